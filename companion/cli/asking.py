@@ -32,18 +32,15 @@ class Asking:
         self._echoes = not sys.stdin.isatty()
 
     def say(self, *lines: str) -> None:
-        """Tell something."""
+        """Print lines."""
         print_lines(*lines, error=self._error)
 
     async def ask(
         self, question: str, now: str, put: Callable[[str], None], hint: str = "", choices: Sequence[str] = ()
     ) -> None:
-        """Ask until `put` takes the answer; an empty one is what holds now. With `yes` that is taken, and said.
+        """Ask until `put` accepts the answer, else raises ConfigError; an empty answer, or `yes`, means `now`.
 
-        `put` raises ConfigError, in one line, where it is none; `choices` are for a page that makes buttons of them.
-
-        Raises:
-            CompanionError: there is nobody to answer any more, or, with `yes`, what holds now is no answer.
+        `choices` become buttons on a page. Raise CompanionError at the end of stdin.
         """
         if self.yes:
             put(now)
@@ -63,7 +60,7 @@ class Asking:
                 return
 
     async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
-        """Ask what is answered by yes or no."""
+        """Ask for yes or no."""
         found = by_default
 
         def put(words: str) -> None:
@@ -74,7 +71,7 @@ class Asking:
         return found
 
     async def _line(self) -> str:
-        """The next line that is typed. Ctrl-C ends the waiting at once, which it would not in `input`."""
+        """Read a line. Ctrl-C ends the waiting at once, unlike in `input`."""
         while b"\n" not in self._rest and len(self._rest) < _MOST_BYTES:
             chunk = await _read(sys.stdin.fileno())
             if not chunk:
@@ -100,9 +97,9 @@ async def _read(descriptor: int) -> bytes:
 
 
 class PageAsking(Asking):
-    """Asks on a page alone, and says everything in the terminal too; `async with` it, and the page is open.
+    """Asks on a page, and prints everything in the terminal too; `async with` opens the page.
 
-    The storage is the daemon's, whose page takes the same token.
+    `storage` is the daemon's: its page has the same token.
     """
 
     def __init__(self, bind: str, storage: Path) -> None:
@@ -117,11 +114,7 @@ class PageAsking(Asking):
         self._page = Page(bind, storage, self._answer)
 
     async def __aenter__(self) -> Self:
-        """Open the page.
-
-        Raises:
-            CompanionError: the page cannot be opened, and why.
-        """
+        """Open the page; raise CompanionError with the reason if that fails."""
         self._serving = asyncio.create_task(self._page.run(), name="page")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(OPEN_WITHIN_S):

@@ -126,7 +126,6 @@ async def setup(options: argparse.Namespace) -> int:
 
 
 def setup_lines(answer: Object) -> list[str]:
-    """Show the set-up of the autopilot."""
     net = answer["net"]
     heading = answer["reason"] if net is None else f"{answer['state']}: {answer['reason']}"
     lines = [f"heading: {heading}", *map(_row, answer["parameters"])]

@@ -25,7 +25,6 @@ _NEEDS_MORE: Final = (
 
 
 def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
-    """Add `fleet` and its own commands."""
     words = "many aircraft: collect what they tell over MQTT in one database"
     fleet = commands.add_parser("fleet", help=words, description=words)
     subcommands = fleet.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 
 def add_commands(add: AddCommand) -> None:
-    """Add `flight` to the parser of the command line."""
     command = add("flight", flight, "what a log of the autopilot says of a flight")
     command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
 

@@ -25,7 +25,6 @@ DEFAULT_URL: Final = "udpin:0.0.0.0:14550"
 
 
 def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
-    """Add `ground` and its own commands."""
     words = "from the laptop on the ground, over the telemetry link (no ground station program needed)"
     ground = commands.add_parser("ground", help=words, description=words)
     link = Parser(add_help=False, argument_default=argparse.SUPPRESS)

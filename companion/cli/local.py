@@ -30,13 +30,12 @@ from companion.cli.terminal import (
 from companion.errors import CompanionError, StorageError
 
 if TYPE_CHECKING:
-    from companion.installation.install import Step
+    from companion.installation.install import InstallStep
     from companion.links.serial.listening import Heard
     from companion.links.serial.ports import SerialPort
 
 
 def add_command(add: AddCommand) -> None:
-    """Add `companion setup`, which comes first."""
     parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
     option = parser.add_argument
     option("ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)")
@@ -57,14 +56,12 @@ def add_command(add: AddCommand) -> None:
 
 
 async def setup(options: argparse.Namespace) -> int:
-    """`companion setup`: what it needs is nothing to other commands."""
     from companion.cli import setup as session
 
     return await session.setup(options)
 
 
 def add_commands(add: AddCommand) -> None:
-    """Add those that have options of their own: to install, to uninstall, and to report."""
     for name, words in (
         ("install-service", "start the companion at every boot: unit, udev rules, configuration"),
         ("uninstall-service", "take that away again; configuration and records stay"),
@@ -116,7 +113,6 @@ async def _first_run(path: Path) -> None:
 
 
 async def ports(options: argparse.Namespace) -> int:
-    """`companion ports`: listed; listened to only when that is asked for."""
     from companion.links.serial.ports import list_ports
 
     found = list_ports()
@@ -164,7 +160,6 @@ def _heard(heard: Heard | str) -> dict[str, object]:
 
 
 async def lua(options: argparse.Namespace) -> int:
-    """`companion lua`: the script on stdout, the steps on stderr."""
     from companion.lua import ARMING_SCRIPT, INSTALLATION
 
     script = ARMING_SCRIPT.read_text(encoding="utf-8")
@@ -178,7 +173,6 @@ async def lua(options: argparse.Namespace) -> int:
 
 
 async def web_token(options: argparse.Namespace) -> int:
-    """`companion web-token`: an address that brings the token along; made if there is none yet."""
     from companion.web.access import is_loopback, kept_token, page_url, split_address
 
     config = load_config(options)
@@ -210,8 +204,8 @@ async def install(options: argparse.Namespace) -> int:
     from companion.installation import install as installing
 
     executable = getattr(options, "executable", None) or installing.own_executable()
-    target = installing.Target(options.root, options.prefix, executable)
-    done: list[Step] = []
+    target = installing.Installation(options.root, options.prefix, executable)
+    done: list[InstallStep] = []
     for step in (installing.install if options.installs else installing.uninstall)(target):
         done.append(step)
         print_lines(step.line(), error=options.json)

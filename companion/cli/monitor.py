@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -28,8 +29,7 @@ SILENT_S: Final = 5.0
 """A daemon that says nothing for so long stands still."""
 AGAIN_S: Final = 1.0
 
-REASON_S: Final = 10.0
-"""Shortest time between lines for the same state with another reason: many reasons count seconds."""
+_FIGURES: Final = re.compile(r"\d+([.,:]\d+)*")
 _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 
@@ -82,37 +82,28 @@ class _Json:
 
 
 class _Lines:
-    """A line whenever something changes, each with the time of day."""
+    """A line whenever its words change, with the time of day; other figures in it are no news."""
 
     def __init__(self) -> None:
         self._before: set[tuple[object, ...]] = set()
-        self._stand: tuple[object, ...] = ()
-        self._reason, self._reason_s = "", 0.0
 
     def show(self, status: Object) -> None:
-        headline, now_s = status["headline"], time.monotonic()
-        # Every tenth of the way is news; what only counts seconds or frames is not.
-        stand = (status["state"], headline["tone"], (status["progress"] or 0) // 10)
-        if stand != self._stand or (headline["reason"] != self._reason and now_s - self._reason_s >= REASON_S):
-            self._stand, self._reason, self._reason_s = stand, headline["reason"], now_s
-        # What each line is about, by which it is known again when it says the same in other figures.
-        lines: dict[tuple[object, ...], str] = {(self._reason_s,): summary.headline(status)}
+        headline = summary.headline(status)
+        tenths = (status["progress"] or 0) // 10
+        lines: dict[tuple[object, ...], str] = {(_FIGURES.sub("", headline), tenths): headline}
         for row in summary.rows(status):
             line = f"{row.name}: {row.words}"
-            lines[(line,) if row.name == "warning" else row[:2]] = line
-        lines |= {(line,): line for line in show.end_lines(status)}
-        self._print([line for about, line in lines.items() if about not in self._before])
-        self._before = set(lines)
+            lines[(_FIGURES.sub("", line),)] = line
+        self._print(lines | {(line,): line for line in show.end_lines(status)})
 
     def gone(self, why: str) -> None:
-        if self._before != {(why,)}:
-            self._print([f"NO DAEMON: {why}; waiting for it"])
-        self._before = {(why,)}
+        self._print({(why,): f"NO DAEMON: {why}; waiting for it"})
 
-    def _print(self, lines: list[str]) -> None:
-        now = time.strftime("%H:%M:%S")
-        for line in lines:
-            print_lines(f"{now} {line}")
+    def _print(self, lines: dict[tuple[object, ...], str]) -> None:
+        for words, line in lines.items():
+            if words not in self._before:
+                print_lines(f"{time.strftime('%H:%M:%S')} {line}")
+        self._before = set(lines)
 
     def close(self) -> None:
         pass

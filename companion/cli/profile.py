@@ -38,7 +38,6 @@ class Learned(NamedTuple):
 
 
 def add_command(add: AddCommand) -> None:
-    """Add `profile`; `add` makes a parser of name, command and help."""
     sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
@@ -51,7 +50,6 @@ def add_command(add: AddCommand) -> None:
 
 
 async def profile(options: argparse.Namespace) -> int:
-    """`companion profile`."""
     from companion.estimation.noise.allan import noise_profile
     from companion.lab.logs.log import NAME
     from companion.lab.logs.log_files import read_logs
@@ -92,11 +90,7 @@ async def profile(options: argparse.Namespace) -> int:
 
 
 def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Learned:
-    """Estimate the noise of one IMU.
-
-    Raises:
-        CalibrationRefusedError: the recordings do not show it.
-    """
+    """Estimate the noise of one IMU; raise CalibrationRefusedError where the recordings do not show it."""
     from companion.estimation.noise.allan import noise_profile
     from companion.lab.profile import Rests, fit_profile, rests
 
@@ -137,7 +131,6 @@ def _named(finding: LearnedNoise) -> Iterator[tuple[str, AxisFit, float, str, in
 
 
 def _lines(result: Learned) -> list[str]:
-    """Make the lines for people."""
     finding = result.finding
     recordings = f"{len(result.logs)} recording{'s' if len(result.logs) > 1 else ''}"
     span = _temperatures(result.logs)
@@ -209,7 +202,6 @@ def _to_save(result: Learned, name: str) -> Any:
 
 
 def _object(result: Learned) -> dict[str, Any]:
-    """Make the object for --json."""
     finding = result.finding
     return {
         "name": result.imu,

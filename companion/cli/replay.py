@@ -21,14 +21,12 @@ if TYPE_CHECKING:
     from companion.lab.replay.estimate import Given, Used
     from companion.lab.replay.windows import Windows
 
+# --json has them all.
 MOST_DIFFERENCES: Final = 20
-"""The most differences that are printed of a calibration; --json has them all."""
 MOST_REASONS: Final = 12
-"""The most reasons that are printed; --json has them all."""
 
 
 def add_command(add: AddCommand) -> None:
-    """Add `replay` to the parser of the command line."""
     player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
     player.add_argument(
         "files", nargs="+", type=Path, metavar="FILE",
@@ -139,7 +137,6 @@ def _add_log_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_table_options(parser: argparse._ActionsContainer) -> None:
-    """Add the options that say how to read a CSV file."""
     parser.add_argument(
         "--columns",
         metavar="NAMES",
@@ -151,7 +148,6 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
 
 
 def _replay_log(options: argparse.Namespace, file: Path) -> int:
-    """Print the biases that the estimator finds in a log."""
     from companion.lab.replay.estimate import estimate
 
     given = _given(options)
@@ -208,7 +204,6 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
 
 
 def _window_lines(found: Windows) -> list[str]:
-    """Say how often the error was within sigma, axis by axis."""
     lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
     lines += [f"not calibrated: {count}: {why}" for why, count in [*found.refused.items()][:MOST_REASONS]]
     for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
@@ -224,7 +219,6 @@ def _window_lines(found: Windows) -> list[str]:
 
 
 def _used_lines(used: Used) -> list[str]:
-    """Say which stretch was used, and how many lines were left out."""
     lines = []
     if used.from_s is not None and used.to_s is not None:
         still = f"{used.still_s} s of it at rest"

@@ -185,7 +185,7 @@ class _Session:
     async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
         """Choose the url: the configured one if it is heard or held, else one that is heard, else a typed one."""
         say, was = self.asking.say, draft.url
-        heard = [one.url for one in found.autopilots]
+        heard = found.autopilots
         if self._options.mavlink is not None:
             draft.take_url(self._options.mavlink)
         elif was is not None and (not heard or any(same_url(url, was) for url in heard) or not found.silent_url(was)):
@@ -311,7 +311,7 @@ class _Session:
                 steps.append(step)
                 self.asking.say(step.line())
         except CompanionError as error:
-            steps.append(installing.Step("service", "failed", str(error)))
+            steps.append(installing.InstallStep("service", "failed", str(error)))
             self.asking.say(str(error))
         self.answer["steps"] = [dataclasses.asdict(step) for step in steps]
         failed = [f"{step.what}: {step.words}" for step in steps if step.outcome == "failed"]

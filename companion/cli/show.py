@@ -68,7 +68,6 @@ def _imu_lines(imu: Object) -> list[str]:
 
 
 def written_lines(written: Object) -> list[str]:
-    """Show each written parameter with its outcome."""
     return [
         f"  {name:16} {_number(one['before'], '+.6f')} -> {one['after']:+.6f}  {outcome_word(one['outcome'])}"
         for name, one in written.items()
@@ -93,7 +92,6 @@ def _number(value: float | None, form: str) -> str:
 
 
 def status_lines(status: Object) -> list[str]:
-    """Show the daemon's state."""
     lines, last, recording = [summary.headline(status)], status["last"], status["recording"]
     said = () if last is None else last["reason"]
     if status["progress"] is None and status["reason"] and status["reason"] != said:
@@ -139,7 +137,6 @@ def _minute(iso: str) -> str:
 
 
 def _reading_lines(status: Object) -> list[str]:
-    """Show the readings of gradienter and compass, and the gradienter's zero."""
     lines, readings, alignment = [], status["readings"], status["alignment"]
     if readings["gradienter_x_deg"] is not None:
         lines.append(
@@ -203,7 +200,6 @@ def _held_back(imu: Object, triad: str) -> str:
 
 
 def finding_lines(findings: Sequence[CheckLine]) -> list[str]:
-    """Show the findings of a check, one line each."""
     return _judged([(finding.verdict, finding.name, finding.words) for finding in findings])
 
 
@@ -273,7 +269,6 @@ def by_hand_words(done: Object) -> str:
 
 
 def _what_became(record: Object) -> str:
-    """Say how many parameters a calibration wrote, and whether they were undone."""
     written = sum(len(imu["written"]) for imu in record.get("imus", ()))
     if not written or record["state"] != "done":
         return ""
@@ -316,7 +311,6 @@ def _accelerometers(imu: Object) -> str | None:
 
 
 def curves_written_lines(written: Object | None) -> list[str]:
-    """Show the temperature curves that were written."""
     if written is None:
         return []
     lines = [f"{name}: {len(each)} parameters" for name, each in written["imus"].items()]
@@ -324,7 +318,6 @@ def curves_written_lines(written: Object | None) -> list[str]:
 
 
 def port_lines(ports: Sequence[SerialPort]) -> list[str]:
-    """Serial ports: the name to put into the configuration first, then what it is and who holds it."""
     if not ports:
         return ["no serial ports with hardware behind them (plugged in? dmesg says what the kernel saw)"]
     lines: list[str] = []

@@ -71,9 +71,9 @@ def _code(text: str) -> list[str]:
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:
-    """The configuration that -c names, or the default one; with the saved noise profiles that it names, or without.
+    """Load the configuration of -c, or the default one, with or without the saved noise profiles that it names.
 
-    Who only asks the daemon may not be allowed to read those. `forgiving`: a damaged one is no reason to refuse.
+    A client of the daemon may not be allowed to read those. `forgiving`: a damaged one is no reason to refuse.
     """
 
     def saved(directory: Path, name: str) -> NoiseProfile | str:
@@ -95,19 +95,16 @@ def storage_path(options: argparse.Namespace) -> Path:
 
 
 def config_path(options: argparse.Namespace) -> Path:
-    """Give the path that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
     return path
 
 
 def own_name(options: argparse.Namespace) -> str:
-    """Give the command that uses this configuration."""
     path = config_path(options)
     return "companion" if path == config.DEFAULT_PATH else f"companion -c {shlex.quote(str(path))}"
 
 
 def how_to_start(options: argparse.Namespace) -> str:
-    """Say what to type when no daemon answers."""
     from companion.installation.install import is_service
 
     serves = is_service() and config_path(options) == config.DEFAULT_PATH
@@ -149,7 +146,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
-    """The type of an argument that is a number within these limits; with int a whole one."""
+    """Make the type of an argument that is a number within limits; with int a whole one."""
 
     def parsed(text: str) -> float:
         try:
@@ -210,5 +207,4 @@ def conclude(options: argparse.Namespace, answer: Any, lines: Iterable[object], 
 
 
 def print_json(value: Any) -> None:
-    """Print the one JSON object of a command."""
     print_lines(json.dumps(value))

@@ -29,7 +29,7 @@ CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
 _Kind = typing.TypeVar("_Kind", bound=msgspec.Struct)
 
 Saved = Callable[[Path, str], NoiseProfile | str]
-"""What a profile of that name is which a storage directory has; a name stays one where nobody looks there.
+"""Looks up a saved profile by storage directory and name, or returns the name.
 
 Raises:
     ConfigError, StorageError: there is none, or it cannot be read; in words that follow "found".
@@ -37,7 +37,7 @@ Raises:
 
 
 def no_profile(wanted: str, names: Sequence[str] = ()) -> ConfigError:
-    """That neither the catalogue nor what was saved has it."""
+    """Make the refusal of a profile that neither the catalogue nor the storage has."""
     near = difflib.get_close_matches(wanted, [*CATALOGUE, *names], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return ConfigError(f"{shown(wanted)}; allowed: {_allowed(names)}{hint}")
@@ -48,21 +48,13 @@ def _none(_directory: Path, wanted: str) -> NoiseProfile:
 
 
 def load(path: Path, saved: Saved = _none) -> Config:
-    """Read and check a configuration file; `saved` says where saved noise profiles are.
-
-    Raises:
-        ConfigError: one line that names the file, the key, what was found and what is allowed.
-    """
+    """Read and check a configuration file; raise ConfigError in one line as `parse`."""
     text = read(path, "companion setup makes it (or give another with -c FILE)")
     return parse(text, str(path), saved)
 
 
 def read(path: Path, missing: str) -> str:
-    """The text of a configuration file; `missing` is what to do where there is none.
-
-    Raises:
-        ConfigError: one line that names the file.
-    """
+    """Read the text of a configuration file; `missing`: the remedy in the ConfigError if there is none."""
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES + 1).decode()
@@ -73,7 +65,7 @@ def read(path: Path, missing: str) -> str:
 
 
 def parse(text: str, name: str, saved: Saved = _none) -> Config:
-    """Check the text of a configuration file; `name` stands for the file in messages, `saved` as for `load`.
+    """Check the text of a configuration file; `name` stands for the file in messages.
 
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
@@ -84,11 +76,7 @@ def parse(text: str, name: str, saved: Saved = _none) -> Config:
 
 
 def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
-    """The text of a file as such a structure; what depends on one another is not checked.
-
-    Raises:
-        ConfigError: one line that names the file, the key, what was found and what is allowed.
-    """
+    """Convert the text of a file without the rules that span several keys; raise ConfigError as `parse`."""
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{name}: found more than {MOST_BYTES} bytes; allowed: a configuration file")
     for number, line in enumerate(text.split("\n"), 1):
@@ -108,7 +96,7 @@ def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
 
 
 def _with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
-    """The configuration with the figures of saved profiles in the place of their names."""
+    """Replace the names of saved profiles by their figures."""
     imus = []
     for index, imu in enumerate(config.imu):
         key = f"{name}: 'imu[{index}].profile': found"

@@ -1,4 +1,4 @@
-"""The rules that span several keys of the configuration file: a check gives what is wrong, in words."""
+"""Rules that span several keys of the configuration file; a check yields its complaints in words."""
 
 from __future__ import annotations
 
@@ -17,17 +17,13 @@ UPRIGHT_COSINE = 0.5
 LAST_PORT = 65535
 LEAST_RECORDINGS_MB = 8
 MAX_TOPIC_BYTES = 200
-"""Of a topic's beginning; MQTT itself allows 65535."""
+"""Limit of `base_topic`; MQTT itself allows 65535."""
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 _SERIAL = 'only with source = "serial"'
 
 
 def check_together(config: Config, name: str) -> None:
-    """Check what no single key can tell.
-
-    Raises:
-        ConfigError: one line that names the file, the key, what was found and what is allowed.
-    """
+    """Check the rules; raise ConfigError with the first complaint."""
     for complaint in _complaints(config):
         raise ConfigError(f"{name}: {complaint}")
 
@@ -123,7 +119,7 @@ def _port(port: str, here: str) -> Iterator[str]:
 
 
 def _ports_differ(config: Config) -> Iterator[str]:
-    """Each port once; only the roles of one device share theirs, and they agree on how it is read."""
+    """Check that each port has one user; the roles of one device share theirs, and agree on the line."""
     used: dict[str, list[tuple[str, Imu | Gradienter | Compass]]] = {}
     for here, device in _serial_devices(config):
         for before, other in (sharing := used.setdefault(device.port or "", [])):
@@ -176,7 +172,7 @@ _BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<por
 
 
 def bind_problem(bind: str, name: str) -> str | None:
-    """Why a page cannot be bound there; None where it can.
+    """Return why a page cannot be bound there, or None.
 
     Numbers only: what a name stands for may change with the network, and with it who can reach the page.
     """
@@ -191,7 +187,7 @@ def bind_problem(bind: str, name: str) -> str | None:
 
 
 def is_address(host: str) -> bool:
-    """Whether it is an IP address, and no name."""
+    """Return whether it is an IP address, and no name."""
     try:
         ipaddress.ip_address(host)
     except ValueError:
@@ -213,14 +209,13 @@ def _mounting(mounting: Mounting, here: str) -> Iterator[str]:
 
 
 def _upright(mounting: Mounting, here: str) -> Iterator[str]:
-    """Neither liquid nor pendulum nor tilt-compensated compass works on its side or head, nor can it tell."""
+    """Refuse a gradienter or compass on its side or head: it does not work there, and cannot tell."""
     roll_deg, pitch_deg, _ = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
     if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
         yield f"{here!r}: found {mounting!r}, on its side or upside down; allowed: within 60 degrees of upright"
 
 
 def _access(mavlink: Mavlink) -> Iterator[str]:
-    """Who may ask, and signing."""
     for entry in mavlink.allow:
         try:
             Senders([entry])
@@ -242,7 +237,7 @@ def _secret(path: str | None, here: str) -> Iterator[str]:
 
 
 def broker_complaints(mqtt: Mqtt) -> Iterator[str]:
-    """What no single key of [mqtt] can tell, in words."""
+    """Yield the complaints about [mqtt]."""
     if mqtt.base_topic is not None:
         yield from _topic(mqtt.base_topic)
     if mqtt.password_file is not None and mqtt.username is None:

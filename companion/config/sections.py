@@ -20,17 +20,13 @@ _IDS: Final = re.compile(r"(?:\*|([0-9]{1,3})(?:-([0-9]{1,3}))?)")
 
 
 class Senders:
-    """The senders that a list names: "255", "255:190", "250-255", "*:190", "*". Without a component it means all.
-
-    Raises:
-        ValueError: an entry is none; its words say which and why.
-    """
+    """Senders named by a list such as "255", "255:190", "250-255", "*:190", "*"; raise ValueError for another entry."""
 
     def __init__(self, entries: Iterable[str]) -> None:
         self._pairs = [_pair(entry) for entry in entries]
 
     def __contains__(self, sender: tuple[int, int]) -> bool:
-        """Whether the list names this (system, component)."""
+        """Return whether the list names a (system, component)."""
         system, component = sender
         return any(system in systems and component in components for systems, components in self._pairs)
 
@@ -54,7 +50,7 @@ def _range(words: str, entry: str) -> range:
 
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-"""Those of the catalogue; others are learned and saved (`companion profile --save`)."""
+"""Profiles of the catalogue; others are learned and saved (`companion profile --save`)."""
 UNKNOWN: Final[Profile] = "unknown"
 """The profile of a part that nobody has named: the figures of the worst common parts."""
 GradienterProtocol = Literal[
@@ -72,7 +68,6 @@ Location = Literal["off", "1km", "full"]
 LATITUDE_DEG: Final = (-90.0, 90.0)
 LONGITUDE_DEG: Final = (-180.0, 180.0)
 HEIGHT_M: Final = (-500.0, 9000.0)
-"""Where an aircraft can stand, whoever says where it does."""
 Latitude = Annotated[float, Meta(ge=LATITUDE_DEG[0], le=LATITUDE_DEG[1])]
 Longitude = Annotated[float, Meta(ge=LONGITUDE_DEG[0], le=LONGITUDE_DEG[1])]
 Height = Annotated[float, Meta(ge=HEIGHT_M[0], le=HEIGHT_M[1])]
@@ -85,7 +80,7 @@ Mounting = str | tuple[float, float, float]
 
 
 def secret_path(name: str) -> Path:
-    """Where a secret lies: at its path, or, without a folder, among systemd's credentials."""
+    """Return the path of a secret; a name without a folder is one of systemd's credentials."""
     return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / name
 
 
@@ -93,37 +88,36 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """A table of the file; unknown keys are refused."""
 
 
-class Vehicle(Section, frozen=True):
-    """Where and on what the aircraft stands, if the autopilot is not to be asked, and its MAVLink system id."""
+class VehicleSection(Section, frozen=True):
+    """Place and system id of the aircraft, where the autopilot is not to be asked, and what it stands on."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
     height_m: Height | None = None
     system_id: Annotated[int, Meta(ge=1, le=255)] | None = None
     platform: Platform = "ground"
-    """Fixed to the Earth, or what may turn and sway under it: a boat, a vehicle with its engine running."""
+    """ground: fixed to the Earth. deck: may turn and sway, such as a boat, or a vehicle with its engine running."""
 
 
 class Mavlink(Section, frozen=True):
-    """How to reach the autopilot, and which component we are."""
+    """Address of the autopilot, and our own ids and rules on its link."""
 
     url: NonEmpty
     component_id: Annotated[int, Meta(ge=2, le=255)] = 191
     """0 means everybody, and 1 is the autopilot."""
     allow: tuple[str, ...] = EVERYBODY
-    """Who may calibrate, cancel, undo and set our parameters: as `Senders` reads it."""
+    """Senders that may calibrate, cancel, undo and set our parameters, as `Senders` reads them."""
     signing: Signing | None = None
-    """"require" where a key file is named, else "off"."""
     signing_key_file: NonEmpty | None = None
 
     @property
     def signing_mode(self) -> Signing:
-        """As configured, else by whether there is a key."""
+        """The configured mode, else "require" with a key and "off" without."""
         return self.signing or ("off" if self.signing_key_file is None else "require")
 
     @property
     def signing_key_path(self) -> Path | None:
-        """The key's file; one without a folder is looked for among systemd's credentials."""
+        """The key's file."""
         return None if self.signing_key_file is None else secret_path(self.signing_key_file)
 
 
@@ -170,14 +164,14 @@ class Imu(Section, frozen=True):
     name: NonEmpty
     source: Literal["autopilot", "serial"]
     instance: Annotated[int, Meta(ge=1, le=3)] | None = None
-    """Of the autopilot; 1 where it is not said."""
+    """Number of the autopilot's IMU; None: 1."""
     port: NonEmpty | None = None
     baud: Baud | None = None
     protocol: ImuProtocol | None = None
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
     read_only: bool = False
-    """Whether nothing may ever be sent to the device on that port."""
+    """True: nothing is ever sent to the device on that port."""
     profile: str | NoiseProfile | None = None
     """One of the catalogue (`Profile`), or a saved one."""
 
@@ -193,10 +187,10 @@ class Gradienter(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: tuple[float, float] = (0.0, 0.0)
     sigma_deg: PositiveFloat | None = None
-    """That of the protocol's device, else 0.05, where it is not said."""
+    """None: the protocol's (protocols/registry.py), else 0.05."""
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
-    """Time constant of fluid and filters; that of the protocol's device where it is not said."""
+    """Time constant of fluid and filters; None: the protocol's."""
 
 
 class Compass(Section, frozen=True):
@@ -210,18 +204,17 @@ class Compass(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
     sigma_deg: PositiveFloat | None = None
-    """That of the protocol's device, else 3, where it is not said."""
+    """None: the protocol's, else 3."""
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
-    """Likewise."""
     heading: Literal["device", "field"] = "device"
-    """The device's own where it sends one, or worked out from its field vector and the gradienter's tilt."""
+    """field: computed from the device's field vector and the gradienter's tilt, not the device's own heading."""
     counts_per_gauss: PositiveFloat | None = None
-    """Of a device that gives its field in counts; not said: the field's strength is not checked."""
+    """Scale of a field in counts; None: its strength is not checked."""
 
 
 class Calibration(Section, frozen=True):
-    """How long, how good, and what happens at arming."""
+    """Duration and target of a calibration, and what happens at arming."""
 
     min_still_s: Annotated[float, Meta(ge=2, le=600)] = 10.0
     max_s: Annotated[float, Meta(ge=2, le=3600)] = 60.0
@@ -229,69 +222,68 @@ class Calibration(Section, frozen=True):
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
     max_age_min: PositiveFloat = 30.0
-    """How long a calibration counts as fresh after it was last seen to be right (method 3.2)."""
+    """Time after the last confirmation at which a calibration is out of date (method 3.2)."""
     max_temperature_change_degc: PositiveFloat = 3.0
-    """How far the temperature may be from the one at which it was seen to be right (the same)."""
+    """Change of temperature since then at which it is out of date (method 3.2)."""
     prior: bool = True
-    """Whether earlier calibrations guard new ones, and weigh in where that betters them (docs/calibration.md)."""
+    """True: earlier calibrations guard new ones, and are combined with them (docs/calibration.md)."""
     any_bias: bool = False
-    """Whether to take biases beyond what any part has, and readings along other axes than the tilt says."""
+    """True: accept biases beyond those of any part, and gravity along another axis than the tilt says."""
 
 
 class Push(Section, frozen=True):
-    """What is sent to the autopilot."""
+    """Data sent to the autopilot."""
 
     parameters: bool = True
     attitude: Literal["off", "yaw", "full"] = "off"
     attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
     stop_rivals: bool = False
-    """Whether to switch off what in the autopilot overwrites our biases; an undo switches it on again."""
+    """True: switch off what in the autopilot overwrites our biases; an undo switches it on again."""
 
 
-class Component(Section, frozen=True):
-    """How we make ourselves heard."""
+class ComponentSection(Section, frozen=True):
+    """Our MAVLink component."""
 
     tunes: bool = True
-    """Whether the autopilot's buzzer is used, while it is disarmed."""
+    """True: use the autopilot's buzzer while it is disarmed."""
 
 
 class Mqtt(Section, frozen=True):
-    """A broker to speak to; the section absent means no MQTT."""
+    """A broker; without the section there is no MQTT."""
 
     host: NonEmpty
     port: Annotated[int, Meta(ge=1, le=65535)] | None = None
-    """8883 with TLS, else 1883, where it is not said."""
     base_topic: NonEmpty | None = None
-    """What all topics begin with; "companion/" and the vehicle's system id where it is not said."""
+    """Beginning of all topics; None: "companion/" and the vehicle's system id."""
     client_id: NonEmpty | None = None
-    """The base topic with "-" for "/" where it is not said."""
+    """None: the base topic with "-" for "/"."""
     username: NonEmpty | None = None
     password_file: NonEmpty | None = None
     tls: bool = False
     ca_file: NonEmpty | None = None
-    """Who is trusted to sign the broker's certificate; the system's authorities where it is not said."""
+    """Authority that signed the broker's certificate; None: the system's authorities."""
     cert_file: NonEmpty | None = None
     key_file: NonEmpty | None = None
     keepalive_s: Annotated[int, Meta(ge=5, le=600)] = 15
 
     @property
     def broker_port(self) -> int:
-        """The port: as configured, else that of the protocol."""
+        """The configured port, else MQTT's own."""
         return self.port or (8883 if self.tls else 1883)
 
     @property
     def password_path(self) -> Path | None:
-        """The password's file; one without a folder is looked for among systemd's credentials."""
+        """The password's file."""
         return None if self.password_file is None else secret_path(self.password_file)
 
 
 class Fleet(Section, frozen=True):
-    """What happens is kept for a fleet's collector, and sent by way of `mqtt`; absent: it is not."""
+    """Items for a fleet's collector, kept and sent over `mqtt`; without the section there are none."""
 
     name: NonEmpty | None = None
-    """What people call the aircraft."""
+    """Name of the aircraft."""
     location: Location = "off"
-    """How much of the place goes along."""
+    """Precision of the place in the items."""
 
 
 class Control(Section, frozen=True):
@@ -299,7 +291,7 @@ class Control(Section, frozen=True):
 
     socket: NonEmpty | None = None
     group: NonEmpty | None = None
-    """Whose members may use it, besides the daemon's own user and root."""
+    """Group whose members may use it, besides the daemon's own user and root."""
 
     @property
     def group_name(self) -> str | None:
@@ -315,11 +307,11 @@ class Control(Section, frozen=True):
 
 
 class Storage(Section, frozen=True):
-    """Where records and the values for undo are kept."""
+    """Folder of records and of the values for undo."""
 
     directory: NonEmpty | None = None
     recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
-    """Room for the ring of recordings; 0: none are kept; not said: a modest ring, where the means are installed."""
+    """Size of the ring of recordings; 0: no ring; None: a modest ring, if mcap is installed."""
 
     @property
     def path(self) -> Path:
@@ -330,13 +322,13 @@ class Storage(Section, frozen=True):
 
 
 class Log(Section, frozen=True):
-    """How much is told on stderr, which under systemd is the journal."""
+    """Level of the log on stderr, which under systemd is the journal."""
 
     level: LogLevel = "info"
 
 
 class Web(Section, frozen=True):
-    """The page; the section absent means no page."""
+    """The page; without the section there is none."""
 
     bind: NonEmpty
 
@@ -346,12 +338,12 @@ class Config(Section, frozen=True):
 
     mavlink: Mavlink
     imu: Annotated[list[Imu], Meta(min_length=1)]
-    vehicle: Vehicle = Vehicle()
+    vehicle: VehicleSection = VehicleSection()
     gradienter: Gradienter | None = None
     compass: Compass | None = None
     calibration: Calibration = Calibration()
     push: Push = Push()
-    component: Component = Component()
+    component: ComponentSection = ComponentSection()
     mqtt: Mqtt | None = None
     fleet: Fleet | None = None
     control: Control = Control()

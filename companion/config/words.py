@@ -87,7 +87,7 @@ def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path
 
 
 def _refuse_unusable(value: object, here: str, name: str) -> None:
-    """What TOML can write and nothing here can be: nan and inf, endless integers, characters that nobody sees."""
+    """Refuse values that TOML allows and no key can have: nan, inf, huge integers, invisible characters."""
     within = [value]
     while within:  # no recursion: dots in a key nest as deep as they like
         item = within.pop()
@@ -104,12 +104,12 @@ def _refuse_unusable(value: object, here: str, name: str) -> None:
 
 
 def shown(value: object) -> str:
-    """A value as it stands in the file; of a long one its ends."""
+    """Format a value as in the file; a long one is abbreviated."""
     return {True: "true", False: "false"}[value] if isinstance(value, bool) else _briefly.repr(value)
 
 
 def brief(words: str) -> str:
-    """The beginning of what may be long."""
+    """Cut a long text."""
     return words if len(words) <= _LONGEST else f"{words[:_LONGEST]}..."
 
 
@@ -152,7 +152,7 @@ def _value_at(raw: object, path: str) -> object:
 
 
 def allowed(path: str) -> str:
-    """Say what may stand at a path such as `imu[0].source`, in words."""
+    """Describe the allowed values of a path such as `imu[0].source`."""
     annotation: object = Config
     for key in re.findall(r"\w+(?=\[|\.|$)", re.sub(r"\[[^\]]*\]", "", path)):
         section = _section_in(annotation)
@@ -182,7 +182,7 @@ def _describe(annotation: object) -> str:
     if origin is list or (isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)):
         section = _section_in(annotation)
         brackets = "[[{}]]" if origin is list else "[{}]"
-        return f"a section {brackets.format(section.__name__.lower() if section else '')}"
+        return f"a section {brackets.format(section.__name__.lower().removesuffix('section') if section else '')}"
     return _WORDS.get(annotation, str(annotation))
 
 

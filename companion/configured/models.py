@@ -1,9 +1,10 @@
-"""From the configuration to the models and devices that the other rooms work with."""
+"""Models and devices made from the configuration."""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
+import time
 from collections.abc import Iterator, Sequence
 from typing import Final, Literal
 
@@ -47,7 +48,7 @@ HEADING_SIGMA_DEG: Final = 3.0
 
 
 def settings(config: Config) -> Settings:
-    """How long and how good."""
+    """Return duration and target of a calibration in the estimator's units."""
     wanted = config.calibration
     return Settings(
         min_still_s=wanted.min_still_s,
@@ -63,9 +64,9 @@ def baud_of(url: str) -> int | None:
 
 
 def imu_rate_hz(config: Config) -> float:
-    """How often each autopilot IMU may send without filling a serial line: half of it stays free for everything else.
+    """Return the rate of each autopilot IMU that leaves half of a serial line free (57600 baud: 38 Hz for one IMU).
 
-    An autopilot whose line is full drops what does not fit, and answers late (57600 baud: 38 Hz for one IMU).
+    An autopilot whose line is full drops messages and answers late.
     """
     baud = baud_of(config.mavlink.url)
     instances = [imu.instance or 1 for imu in config.imu if imu.source == "autopilot"]
@@ -76,20 +77,20 @@ def imu_rate_hz(config: Config) -> float:
 
 
 def attitude_rate_hz(config: Config) -> float:
-    """How often the attitude may be sent without filling a serial line (57600 baud: 22 Hz)."""
+    """Return the rate of the attitude that does not fill a serial line (57600 baud: 22 Hz)."""
     wanted, baud = config.push.attitude_rate_hz, baud_of(config.mavlink.url)
     return wanted if baud is None else min(wanted, LINE_SHARE * baud / BITS_PER_BYTE / VISION_BYTES)
 
 
 def cannot_work(config: Config) -> list[str]:
-    """What the configuration asks for and cannot come about: said at start, never silently ignored."""
+    """List the wishes of the configuration that cannot be met: reported at start, never silently ignored."""
     if config.push.attitude == "off" or config.compass is not None:
         return []
     return [f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known']
 
 
 def doubtful(config: Config) -> list[str]:
-    """What in the configuration is taken as it stands, and is probably not meant."""
+    """List the settings that are followed, but probably not meant."""
     found, gradienter = [], config.gradienter
     if config.mavlink.signing_mode == "off" and config.mavlink.signing_key_file is not None:
         found.append('mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked')
@@ -102,7 +103,8 @@ def doubtful(config: Config) -> list[str]:
 
 
 def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
-    """One IMU as the collector takes it; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already."""
+    """Describe an IMU to the collector; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already."""
+    integers = kind is not None and kind.truncates
     return ImuInput(
         name=imu.name,
         rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),
@@ -115,14 +117,14 @@ def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
 
 
 def collector(config: Config) -> RollingCollector:
-    """Return the collector of a configuration, before anything has been heard of the autopilot's IMUs."""
+    """Make the collector, before anything is known of the autopilot's IMUs."""
     wanted, pose = settings(config), (gradienter_model(config.gradienter), compass_model(config.compass))
     windows = Deck(*pose, wanted.horizon_s) if config.vehicle.platform == "deck" else None
     return RollingCollector(wanted, [imu_input(imu, None) for imu in config.imu], *pose, windows)
 
 
 def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
-    """How the gradienter's readings become the direction of up."""
+    """Make the model that turns the gradienter's readings into the direction of up."""
     if gradienter is None:
         return None
     info = PROTOCOLS["gradienter"][gradienter.protocol]
@@ -136,14 +138,14 @@ def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
 
 
 def tilt_sigma_deg(protocol: GradienterProtocol) -> float:
-    """How well the tilt of a device with this protocol is known where nobody says better."""
+    """Return the sigma of the tilt of a device with this protocol, unless configured."""
     known = PROTOCOLS["gradienter"][protocol].sigma_deg
     by_the_way = protocol in PROTOCOLS["compass"] or protocol in PROTOCOLS["imu"]
     return known or (TILT_BY_THE_WAY_SIGMA_DEG if by_the_way else TILT_SIGMA_DEG)
 
 
 def compass_model(compass: Compass | None) -> CompassModel | None:
-    """How the compass' readings become a true heading."""
+    """Make the model that turns the compass' readings into a true heading."""
     if compass is None:
         return None
     info = PROTOCOLS["compass"][compass.protocol]
@@ -161,19 +163,17 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
 
 
 def longest_window_s(config: Config) -> float:
-    """The longest time that a calibration is made of."""
+    """Return the longest window of a calibration."""
     return config.calibration.max_s if config.vehicle.platform == "ground" else KEPT_S
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
-    """Place and date: the configuration's where it says so, else the autopilot's.
+    """Return place and date: as configured, else the autopilot's.
 
     The date is the autopilot's (from its GNSS), else the host's; it only picks the year of the magnetic model.
     """
-    if vehicle.place.unix_time_s is not None:
-        date = datetime.datetime.fromtimestamp(vehicle.place.unix_time_s, tz=datetime.UTC).date()
-    else:
-        date = datetime.datetime.now(tz=datetime.UTC).date()
+    unix_s = time.time() if vehicle.place.unix_time_s is None else vehicle.place.unix_time_s
+    date = datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).date()
     place, position = config.vehicle, vehicle.place.position
     if place.latitude_deg is not None:
         height_m, source = place.height_m, "configuration"
@@ -188,13 +188,13 @@ def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
 
 
 def place_doubt(config: Config, vehicle: Vehicle) -> str | None:
-    """What a calibration waits for: the autopilot contradicts itself about what the configuration leaves open."""
+    """Return why a calibration waits: the autopilot contradicts itself on a place that is not configured; else None."""
     place = config.vehicle
     return None if place.latitude_deg is not None and place.height_m is not None else vehicle.place.doubt
 
 
 def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> GradienterModel | None:
-    """The configured model with the measured zero on top, and its sigma in the place of the configured one."""
+    """Return the configured model with the measured zero added, and the measured sigma."""
     if model is None or used is None:
         return model
     x_deg, y_deg = model.offset_deg
@@ -205,7 +205,7 @@ def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> Gradie
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Role:
-    """What a device is used as: under which name, and as which kind."""
+    """One use of a device."""
 
     name: str
     kind: Kind
@@ -213,13 +213,13 @@ class Role:
     """The north that a compass' headings are configured to mean."""
 
     def refuses(self, sample: Sample) -> bool:
-        """Whether this is a heading to another north than the configured one, by the device's own word."""
+        """Return whether the device itself calls this a heading to another north than the configured one."""
         return self.north is not None and isinstance(sample, CompassSample) and sample.north not in (None, self.north)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SerialDevice:
-    """One device: its line as configured, else as it comes from the factory."""
+    """One device with its line: as configured, else as it comes from the factory."""
 
     port: str
     info: ProtocolInfo
@@ -230,27 +230,27 @@ class SerialDevice:
 
     @property
     def settings(self) -> PortSettings:
-        """Of its port."""
+        """Port and line."""
         return PortSettings(self.port, self.baud, self.parity)
 
     @property
     def line(self) -> Line:
-        """How its line is set."""
+        """Setting of the line."""
         return Line(self.baud, self.parity)
 
     @property
     def name(self) -> str:
-        """That of its first role; its bytes have it in a recording."""
+        """Name of its first role, and of its bytes in a recording."""
         return self.roles[0].name
 
     @property
     def kind(self) -> Kind:
-        """That of its first role."""
+        """Kind of its first role."""
         return self.roles[0].kind
 
 
 def serial_devices(config: Config) -> list[SerialDevice]:
-    """All devices, in the order of their first roles: IMUs as configured, gradienter, compass."""
+    """List the devices, in the order of their first roles: IMUs as configured, gradienter, compass."""
     shared: dict[str, list[tuple[Role, Imu | Gradienter | Compass]]] = {}
     for role, section in _sections(config):
         shared.setdefault(section.port or "", []).append((role, section))
@@ -282,14 +282,14 @@ def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) 
 
 
 def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Sample]]:
-    """What each role takes of a sample."""
+    """Yield the part of a sample for each role."""
     for role in roles:
         if (part := part_for(role.kind, sample)) is not None and not role.refuses(sample):
             yield role, part
 
 
 def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
-    """Give the collector what a role has taken; the reading of the pose that counts, or came of it, if any."""
+    """Give the collector the part of a role; return the reading of the pose that counts or results, if any."""
     match part:
         case ImuSample():
             into.add_imu(role.name, part)

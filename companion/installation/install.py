@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import os
 import re
@@ -11,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import companion
 from companion.errors import CompanionError
@@ -23,37 +22,33 @@ _STAMP: Final = "# Put here by `companion install-service`; sha256 of what follo
 _STAMPED: Final = re.compile(re.escape(_STAMP).encode() + rb"([0-9a-f]{64})\n")
 
 
-class Shipped(NamedTuple):
-    """One file: its name in `systemd/`, and where it goes."""
-
-    source: str
-    target: str
-    """Below /etc/companion, the owner's own folder; or, where it begins with lib/, below a prefix: the installation's
-    own, of which the owner changes what he wants in /etc (`systemctl edit`)."""
-
-
-SERVICE: Final = Shipped("companion.service", "lib/systemd/system/companion.service")
-FIRST_RUN: Final = Shipped("companion-setup.service", "lib/systemd/system/companion-setup.service")
-UNITS: Final = (SERVICE, FIRST_RUN)
-RULES: Final = Shipped("rules.d/70-companion.rules", "lib/udev/rules.d/70-companion.rules")
-MODULES: Final = Shipped("modules-load.d/companion.conf", "lib/modules-load.d/companion.conf")
-SAMPLE: Final = Shipped("companion.toml", "companion.toml.sample")
-OURS: Final = (*UNITS, RULES, MODULES, SAMPLE)
-CONFIGURATION: Final = "companion.toml"
+SERVICE: Final = "companion.service"
+UNITS: Final = (SERVICE, "companion-setup.service")
+RULES: Final = "rules.d/70-companion.rules"
+MODULES: Final = "modules-load.d/companion.conf"
+SAMPLE: Final = "companion.toml"
+SHIPPED: Final = {
+    **{unit: f"lib/systemd/system/{unit}" for unit in UNITS},
+    RULES: f"lib/udev/{RULES}",
+    MODULES: f"lib/{MODULES}",
+    SAMPLE: "companion.toml.sample",
+}
+"""Where each file of `systemd/` goes: lib/ is below a prefix, the installation's own folder (an owner changes units
+with `systemctl edit`, in /etc); all else is below /etc/companion, the owner's."""
 
 
 def folder() -> Path:
     """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError where there is none."""
     here = Path(__file__).resolve().parent
     for candidate in (here / "systemd", here.parents[1] / "systemd"):
-        if (candidate / SERVICE.source).is_file():
+        if (candidate / SERVICE).is_file():
             return candidate
     raise CompanionError(f"the files of the service are not beside {here}: the installation is not complete")
 
 
-def content(shipped: Shipped, *, executable: str = EXECUTABLE) -> bytes:
+def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
     """Return a shipped file for this executable, without stamp; raise CompanionError where that cannot be."""
-    text = (folder() / shipped.source).read_text(encoding="utf-8")
+    text = (folder() / shipped).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
             raise CompanionError(f"{executable!r} cannot stand in a unit; allowed: an absolute path without spaces")
@@ -62,7 +57,7 @@ def content(shipped: Shipped, *, executable: str = EXECUTABLE) -> bytes:
 
 
 def stamped(data: bytes) -> bytes:
-    """The data behind a first line by which a later change by hand is recognised."""
+    """Put a first line before the data that shows a later change by hand."""
     return f"{_STAMP}{hashlib.sha256(data).hexdigest()}\n".encode() + data
 
 
@@ -87,20 +82,20 @@ Run = Callable[[Sequence[str]], str | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """One thing that was done."""
+class InstallStep:
+    """One step of an installation, and its outcome."""
 
     what: str
     outcome: Outcome
     words: str = ""
 
     def line(self) -> str:
-        """For people."""
+        """Format it for people."""
         return f"{self.outcome:9}  {self.what}" + (f": {self.words}" if self.words else "")
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class Installation:
     """Root folder, prefix and executable of an installation."""
 
     root: Path
@@ -112,41 +107,41 @@ class Target:
         """Return whether the running machine is meant."""
         return self.root == Path("/")
 
-    def path(self, shipped: Shipped) -> Path:
+    def path(self, shipped: str) -> Path:
         """Return the path of a shipped file."""
-        base = str(self.prefix).lstrip("/") if shipped.target.startswith("lib/") else "etc/companion"
-        return self.root / base / shipped.target
+        target = SHIPPED[shipped]
+        base = str(self.prefix).lstrip("/") if target.startswith("lib/") else "etc/companion"
+        return self.root / base / target
 
 
 PREFIX: Final = Path("/usr/local")
-_HERE: Final = Target(Path("/"), PREFIX, EXECUTABLE)
 
 
 def own_executable() -> str:
-    """The companion that is running, beside its Python."""
+    """Return the path of the running companion: beside its Python."""
     return str(Path(sys.executable).with_name("companion"))
 
 
-def install(target: Target, run: Run | None = None) -> Iterator[Step]:
+def install(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
     """Install step by step; raise CompanionError for another user, or where a package has brought the service."""
     if target.is_this_machine:
         _check_not_packaged(_START_PACKAGED)
         _check_user("install-service")
         _check_reach(target.executable)
-    for shipped in OURS:
+    for shipped in SHIPPED:
         yield _put(target.path(shipped), stamped(content(shipped, executable=target.executable)))
     yield _configuration(target, "yours; what is new is in companion.toml.sample", "sudo companion setup makes it")
     if target.is_this_machine:
         yield from _activate(run or _run)
 
 
-def start_service(run: Run | None = None) -> Iterator[Step]:
+def start_service(run: Run | None = None) -> Iterator[InstallStep]:
     """Have the service run now and at every boot; raise CompanionError as `install`."""
     if _is_packaged():
         for command in ("enable", "restart"):
             yield _command(run or _run, "systemctl", command, "companion.service")
         return
-    yield from install(dataclasses.replace(_HERE, executable=own_executable()), run)
+    yield from install(Installation(Path("/"), PREFIX, own_executable()), run)
 
 
 def how_to_start() -> str:
@@ -154,7 +149,7 @@ def how_to_start() -> str:
     return _START_PACKAGED if _is_packaged() else "sudo companion install-service"
 
 
-def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
+def uninstall(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
     """Remove what `install` wrote; configuration and records stay. Raise CompanionError as `install`."""
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
@@ -162,39 +157,39 @@ def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
         if systemd_runs():
             yield _command(run or _run, "systemctl", "disable", "--now", "companion.service")
             yield _command(run or _run, "systemctl", "stop", "companion-setup.service")
-    for shipped in OURS:
+    for shipped in SHIPPED:
         yield _take(target.path(shipped))
     yield _configuration(target, "yours")
     if target.is_this_machine:
         yield from _reload(run or _run)
     state = target.root / "var/lib/private/companion"
     if state.is_dir():
-        yield Step(str(state), "kept", "records and values for undo; remove it if they are not wanted any more")
+        yield InstallStep(str(state), "kept", "records and values for undo; remove it if they are not wanted any more")
 
 
-def _put(path: Path, wanted: bytes) -> Step:
+def _put(path: Path, wanted: bytes) -> InstallStep:
     found = _read(path)
     if found == wanted:
-        return Step(str(path), "unchanged")
+        return InstallStep(str(path), "unchanged")
     if found is not None and not is_untouched(found):
-        return Step(str(path), "kept", "changed by hand; remove it to get the new one")
+        return InstallStep(str(path), "kept", "changed by hand; remove it to get the new one")
     write_atomically(path, wanted, mode=MODE, parents=True)
-    return Step(str(path), "written" if found is None else "updated")
+    return InstallStep(str(path), "written" if found is None else "updated")
 
 
-def _configuration(target: Target, there: str, absent: str = "") -> Step:
-    path = target.path(SAMPLE).with_name(CONFIGURATION)
-    return Step(str(path), "kept", there) if path.exists() else Step(str(path), "absent", absent)
+def _configuration(target: Installation, there: str, absent: str = "") -> InstallStep:
+    path = target.path(SAMPLE).with_name("companion.toml")
+    return InstallStep(str(path), "kept", there) if path.exists() else InstallStep(str(path), "absent", absent)
 
 
-def _take(path: Path) -> Step:
+def _take(path: Path) -> InstallStep:
     found = _read(path)
     if found is None:
-        return Step(str(path), "absent")
+        return InstallStep(str(path), "absent")
     if not is_untouched(found):
-        return Step(str(path), "kept", "changed by hand")
+        return InstallStep(str(path), "kept", "changed by hand")
     remove_durably(path)
-    return Step(str(path), "removed")
+    return InstallStep(str(path), "removed")
 
 
 def _read(path: Path) -> bytes | None:
@@ -238,7 +233,7 @@ def _check_reach(executable: str) -> None:
 
 
 def unreachable(path: Path) -> str | None:
-    """Why the service could not reach a path, in one line; None when it can."""
+    """Return why the service could not reach a path, in one line; None when it can."""
     resolved = path.resolve()
     for hidden in HIDDEN:
         if resolved.is_relative_to(hidden):
@@ -253,22 +248,22 @@ def unreachable(path: Path) -> str | None:
     return None
 
 
-def _activate(run: Run) -> Iterator[Step]:
+def _activate(run: Run) -> Iterator[InstallStep]:
     if not systemd_runs():
-        yield Step("systemd", "skipped", "does not run here: nothing was started")
+        yield InstallStep("systemd", "skipped", "does not run here: nothing was started")
         return
     yield from _reload(run)
     yield _command(run, "systemctl", "enable", "companion.service")
     yield _command(run, "systemctl", "restart", "companion.service")
 
 
-def _reload(run: Run) -> Iterator[Step]:
+def _reload(run: Run) -> Iterator[InstallStep]:
     if not systemd_runs():
         return
     yield _command(run, "systemctl", "daemon-reload")
     yield _command(run, "systemctl", "restart", "systemd-modules-load.service")
     if not UDEV_RUNS.exists():
-        yield Step("udev", "skipped", "does not run here: its rules hold from the next start on")
+        yield InstallStep("udev", "skipped", "does not run here: its rules hold from the next start on")
     else:
         yield _command(run, "udevadm", "control", "--reload")
         subsystems = ("--subsystem-match=tty", "--subsystem-match=usb-serial")
@@ -283,13 +278,13 @@ def systemd_runs() -> bool:
 def is_service() -> bool:
     """Return whether systemd here knows the companion's unit, wherever it was put."""
     folders = ("/etc", "/usr/local/lib", "/usr/lib", "/lib")
-    return systemd_runs() and any(Path(folder, "systemd/system", SERVICE.source).exists() for folder in folders)
+    return systemd_runs() and any(Path(folder, "systemd/system", SERVICE).exists() for folder in folders)
 
 
-def _command(run: Run, *words: str) -> Step:
+def _command(run: Run, *words: str) -> InstallStep:
     line = " ".join(words)
     why = run(words)
-    return Step(line, "done") if why is None else Step(line, "failed", why)
+    return InstallStep(line, "done") if why is None else InstallStep(line, "failed", why)
 
 
 def _run(words: Sequence[str]) -> str | None:

@@ -1,7 +1,4 @@
-"""Which device speaks? Every decoder there is has a go at the same bytes; what it accepts is counted.
-
-Pure: whoever has the bytes asks. A family that joins the registry is recognised without a word here.
-"""
+"""Recognise a device by its bytes: every decoder of the registry reads them, and the one that accepts most wins."""
 
 from __future__ import annotations
 
@@ -10,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from companion.protocols.registry import PROTOCOLS, Kind, main_kind
+from companion.protocols.registry import DEVICES, Kind, main_kind
 
 Parity = Literal["none", "even", "odd"]
 
 COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
 ENOUGH_BYTES: Final = 1500
-"""Six frames of the longest kind: where none of them was one, more will not be."""
+"""Six frames of the longest kind: if no decoder has understood one, none will."""
 
 _LEAST_FRAMES: Final = 2
 _SURE_FRAMES: Final = 4
@@ -59,32 +56,28 @@ class Candidate:
         return self.accepted >= _SURE_FRAMES and self.accepted >= 4 * self.rejected
 
 
-def candidates(data: bytes, seconds_per_byte: float = 0.0) -> list[Candidate]:
+def candidates(data: bytes) -> list[Candidate]:
     """List the protocols that these bytes may be, the likeliest first."""
-    kinds: dict[tuple[str, type], list[Kind]] = {}
-    for kind, protocols in PROTOCOLS.items():
-        for info in protocols.values():
-            kinds.setdefault((info.name, info.decoder), []).append(kind)
     found = []
-    for (name, make), serves in kinds.items():
-        decoder = make(seconds_per_byte)
+    for info, kinds in DEVICES.items():
+        decoder = info.decoder()
         decoder.interrupted()  # the first frame lacks its beginning
         decoder.feed(data, 0.0)
         if decoder.accepted:
             rejected = max(decoder.rejected.total() - 1, 0)
-            serves.sort(key=lambda kind: kind != main_kind(name))
-            found.append(Candidate(name, tuple(serves), decoder.accepted, rejected))
+            main_first = sorted(kinds, key=lambda kind: kind != main_kind(info.name))
+            found.append(Candidate(info.name, tuple(main_first), decoder.accepted, rejected))
     return sorted(found, key=lambda one: (one.likely, one.accepted - 2 * one.rejected), reverse=True)
 
 
 def likeliest(data: bytes) -> Candidate | None:
-    """The first of `candidates` if it is more than chance."""
+    """Return the first of `candidates` if it is more than chance."""
     return next((one for one in candidates(data) if one.likely), None)
 
 
 def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
-    """Line settings in the order in which trying them is worth most, each once; what is believed already, first."""
-    defaults = [Line(info.baud, info.parity) for kind in PROTOCOLS.values() for info in kind.values()]
+    """Yield line settings, the likeliest first, each once; `first`: settings believed already."""
+    defaults = [Line(info.baud, info.parity) for info in DEVICES]
     bauds = dict.fromkeys([*(line.baud for line in (*first, *defaults)), *COMMON_BAUDS])
     parities: tuple[Parity, ...] = ("none", "even", "odd")
     rest = [Line(baud, parity) for parity in parities for baud in bauds]
@@ -92,7 +85,7 @@ def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
 
 
 def strangers(data: bytes) -> str | None:
-    """In a few words who it is when it is no sensor: a login console, a modem's commands, an autopilot."""
+    """Name a speaker that is no sensor: a login console, a modem's commands, an autopilot."""
     if _CONSOLE.search(data):
         return "a login console or kernel messages"
     if _MODEM.search(data):
@@ -108,12 +101,12 @@ def looks_garbled(data: bytes) -> bool:
 
 
 def plain_share(data: bytes) -> float:
-    """The share of bytes that a text may hold, 0 to 1; 0 of nothing."""
+    """Return the share of bytes that a text may hold, 0 to 1; 0 without any bytes."""
     return len(data.translate(None, _NOT_PLAIN)) / len(data) if data else 0.0
 
 
 def is_mavlink(data: bytes) -> bool:
-    """A few packets in a row, each of which begins where the one before ends."""
+    """Return whether a few packets follow one another without a gap."""
     for start in range(len(data)):
         at = start
         for _ in range(_MAVLINK_RUN):

@@ -5,10 +5,11 @@ A decoder gives the tilt of a frame once, as `TiltSample` or in its `CompassSamp
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Final, Literal
 
 from companion.config.sections import Law
 from companion.errors import ConfigError
@@ -34,11 +35,10 @@ Kind = Literal["imu", "gradienter", "compass"]
 
 @dataclass(frozen=True, slots=True)
 class ProtocolInfo:
-    """One protocol: its decoder, and the line settings of a device as it comes from the factory."""
+    """One protocol as a device of one kind: its decoder, and the device's line as it comes from the factory."""
 
     name: str
     baud: int
-    parity: Literal["none", "even", "odd"]
     decoder: type[Decoder]
     dialogue: Callable[[], Dialogue] | None = None
     lag_s: float = 0.0
@@ -48,56 +48,57 @@ class ProtocolInfo:
     tilted_sigma_deg: float | None = None
     law: Law | None = None
     """Meaning of a gradienter's two readings by its documents; None: the user must say."""
+    parity: Literal["none", "even", "odd"] = "none"
 
 
-# One device may stand under several kinds: then its line, decoder and dialogue are the same under each.
-PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
-    "imu": {
-        "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder, VectorNavDialogue),
-        "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
-        # 9600 baud carries 21 of its usual epochs a second; a faster line is set with the vendor's program.
-        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder),
-        # The 3DM-GX5's and CV5's rate, from memory and not from a document.
-        "mip": ProtocolInfo("mip", 115200, "none", MipDecoder, MipDialogue),
-        "xsens": ProtocolInfo("xsens", 115200, "none", XsensDecoder, XsensDialogue),
-        # Of the rates that can be ordered (TS1524, table 5-11: 374400 to 1843200) the usual one, from memory.
-        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder),
+DEVICES: Final[dict[ProtocolInfo, dict[Kind, dict[str, Any]]]] = {
+    ProtocolInfo("vectornav", 115200, VectorNavDecoder, VectorNavDialogue): {"imu": {}},
+    ProtocolInfo("imu_line", 500000, ImuLineDecoder): {"imu": {}},
+    # 9600 baud carries 21 of its usual epochs a second; a faster line is set with the vendor's program.
+    # WitMotion prints 0.2 deg for the WT9011; the SINxT are sold as better.
+    ProtocolInfo("witmotion", 9600, WitMotionDecoder): {"imu": {}, "gradienter": {"sigma_deg": 0.2, "law": "euler"}},
+    # The 3DM-GX5's and CV5's rate, from memory and not from a document.
+    ProtocolInfo("mip", 115200, MipDecoder, MipDialogue): {"imu": {}},
+    ProtocolInfo("xsens", 115200, XsensDecoder, XsensDialogue): {"imu": {}},
+    # Of the rates that can be ordered (TS1524, table 5-11: 374400 to 1843200) the usual one, from memory. Lag: the
+    # slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
+    ProtocolInfo("stim300", 921600, Stim300Decoder): {"imu": {}, "gradienter": {"lag_s": 0.01, "law": "axis"}},
+    # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
+    # parity.
+    ProtocolInfo("inclinometer_xy", 9600, InclinometerXyDecoder, InclinometerXyDialogue): {
+        "gradienter": {"lag_s": 0.43}
     },
-    "gradienter": {
-        # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
-        # parity.
-        "inclinometer_xy": ProtocolInfo(
-            "inclinometer_xy", 9600, "none", InclinometerXyDecoder, InclinometerXyDialogue, lag_s=0.43
-        ),
-        # MD900-T. How long its fluid takes is not documented.
-        "jewell": ProtocolInfo("jewell", 9600, "none", JewellDecoder, JewellDialogue),
-        # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most.
-        "hmr3300": ProtocolInfo(
-            "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=math.hypot(0.4, 0.5), law="euler"
-        ),
-        # Of the compass' frame the law would be "euler", of the inclinometer's "axis" is likely: not said.
-        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
-        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue, law="euler"),
-        # WitMotion prints 0.2 deg for the WT9011; the SINxT are sold as better.
-        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, sigma_deg=0.2, law="euler"),
-        # The slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
-        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder, lag_s=0.01, law="axis"),
-        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29, law="axis"),
-        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
+    # MD900-T. How long its fluid takes is not documented.
+    ProtocolInfo("jewell", 9600, JewellDecoder, JewellDialogue): {"gradienter": {}},
+    # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most. Heading:
+    # 1 deg rms level, 3 deg to 30 deg of tilt.
+    ProtocolInfo("hmr3300", 19200, Hmr3300Decoder, Hmr3300Dialogue): {
+        "gradienter": {"sigma_deg": math.hypot(0.4, 0.5), "law": "euler"},
+        "compass": {"sigma_deg": 1.0, "tilted_sigma_deg": 3.0},
     },
-    "compass": {
-        # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.
-        "hmr3300": ProtocolInfo(
-            "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=1.0, tilted_sigma_deg=3.0
-        ),
-        # An HMR3000, with its first filter's usual time constant of 4 steps of 72 ms. NMEA 0183 itself has 4800 baud.
-        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
-        # OceanServer: 0.5 deg rms level, 1 deg to 30 deg of tilt.
-        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder, sigma_deg=0.5, tilted_sigma_deg=1.0),
-        # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
-        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
-        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
+    # An HMR3000, with its first filter's usual time constant of 4 steps of 72 ms. NMEA 0183 itself has 4800 baud.
+    ProtocolInfo("nmea", 19200, NmeaDecoder, Hmr3000Dialogue, lag_s=0.29): {
+        "gradienter": {"law": "axis"},
+        "compass": {},
     },
+    # OceanServer: 0.5 deg rms level, 1 deg to 30 deg of tilt.
+    ProtocolInfo("os5000", 19200, Os5000Decoder): {
+        "gradienter": {},
+        "compass": {"sigma_deg": 0.5, "tilted_sigma_deg": 1.0},
+    },
+    # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
+    ProtocolInfo("pni", 38400, PniDecoder, PniDialogue): {"gradienter": {"law": "euler"}, "compass": {}},
+    # Of the compass' frame the law would be "euler", of the inclinometer's "axis" is likely: not said.
+    ProtocolInfo("rion", 9600, RionDecoder, RionDialogue): {"gradienter": {}, "compass": {}},
+}
+"""One device of each protocol, and what differs where it serves as one kind or another."""
+
+_KINDS: Final[tuple[Kind, ...]] = ("imu", "gradienter", "compass")
+PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {
+    kind: {
+        info.name: dataclasses.replace(info, **figures[kind]) for info, figures in DEVICES.items() if kind in figures
+    }
+    for kind in _KINDS
 }
 
 
@@ -107,9 +108,7 @@ def main_kind(name: str) -> Kind:
     for kind in kinds:
         if name in PROTOCOLS[kind]:
             return kind
-    raise ConfigError(
-        f"found protocol {name!r}; allowed: {', '.join(sorted({n for o in PROTOCOLS.values() for n in o}))}"
-    )
+    raise ConfigError(f"found protocol {name!r}; allowed: {', '.join(sorted(info.name for info in DEVICES))}")
 
 
 def part_for(role: Kind, sample: Sample) -> Sample | None:

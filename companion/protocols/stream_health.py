@@ -1,7 +1,4 @@
-"""What is wrong with a stream of bytes and samples, as far as the stream itself tells.
-
-Pure: time comes in. Fed with every chunk that was read and the samples it completed; asked now and then.
-"""
+"""Faults of a stream of bytes and samples, as far as the stream itself shows them. Pure: time comes in."""
 
 from __future__ import annotations
 
@@ -37,8 +34,10 @@ _HARMLESS: Final = frozenset(
         reasons.OVER_RANGE,
         reasons.REPLY,
         reasons.SINGLE_AXIS,
+        reasons.UNKNOWN_FIELD,
+        reasons.UNKNOWN_GROUP,
+        reasons.UNKNOWN_SENTENCE,
     }
-    | {reasons.UNKNOWN_FIELD, reasons.UNKNOWN_GROUP, reasons.UNKNOWN_SENTENCE}
 )
 _DAMAGED_SHARE: Final = 0.1
 _DAMAGED_FRAMES: Final = 3
@@ -54,11 +53,8 @@ class Trouble:
     implausible: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Mark:
-    t_s: float
-    accepted: int
-    rejected: Counter[str]
+_Counts = tuple[int, Counter[str]]
+"""Frames accepted, and rejected by reason."""
 
 
 class StreamHealth:
@@ -67,32 +63,27 @@ class StreamHealth:
     def __init__(self, protocol: str, decoder: Decoder) -> None:
         self._protocol, self._decoder = protocol, decoder
         self.last_sample_s: float | None = None
+        self._marks: deque[tuple[float, _Counts]] = deque()
+        self.opened()
+
+    def opened(self) -> None:
+        """Begin anew: the port was opened (again)."""
+        self._tail = b""
         self.last_byte_s: float | None = None
         self.unchanged_since_s: float | None = None
         self.near_since_s: float | None = None
+        self._reading: tuple[object, ...] = ()
+        self._near: tuple[float, ...] = ()
+        self._same = 0
         self.speaks: str | None = None
-        self._tail = b""
-        self._reading: object = None
-        self._near: tuple[float, ...] | None = None
-        self._same = 0
-        self._marks: deque[_Mark] = deque()
-        self._guessed_s = -math.inf
-        self._guess = ""
-
-    def opened(self) -> None:
-        """The port was opened (again): what came before has no continuation."""
-        self._tail = b""
-        self.last_byte_s = self.unchanged_since_s = self._reading = None
-        self.near_since_s = self._near = None
-        self._same = 0
-        self.speaks, self._guess, self._guessed_s = None, "", -math.inf
+        self._guess, self._guessed_s = "", -math.inf
 
     def excuse(self) -> None:
         """Forget the damage so far: its cause is known."""
         self._marks.clear()
 
     def took(self, data: bytes, samples: Sequence[Sample], t_s: float) -> None:
-        """Bytes were read at `t_s` and have completed these samples."""
+        """Note bytes that were read at `t_s`, and the samples that they completed."""
         self.last_byte_s = t_s
         if not samples:
             self._tail = (self._tail + data)[-TAIL_BYTES:]
@@ -101,32 +92,23 @@ class StreamHealth:
         self._compare(samples[-1], len(samples), t_s)
 
     def _compare(self, sample: Sample, count: int, t_s: float) -> None:
-        reading: object
+        reading: tuple[object, ...]
+        angles_deg: tuple[float, ...] = ()
         if isinstance(sample, ImuSample):
             reading = (sample.gyro_rad_s, sample.accel_m_s2)
         elif isinstance(sample, TiltSample):
-            reading = (sample.x_deg, sample.y_deg)
-            self._look_whether_near(reading, t_s)
+            reading = angles_deg = (sample.x_deg, sample.y_deg)
         elif isinstance(sample, CompassSample):
             reading = (sample.heading_deg, sample.pitch_deg, sample.roll_deg)
-            self._look_whether_near((sample.heading_deg,), t_s)
+            angles_deg = (sample.heading_deg,)
         else:
             return
+        if angles_deg and not _are_near(self._near, angles_deg):
+            self._near, self.near_since_s = angles_deg, t_s
         if reading == self._reading:
             self._same += count
             return
         self._reading, self._same, self.unchanged_since_s = reading, 0, t_s
-
-    def _look_whether_near(self, angles_deg: tuple[float, ...], t_s: float) -> None:
-        near = self._near
-        if (
-            near is None
-            or len(near) != len(angles_deg)
-            or any(
-                abs(math.remainder(one - other, 360.0)) > NEAR_DEG for one, other in zip(near, angles_deg, strict=True)
-            )
-        ):
-            self._near, self.near_since_s = angles_deg, t_s
 
     def trouble(self, now_s: float) -> Trouble | None:
         """Return the present fault of an open port at `now_s`."""
@@ -134,20 +116,18 @@ class StreamHealth:
         if self.last_sample_s is None or now_s - self.last_sample_s >= SILENT_AFTER_S:
             return self._without_samples(now_s, lately)
         self.speaks = None
-        return self._lying() or self._in_part(lately)
+        return self._stuck() or _valueless(lately) or _damaged(lately)
 
-    def _without_samples(self, now_s: float, lately: _Mark) -> Trouble:
+    def _without_samples(self, now_s: float, lately: _Counts) -> Trouble:
         if self.last_byte_s is None or now_s - self.last_byte_s >= SILENT_AFTER_S:
             return Trouble(SILENT, "silent (power? wiring? told to stop?)")
         if (valueless := _valueless(lately)) is not None:
             return valueless
         if now_s - self._guessed_s >= GUESS_EVERY_S and len(self._tail) >= TAIL_BYTES // 8:
             self._guessed_s, self._guess = now_s, self._guesses()
-        rejected = ", ".join(f"{count} {why}" for why, count in self._decoder.rejected.most_common(_MOST_DAMAGE_NAMED))
+        rejected = _named(self._decoder.rejected) or "none begun"
         guess = self._guess or "wrong baud or protocol?"
-        return Trouble(
-            "undecodable", f"bytes come, but no {self._protocol} frames ({rejected or 'none begun'}); {guess}"
-        )
+        return Trouble("undecodable", f"bytes come, but no {self._protocol} frames ({rejected}); {guess}")
 
     def _guesses(self) -> str:
         found = likeliest(self._tail)
@@ -160,43 +140,54 @@ class StreamHealth:
             return "wrong baud or parity?"
         return ""
 
-    def _lying(self) -> Trouble | None:
+    def _stuck(self) -> Trouble | None:
         since_s, last_s = self.unchanged_since_s, self.last_sample_s
         if since_s is None or last_s is None or self._same < STUCK_SAMPLES or last_s - since_s < STUCK_S:
             return None
-        if isinstance(self._reading, tuple) and isinstance(self._reading[0], tuple):
-            words = f"stuck: {self._same + 1} equal readings; switch its power off and on"
-            return Trouble("stuck", words, implausible=True)
-        return None
+        if not isinstance(self._reading[0], tuple):
+            return None  # no IMU: a still gradienter or compass repeats its digits
+        words = f"stuck: {self._same + 1} equal readings; switch its power off and on"
+        return Trouble("stuck", words, implausible=True)
 
-    def _in_part(self, lately: _Mark) -> Trouble | None:
-        if (valueless := _valueless(lately)) is not None:
-            return valueless
-        damage = Counter({why: n for why, n in lately.rejected.items() if why not in _HARMLESS})
-        damaged = damage.total()
-        if damaged < _DAMAGED_FRAMES or damaged < _DAMAGED_SHARE * (lately.accepted + damaged):
-            return None
-        percent = 100 * damaged // (lately.accepted + damaged)
-        named = ", ".join(f"{count} {why}" for why, count in damage.most_common(_MOST_DAMAGE_NAMED))
-        return Trouble(
-            "damaged", f"{percent} % of its frames are damaged ({named}): a second reader? wire, ground, levels?"
-        )
-
-    def _lately(self, now_s: float) -> _Mark:
+    def _lately(self, now_s: float) -> _Counts:
+        """Count the frames of the last `SPAN_S`."""
         marks, decoder = self._marks, self._decoder
-        if not marks or now_s - marks[-1].t_s >= SPAN_S / 4:
-            marks.append(_Mark(now_s, decoder.accepted, Counter(decoder.rejected)))
-        while len(marks) > 1 and now_s - marks[1].t_s >= SPAN_S:
+        if not marks or now_s - marks[-1][0] >= SPAN_S / 4:
+            marks.append((now_s, (decoder.accepted, Counter(decoder.rejected))))
+        while len(marks) > 1 and now_s - marks[1][0] >= SPAN_S:
             marks.popleft()
-        oldest = marks[0]
-        return _Mark(now_s, decoder.accepted - oldest.accepted, Counter(decoder.rejected) - oldest.rejected)
+        accepted, rejected = marks[0][1]
+        return decoder.accepted - accepted, Counter(decoder.rejected) - rejected
 
 
-def _valueless(lately: _Mark) -> Trouble | None:
-    least = _DAMAGED_SHARE * max(lately.accepted, 1)
-    if (count := lately.rejected[reasons.NON_FINITE]) and count >= least:
+def _are_near(ones_deg: tuple[float, ...], others_deg: tuple[float, ...]) -> bool:
+    if len(ones_deg) != len(others_deg):
+        return False
+    pairs = zip(ones_deg, others_deg, strict=True)
+    return all(abs(math.remainder(one - other, 360.0)) <= NEAR_DEG for one, other in pairs)
+
+
+def _named(counts: Counter[str]) -> str:
+    return ", ".join(f"{count} {why}" for why, count in counts.most_common(_MOST_DAMAGE_NAMED))
+
+
+def _valueless(lately: _Counts) -> Trouble | None:
+    accepted, rejected = lately
+    least = _DAMAGED_SHARE * max(accepted, 1)
+    if (count := rejected[reasons.NON_FINITE]) and count >= least:
         words = f"NaN in {count} whole frames: the device has no valid reading; switch its power off and on"
         return Trouble(reasons.NON_FINITE, words)
-    if (count := lately.rejected[reasons.OVER_RANGE]) and count >= least:
+    if (count := rejected[reasons.OVER_RANGE]) and count >= least:
         return Trouble(reasons.OVER_RANGE, f"{count} readings are over range: level it")
     return None
+
+
+def _damaged(lately: _Counts) -> Trouble | None:
+    accepted, rejected = lately
+    damage = Counter({why: n for why, n in rejected.items() if why not in _HARMLESS})
+    damaged = damage.total()
+    if damaged < _DAMAGED_FRAMES or damaged < _DAMAGED_SHARE * (accepted + damaged):
+        return None
+    percent = 100 * damaged // (accepted + damaged)
+    words = f"{percent} % of its frames are damaged ({_named(damage)}): a second reader? wire, ground, levels?"
+    return Trouble("damaged", words)

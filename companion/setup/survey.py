@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -32,27 +32,34 @@ LISTEN_TURNS: Final = 30
 listens longer."""
 
 
-@dataclass(frozen=True, slots=True)
-class HeardUdp:
+class HeardUdp(asyncio.DatagramProtocol):
     """Messages heard on a UDP port."""
 
-    port: int
-    senders: tuple[Heartbeat, ...]
-    datagrams: int
-    from_here: bool
+    def __init__(self, senders: Iterable[Heartbeat] = (), *, from_here: bool = True) -> None:
+        self.senders = dict.fromkeys(senders)
+        self.from_here = from_here
+        self.datagrams = 0
+        self.enough = asyncio.Event()
 
     @property
     def autopilot(self) -> Heartbeat | None:
-        """The first one that speaks there."""
+        """The first autopilot heard."""
         return next((one for one in self.senders if one.is_autopilot), None)
+
+    def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
+        """Note the senders of a datagram."""
+        self.datagrams += 1
+        self.from_here &= ipaddress.ip_address(addr[0]).is_loopback
+        self.senders |= dict.fromkeys(heartbeats(data))
+        if self.autopilot is not None:
+            self.enough.set()
 
 
 async def listen_udp(port: int) -> HeardUdp:
     """Receive until an autopilot is heard or time is over; raise LinkError where the port cannot be opened."""
-    heard = _Heard()
     try:
-        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: heard,
+        transport, heard = await asyncio.get_running_loop().create_datagram_endpoint(
+            HeardUdp,
             local_addr=("0.0.0.0", port),  # noqa: S104
         )
     except OSError as error:
@@ -63,36 +70,7 @@ async def listen_udp(port: int) -> HeardUdp:
                 break
     finally:
         transport.close()
-    return HeardUdp(
-        port, tuple(sorted(heard.senders, key=lambda one: not one.is_autopilot)), heard.datagrams, heard.from_here
-    )
-
-
-class _Heard(asyncio.DatagramProtocol):
-    def __init__(self) -> None:
-        self.enough = asyncio.Event()
-        self.senders: dict[Heartbeat, None] = {}
-        self.datagrams = 0
-        self.from_here = True
-
-    def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self.datagrams += 1
-        self.from_here &= ipaddress.ip_address(addr[0]).is_loopback
-        self.senders |= dict.fromkeys(heartbeats(data))
-        if any(one.is_autopilot for one in self.senders):
-            self.enough.set()
-
-
-@dataclass(frozen=True, slots=True)
-class FoundAutopilot:
-    """An autopilot, and how to reach it."""
-
-    url: str
-    who: Heartbeat
-
-    def __str__(self) -> str:
-        """For people."""
-        return f"{self.who}: {self.url}"
+    return heard
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +83,7 @@ class FoundDevice:
     kind: Kind
 
     def __str__(self) -> str:
-        """For people."""
+        """Format it for people."""
         return f"{self.protocol}: {self.port}, {self.line}"
 
 
@@ -117,15 +95,15 @@ class Survey:
     udp: dict[int, HeardUdp | str]
 
     @property
-    def autopilots(self) -> list[FoundAutopilot]:
-        """List the autopilots, those on wires of their own first."""
+    def autopilots(self) -> list[str]:
+        """List the urls of the autopilots, those on wires of their own first."""
         wired = [
-            FoundAutopilot(f"serial:{port}:{heard.line.baud}", heard.heartbeat)
+            f"serial:{port}:{heard.line.baud}"
             for port, heard in self.serial.items()
             if not isinstance(heard, str) and heard.heartbeat is not None and heard.line is not None
         ]
         return wired + [
-            FoundAutopilot(f"udpin:{'127.0.0.1' if heard.from_here else '0.0.0.0'}:{port}", heard.autopilot)  # noqa: S104
+            f"udpin:{'127.0.0.1' if heard.from_here else '0.0.0.0'}:{port}"  # noqa: S104
             for port, heard in self.udp.items()
             if not isinstance(heard, str) and heard.autopilot is not None
         ]
@@ -198,7 +176,7 @@ def in_words(place: str, found: Heard | HeardUdp | str) -> str:
         return f"left alone: {found.removeprefix(f'{place}: ')}"
     if isinstance(found, HeardUdp):
         if found.senders:
-            return "; ".join(map(str, found.senders))
+            return "; ".join(map(str, sorted(found.senders, key=lambda one: not one.is_autopilot)))
         return "silent" if not found.datagrams else "something that is no MAVLink"
     if found.heartbeat is not None:
         return f"{found.heartbeat} ({found.line})"

@@ -17,7 +17,7 @@ from companion import cli
 from companion.errors import CompanionError
 from companion.installation import install as installation
 from companion.installation import install as installing
-from companion.installation.install import Target, install, uninstall, unreachable
+from companion.installation.install import Installation, install, uninstall, unreachable
 
 UNIT = "usr/local/lib/systemd/system/companion.service"
 FIRST_RUN = "usr/local/lib/systemd/system/companion-setup.service"
@@ -32,8 +32,8 @@ needs_systemd_analyze = pytest.mark.skipif(
 )
 
 
-def target(root: Path, *, executable: str = EXECUTABLE) -> Target:
-    return Target(root, Path("/usr/local"), executable)
+def target(root: Path, *, executable: str = EXECUTABLE) -> Installation:
+    return Installation(root, Path("/usr/local"), executable)
 
 
 def outcomes(root: Path, steps: Sequence[object]) -> dict[str, str]:

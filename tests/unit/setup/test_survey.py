@@ -21,13 +21,12 @@ def test_autopilots_on_wires_come_first_and_stations_are_none() -> None:
     found = Survey(
         {"/dev/a": Heard(Line(921600, "none"), None, "MAVLink", 900, PX4), "/dev/b": SILENT, "/dev/c": "in use"},
         {
-            14540: HeardUdp(14540, (PX4,), 3, from_here=True),
-            14550: HeardUdp(14550, (STATION,), 9, from_here=False),
-            14551: HeardUdp(14551, (PX4, STATION), 9, from_here=False),
+            14540: HeardUdp([PX4]),
+            14550: HeardUdp([STATION], from_here=False),
+            14551: HeardUdp([PX4, STATION], from_here=False),
         },
     )
-    urls = [one.url for one in found.autopilots]
-    assert urls == ["serial:/dev/a:921600", "udpin:127.0.0.1:14540", "udpin:0.0.0.0:14551"]
+    assert found.autopilots == ["serial:/dev/a:921600", "udpin:127.0.0.1:14540", "udpin:0.0.0.0:14551"]
 
 
 def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
@@ -50,7 +49,7 @@ def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
 
 
 def _nobody() -> HeardUdp:
-    return HeardUdp(14550, (), 0, from_here=True)
+    return HeardUdp()
 
 
 def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:
