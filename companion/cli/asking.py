@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import os
 import sys
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -14,7 +14,7 @@ from typing import Final, Self
 from companion.cli.terminal import print_address, print_lines
 from companion.errors import CalibrationRefusedError, CompanionError, ConfigError
 from companion.formats import Object
-from companion.setup.draft import one_of
+from companion.setup.draft import Question, one_of
 
 _MOST_BYTES: Final = 4096
 OPEN_WITHIN_S: Final = 5.0
@@ -35,25 +35,25 @@ class Asking:
         """Print lines."""
         print_lines(*lines, error=self._error)
 
-    async def ask(
-        self, question: str, now: str, put: Callable[[str], None], hint: str = "", choices: Sequence[str] = ()
-    ) -> None:
-        """Ask until `put` accepts the answer, else raises ConfigError; an empty answer, or `yes`, means `now`.
+    async def ask(self, question: Question) -> None:
+        """Ask until an answer is accepted; an empty one, or `yes`, means the present one.
 
-        `choices` become buttons on a page. Raise CompanionError at the end of stdin.
+        Raises:
+            CompanionError: stdin has ended; or, with `yes`, the present answer is not accepted.
         """
+        now = question.now
         if self.yes:
-            put(now)
-            self.say(f"{question.rstrip('?')}: {now}")
+            question.put(now)
+            self.say(f"{question.words.rstrip('?')}: {now}")
             return
-        self.say("", question, *([f"  {hint}"] if hint else []))
+        self.say("", question.words, *([f"  {question.hint}"] if question.hint else []))
         while True:
             print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
             answer = (await self._line()).strip() or now
             if self._echoes:
                 self.say(answer)
             try:
-                put(answer)
+                question.put(answer)
             except ConfigError as error:
                 self.say(f"  {error}")
             else:
@@ -67,7 +67,7 @@ class Asking:
             nonlocal found
             found = one_of(words, ("yes", "no")) == "yes"
 
-        await self.ask(question, "yes" if by_default else "no", put, hint, ("yes", "no"))
+        await self.ask(Question(question, "yes" if by_default else "no", put, hint, ("yes", "no")))
         return found
 
     async def _line(self) -> str:
@@ -144,12 +144,11 @@ class PageAsking(Asking):
         super().say(*lines)
         self._lines += lines
 
-    async def ask(  # noqa: D102 - as in the base class
-        self, question: str, now: str, put: Callable[[str], None], hint: str = "", choices: Sequence[str] = ()
-    ) -> None:
-        self._question = {"words": question, "hint": hint, "now": now, "choices": list(choices)}
+    async def ask(self, question: Question) -> None:  # noqa: D102 - as in the base class
+        shown = ("words", "hint", "now", "choices")
+        self._question = {key: getattr(question, key) for key in shown}
         try:
-            await super().ask(question, now, put, hint, choices)
+            await super().ask(question)
         finally:
             self._question = None
 

@@ -1,4 +1,4 @@
-"""`companion setup`: from what is connected, and three answers, to a configuration that works."""
+"""`companion setup`: makes a configuration that works from the connected devices and three answers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CHECK_S: Final = 10.0
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
-    """`companion setup`; `goes_on`: the daemon starts behind it, in this process."""
+    """`companion setup`; `goes_on`: the daemon starts after it, in this process."""
     if options.page is None:
         session = _Session(options, Asking(yes=options.yes, error=options.json))
         await _to_the_end(session)
@@ -61,7 +61,6 @@ def _bind(options: argparse.Namespace) -> str:
 
 
 def _storage(options: argparse.Namespace) -> Path:
-    """The storage that the daemon will have."""
     path = config_path(options)
     try:
         return config.load(path).storage.path
@@ -81,7 +80,7 @@ async def _to_the_end(session: _Session) -> None:
 
 
 class _Session:
-    """One run of it."""
+    """One run of `companion setup`."""
 
     def __init__(self, options: argparse.Namespace, asking: Asking, *, goes_on: bool = False) -> None:
         self.asking, self._goes_on = asking, goes_on
@@ -94,7 +93,6 @@ class _Session:
         }  # fmt: skip
 
     async def run(self) -> None:
-        """Run the whole session."""
         say = self.asking.say
         if not drafting.is_writable(self._path):
             raise CompanionError(
@@ -204,7 +202,7 @@ class _Session:
                 "No autopilot was heard. Has it power? Is its port set to MAVLink 2? TX to RX, RX to TX, ground?",
                 "Where is it: serial:/dev/serial0:921600, udpin:0.0.0.0:14550, or tcp:HOST:PORT?",
             )
-            await self.asking.ask("Autopilot", "", draft.take_url)
+            await self.asking.ask(Question("Autopilot", "", draft.take_url))
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
         """Choose a device that is heard; keep a configured one whose port somebody holds."""
@@ -243,7 +241,7 @@ class _Session:
             chosen = names[int(words) - 1]
 
         numbers = [str(number) for number in range(1, len(names) + 1)]
-        await self.asking.ask(f"{what}: which?", "1", put, choices=numbers)
+        await self.asking.ask(Question(f"{what}: which?", "1", put, choices=numbers))
         return chosen
 
     async def _ask(self, draft: Draft, questions: Sequence[Question], given: dict[str, str]) -> None:
@@ -258,7 +256,7 @@ class _Session:
                     raise ConfigError(f"{question.key}: {error}") from None
                 self.asking.say(f"{question.key}: {given[question.key]}")
             elif not self.asking.yes:
-                await self.asking.ask(question.words, question.now, question.put, question.hint, question.choices)
+                await self.asking.ask(question)
             else:
                 guess = " (a guess)" if question.key in draft.guessed else ""
                 self.asking.say(f"{question.key}: {question.now}{guess}")

@@ -28,6 +28,14 @@ def check_together(config: Config, name: str) -> None:
         raise ConfigError(f"{name}: {complaint}")
 
 
+def _wrong(key: str, found: object, allowed: str) -> str:
+    return f"{key!r}: found {found}; allowed: {allowed}"
+
+
+def _missing(key: str, allowed: str, needed_by: str) -> str:
+    return f"{key!r} is missing; allowed: {allowed} (needed by {needed_by})"
+
+
 def _complaints(config: Config) -> Iterator[str]:
     yield from _imus(config)
     for section in ("gradienter", "compass"):
@@ -45,15 +53,15 @@ def _complaints(config: Config) -> Iterator[str]:
     if config.mqtt is not None:
         yield from broker_complaints(config.mqtt)
     elif config.fleet is not None:
-        yield "'mqtt' is missing; allowed: a table with the broker's host (needed by [fleet])"
+        yield _missing("mqtt", "a table with the broker's host", "[fleet]")
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
-        yield "'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"
+        yield _wrong("vehicle", "only one of latitude_deg and longitude_deg", "both or neither")
     room_mb = config.storage.recordings_mb
     if room_mb is not None and 0 < room_mb < LEAST_RECORDINGS_MB:
-        yield f"'storage.recordings_mb': found {room_mb}; allowed: 0 (none) or at least {LEAST_RECORDINGS_MB}"
+        yield _wrong("storage.recordings_mb", room_mb, f"0 (none) or at least {LEAST_RECORDINGS_MB}")
     limits = config.calibration
     if limits.max_s < limits.min_still_s:
-        yield f"'calibration.max_s': found {limits.max_s:g}; allowed: at least min_still_s ({limits.min_still_s:g})"
+        yield _wrong("calibration.max_s", f"{limits.max_s:g}", f"at least min_still_s ({limits.min_still_s:g})")
 
 
 def _imus(config: Config) -> Iterator[str]:
@@ -62,19 +70,15 @@ def _imus(config: Config) -> Iterator[str]:
     for index, imu in enumerate(config.imu):
         here = f"imu[{index}]"
         if imu.name in seen:
-            yield (
-                f"'{here}.name': found {imu.name!r}, which imu[{seen[imu.name]}] has already;"
-                " allowed: a name of its own for each IMU"
-            )
+            found = f"{imu.name!r}, which imu[{seen[imu.name]}] has already"
+            yield _wrong(f"{here}.name", found, "a name of its own for each IMU")
         seen[imu.name] = index
         yield from _imu(imu, here)
         yield from _mounting(imu.mounting, f"{here}.mounting")
         target = (imu.instance or 1) if imu.source == "autopilot" else imu.autopilot_instance
         if target is not None and target in autopilot_instances:
-            yield (
-                f"'{here}': found autopilot IMU {target} a second time (imu {autopilot_instances[target]!r} has it);"
-                " allowed: one source for each autopilot IMU"
-            )
+            found = f"autopilot IMU {target} a second time (imu {autopilot_instances[target]!r} has it)"
+            yield _wrong(here, found, "one source for each autopilot IMU")
         if target is not None:
             autopilot_instances[target] = imu.name
 
@@ -83,39 +87,35 @@ def _imu(imu: Imu, here: str) -> Iterator[str]:
     if imu.source == "serial":
         for key, what in (("port", PORT_WORDS), ("protocol", allowed("imu.protocol"))):
             if getattr(imu, key) is None:
-                yield f"'{here}.{key}' is missing; allowed: {what} (needed by source = \"serial\")"
+                yield _missing(f"{here}.{key}", what, 'source = "serial"')
         yield from _port(imu.port or "", f"{here}.port")
         if imu.instance is not None:
-            yield (
-                f"'{here}.instance': found {imu.instance}; allowed: only with source = \"autopilot\""
-                " (autopilot_instance names the autopilot's IMU that this one is)"
-            )
+            why = "autopilot_instance names the autopilot's IMU that this one is"
+            yield _wrong(f"{here}.instance", imu.instance, f'only with source = "autopilot" ({why})')
         return
     if imu.mounting != "ROTATION_NONE":
-        yield (
-            f"'{here}.mounting': found {imu.mounting!r}; allowed: {_SERIAL} (the autopilot's telemetry is in the"
-            " vehicle's axes already)"
-        )
+        why = "the autopilot's telemetry is in the vehicle's axes already"
+        yield _wrong(f"{here}.mounting", repr(imu.mounting), f"{_SERIAL} ({why})")
     for key in ("port", "baud", "protocol", "autopilot_instance"):
         if (found := getattr(imu, key)) is not None:
-            yield f"'{here}.{key}': found {found!r}; allowed: {_SERIAL} (this IMU is read over MAVLink)"
+            yield _wrong(f"{here}.{key}", repr(found), f"{_SERIAL} (this IMU is read over MAVLink)")
     if imu.read_only:
-        yield f"'{here}.read_only': found true; allowed: {_SERIAL} (nothing is said to an autopilot's IMU)"
+        yield _wrong(f"{here}.read_only", "true", f"{_SERIAL} (nothing is said to an autopilot's IMU)")
 
 
 def _field_heading(config: Config) -> Iterator[str]:
     if config.compass is None or config.compass.heading != "field":
         return
     if config.gradienter is None:
-        yield "'compass.heading': found 'field'; allowed: only with a [gradienter], whose tilt it needs"
+        yield _wrong("compass.heading", "'field'", "only with a [gradienter], whose tilt it needs")
     if config.compass.reference != "magnetic":
-        yield "'compass.heading': found 'field'; allowed: only with reference = \"magnetic\", the north of a field"
+        yield _wrong("compass.heading", "'field'", 'only with reference = "magnetic", the north of a field')
 
 
 def _port(port: str, here: str) -> Iterator[str]:
     address = re.fullmatch(r"tcp://\S+:(\d{1,5})", port)
     if not port.startswith("/") and not (address and 1 <= int(address[1]) <= LAST_PORT):
-        yield f"{here!r}: found {port!r}; allowed: {PORT_WORDS}"
+        yield _wrong(here, repr(port), PORT_WORDS)
 
 
 def _ports_differ(config: Config) -> Iterator[str]:
@@ -128,9 +128,7 @@ def _ports_differ(config: Config) -> Iterator[str]:
     if config.mavlink.url.startswith("serial:"):
         port = config.mavlink.url.removeprefix("serial:").rpartition(":")[0]
         if port in used:
-            yield (
-                f"'mavlink.url': found {port!r}, which {used[port][0][0]}.port has already; allowed: a port of its own"
-            )
+            yield _wrong("mavlink.url", f"{port!r}, which {used[port][0][0]}.port has already", "a port of its own")
 
 
 def _serial_devices(config: Config) -> Iterator[tuple[str, Imu | Gradienter | Compass]]:
@@ -145,15 +143,13 @@ def _shared(
     here: str, device: Imu | Gradienter | Compass, before: str, other: Imu | Gradienter | Compass
 ) -> Iterator[str]:
     if isinstance(device, Imu) and isinstance(other, Imu):
-        yield f"'{here}.port': found {device.port!r}, which {before}.port has already; allowed: a port of its own"
+        yield _wrong(f"{here}.port", f"{device.port!r}, which {before}.port has already", "a port of its own")
     for key in ("protocol", "baud", "parity"):
         ours, theirs = getattr(device, key, None), getattr(other, key, None)
-        # What one section leaves open, another may say: there is one device and one line.
+        # A section may leave open what another one of the same device says.
         if ours is not None and theirs is not None and ours != theirs:
-            yield (
-                f"'{here}.{key}': found {ours!r} on {device.port}, where {before}.{key} is {theirs!r}; allowed:"
-                f" {theirs!r} (one device serves both), or a port of its own"
-            )
+            found = f"{ours!r} on {device.port}, where {before}.{key} is {theirs!r}"
+            yield _wrong(f"{here}.{key}", found, f"{theirs!r} (one device serves both), or a port of its own")
 
 
 _MAVLINK_URL = re.compile(r"(udpin|udpout|tcp):[^:\s]+:(?P<port>\d{1,5})|serial:/\S+:\d{3,7}")
@@ -162,10 +158,8 @@ _MAVLINK_URL = re.compile(r"(udpin|udpout|tcp):[^:\s]+:(?P<port>\d{1,5})|serial:
 def _mavlink_url(url: str) -> Iterator[str]:
     match = _MAVLINK_URL.fullmatch(url)
     if match is None or (match["port"] and not 1 <= int(match["port"]) <= LAST_PORT):
-        yield (
-            f"'mavlink.url': found {url!r}; allowed: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT"
-            " or serial:PATH:BAUD, with ports from 1 to 65535"
-        )
+        shapes = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
+        yield _wrong("mavlink.url", repr(url), f"{shapes}, with ports from 1 to 65535")
 
 
 _BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<port>\d{1,5})")
@@ -198,21 +192,19 @@ def is_address(host: str) -> bool:
 def _mounting(mounting: Mounting, here: str) -> Iterator[str]:
     if not isinstance(mounting, str):
         if max(map(abs, mounting)) > 360.0:
-            yield f"{here!r}: found {list(mounting)}; allowed: angles within 360 degrees"
+            yield _wrong(here, list(mounting), "angles within 360 degrees")
     elif mounting not in ROTATIONS_DEG:
         near = difflib.get_close_matches(mounting, ROTATIONS_DEG, n=1)
         hint = f" (did you mean {near[0]}?)" if near else ""
-        yield (
-            f"{here!r}: found {mounting!r}{hint}; allowed: a MAVLink rotation name such as"
-            ' "ROTATION_YAW_90", or [roll, pitch, yaw] in degrees'
-        )
+        shapes = 'a MAVLink rotation name such as "ROTATION_YAW_90", or [roll, pitch, yaw] in degrees'
+        yield _wrong(here, f"{mounting!r}{hint}", shapes)
 
 
 def _upright(mounting: Mounting, here: str) -> Iterator[str]:
     """Refuse a gradienter or compass on its side or head: it does not work there, and cannot tell."""
     roll_deg, pitch_deg, _ = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
     if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
-        yield f"{here!r}: found {mounting!r}, on its side or upside down; allowed: within 60 degrees of upright"
+        yield _wrong(here, f"{mounting!r}, on its side or upside down", "within 60 degrees of upright")
 
 
 def _access(mavlink: Mavlink) -> Iterator[str]:
@@ -220,20 +212,15 @@ def _access(mavlink: Mavlink) -> Iterator[str]:
         try:
             Senders([entry])
         except ValueError:
-            yield f"'mavlink.allow': found {entry!r}; allowed: {ALLOWED}"
+            yield _wrong("mavlink.allow", repr(entry), ALLOWED)
     if mavlink.signing in ("sign", "require") and mavlink.signing_key_file is None:
-        yield (
-            "'mavlink.signing_key_file' is missing; allowed: a text, not empty (needed by signing ="
-            f' "{mavlink.signing}")'
-        )
+        yield _missing("mavlink.signing_key_file", "a text, not empty", f'signing = "{mavlink.signing}"')
     yield from _secret(mavlink.signing_key_file, "mavlink.signing_key_file")
 
 
 def _secret(path: str | None, here: str) -> Iterator[str]:
     if path is not None and "/" in path and not path.startswith("/"):
-        yield (
-            f"{here!r}: found {path!r}; allowed: a path that begins with /, or the bare name of a systemd credential"
-        )
+        yield _wrong(here, repr(path), "a path that begins with /, or the bare name of a systemd credential")
 
 
 def broker_complaints(mqtt: Mqtt) -> Iterator[str]:
@@ -241,17 +228,17 @@ def broker_complaints(mqtt: Mqtt) -> Iterator[str]:
     if mqtt.base_topic is not None:
         yield from _topic(mqtt.base_topic)
     if mqtt.password_file is not None and mqtt.username is None:
-        yield "'mqtt.username' is missing; allowed: a text, not empty (needed by password_file)"
+        yield _missing("mqtt.username", "a text, not empty", "password_file")
     yield from _secret(mqtt.password_file, "mqtt.password_file")
     for key in ("ca_file", "cert_file", "key_file"):
         path = getattr(mqtt, key)
         if path is not None and not mqtt.tls:
-            yield f"'mqtt.{key}': found {path!r}; allowed: only with tls = true"
+            yield _wrong(f"mqtt.{key}", repr(path), "only with tls = true")
         if path is not None and not path.startswith("/"):
-            yield f"'mqtt.{key}': found {path!r}; allowed: a path that begins with /"
+            yield _wrong(f"mqtt.{key}", repr(path), "a path that begins with /")
     for key, other in (("cert_file", "key_file"), ("key_file", "cert_file")):
         if getattr(mqtt, key) is not None and getattr(mqtt, other) is None:
-            yield f"'mqtt.{other}' is missing; allowed: a path (needed by {key})"
+            yield _missing(f"mqtt.{other}", "a path", key)
 
 
 _TOPIC = re.compile(r"(?!\$)[^+# /]+(/[^+# /]+)*")
@@ -259,7 +246,7 @@ _TOPIC = re.compile(r"(?!\$)[^+# /]+(/[^+# /]+)*")
 
 def _topic(topic: str) -> Iterator[str]:
     if len(topic.encode()) > MAX_TOPIC_BYTES or not _TOPIC.fullmatch(topic):
-        yield (
-            f"'mqtt.base_topic': found {topic!r}; allowed: words with / between them, such as"
-            f' "field/heron", without + # or blanks, at most {MAX_TOPIC_BYTES} bytes'
+        shape = (
+            f'words with / between them, such as "field/heron", without + # or blanks, at most {MAX_TOPIC_BYTES} bytes'
         )
+        yield _wrong("mqtt.base_topic", repr(topic), shape)

@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
+from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu, Parity
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.deck.deck import KEPT_S, Deck
@@ -224,7 +224,7 @@ class SerialDevice:
     port: str
     info: ProtocolInfo
     baud: int
-    parity: Literal["none", "even", "odd"]
+    parity: Parity
     read_only: bool
     roles: tuple[Role, ...]
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
+from companion.config.sections import Parity
 from companion.protocols.registry import DEVICES, Kind, main_kind
-
-Parity = Literal["none", "even", "odd"]
 
 COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
 ENOUGH_BYTES: Final = 1500

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from companion.config.sections import Law
+from companion.config.sections import Law, Parity
 from companion.errors import ConfigError
 from companion.protocols.compasses.hmr3300 import Hmr3300Decoder, Hmr3300Dialogue
 from companion.protocols.compasses.nmea import Hmr3000Dialogue, NmeaDecoder
@@ -48,7 +48,7 @@ class ProtocolInfo:
     tilted_sigma_deg: float | None = None
     law: Law | None = None
     """Meaning of a gradienter's two readings by its documents; None: the user must say."""
-    parity: Literal["none", "even", "odd"] = "none"
+    parity: Parity = "none"
 
 
 DEVICES: Final[dict[ProtocolInfo, dict[Kind, dict[str, Any]]]] = {

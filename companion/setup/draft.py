@@ -1,4 +1,4 @@
-"""The configuration that is being made: the file as it is, or the sample, with what was heard and answered in it."""
+"""Draft of a configuration: the present file, or the sample, changed by findings and answers."""
 
 from __future__ import annotations
 
@@ -35,19 +35,22 @@ _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compas
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One of the things that cannot be found out."""
+    """A question for the operator."""
 
-    key: str
     words: str
-    hint: str
     now: str
+    """Present answer."""
     put: Callable[[str], None]
-    choices: Sequence[str]
+    """Accepts an answer; raises ConfigError, in one line, for a wrong one."""
+    hint: str = ""
+    choices: Sequence[str] = ()
+    """Answers that a page shows as buttons."""
+    key: str = ""
 
 
 @dataclass
 class Draft:
-    """A file on its way to another content; a new one is the sample, whose values nobody has meant."""
+    """A configuration file and its wanted content; a new one is the sample, whose values nobody has chosen."""
 
     text: str
     is_new: bool
@@ -68,7 +71,7 @@ class Draft:
 
     @property
     def url(self) -> str | None:
-        """The autopilot's, where somebody has said it."""
+        """The autopilot's url, unless it is the sample's."""
         return None if self.is_new else str(self.wanted["mavlink"]["url"])
 
     @property
@@ -88,12 +91,12 @@ class Draft:
         return found
 
     def take_url(self, url: str) -> None:
-        """Set the autopilot's url; raise ConfigError where it is none."""
+        """Set the autopilot's url; raise ConfigError for a wrong one."""
         self._put("mavlink", "url", url)
         self.is_new = False
 
     def keep_beside(self, path: Path) -> None:
-        """Let records and socket lie beside the file: where the service has them its owner may not write."""
+        """Keep records and socket beside the file: its owner may not write into the service's folders."""
         self._put("storage", "directory", str(storage_beside(path)))
         self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
@@ -110,7 +113,7 @@ class Draft:
         return found
 
     def take(self, found: FoundDevice) -> None:
-        """Let a device have its section; of another make than before it brings nothing of that along."""
+        """Put a device into its section; of another make than before, it keeps no setting of that one."""
         section = self.section(found.kind)
         if section is None:
             section = {"name": "own", "source": "serial"} if found.kind == "imu" else {}
@@ -126,7 +129,7 @@ class Draft:
         info = PROTOCOLS[found.kind][found.protocol]
         for key in ("baud", "parity")[: 1 if found.kind == "imu" else 2]:
             value = getattr(found.line, key)
-            # What the protocol's device comes with need not be said of one that works without.
+            # A setting from the factory need not be written for a device that works without.
             if key in section or not is_there or value != getattr(info, key):
                 section[key] = value
         if found.kind == "gradienter" and "law" not in section:
@@ -151,35 +154,33 @@ class Draft:
     def questions(self) -> Iterator[Question]:
         """Yield the questions, with the answers that hold at present."""
         yield Question(
-            "vehicle.platform",
             "Where is it calibrated: on the ground, or on a deck (a boat)?",
-            "",
             self.wanted.get("vehicle", {}).get("platform", "ground"),
             lambda words: self._put("vehicle", "platform", one_of(words, get_args(Platform)), "ground"),
-            get_args(Platform),
+            choices=get_args(Platform),
+            key="vehicle.platform",
         )
         if (gradienter := self.section("gradienter")) is not None:
             known = PROTOCOLS["gradienter"][gradienter["protocol"]].law
+            unknown = "Its data sheet tells, or docs/calibration.md. A wrong one costs milli-g."
             yield Question(
-                "gradienter.law",
                 "What do the gradienter's two readings mean: axis, slope or euler?",
-                f"Its documents say {known}."
-                if known
-                else "Its data sheet tells, or docs/calibration.md. A wrong one costs milli-g.",
                 gradienter["law"],
                 lambda words: self._put("gradienter", "law", one_of(words, get_args(Law))),
+                f"Its documents say {known}." if known else unknown,
                 get_args(Law),
+                "gradienter.law",
             )
         kinds: Sequence[Kind] = ("gradienter", "compass", "imu")
         for kind in kinds:
             if (section := self.section(kind)) is not None:
                 yield Question(
-                    f"{kind}.mounting",
                     f"How is the {_NAMES[kind]} turned in the aircraft, seen from above: 0, 90, 180 or 270?",
-                    "Degrees clockwise; 0: its front is to the aircraft's front. Or ROLL PITCH YAW, or ROTATION_...",
                     mounting_words(section.get("mounting", "ROTATION_NONE")),
                     functools.partial(self._put_mounting, kind),
+                    "Degrees clockwise; 0: its front is to the aircraft's front. Or ROLL PITCH YAW, or ROTATION_...",
                     ("0", "90", "180", "270"),
+                    f"{kind}.mounting",
                 )
 
     def part_questions(self, names: Collection[str]) -> Iterator[Question]:
@@ -197,12 +198,12 @@ class Draft:
             choices = list(dict.fromkeys((*sigmas, now)))
             whose = f"IMU {imu.get('instance', 1)} of the autopilot" if imu["source"] == "autopilot" else "the own IMU"
             yield Question(
-                key,
                 f"Which part is {whose} ({name})?",
-                f"Its board's data sheet says; any other part: {UNKNOWN}. Gyros known, at best, to: {price} deg/h.",
                 now,
                 functools.partial(self._put_part, imu, key, choices),
+                f"Its board's data sheet says; any other part: {UNKNOWN}. Gyros known, at best, to: {price} deg/h.",
                 choices,
+                key,
             )
 
     def _put_part(self, imu: Table, key: str, choices: Sequence[str], words: str) -> None:
@@ -242,7 +243,7 @@ def storage_beside(path: Path) -> Path:
 
 
 def one_of(words: str, allowed: Sequence[str]) -> str:
-    """The choice that begins so."""
+    """Return the only choice that begins with these words."""
     found = [choice for choice in allowed if words and choice.startswith(words.strip().lower())]
     if len(found) != 1:
         raise ConfigError(f"found {shown(words)}; allowed: {', '.join(allowed)}")
@@ -267,7 +268,7 @@ def _mounting(words: str) -> str | list[float]:
 
 
 def mounting_words(mounting: Any) -> str:
-    """A mounting as `Question.put` takes it."""
+    """Format a mounting as an answer."""
     if not isinstance(mounting, str):
         return " ".join(f"{angle:g}" for angle in mounting)
     if mounting == "ROTATION_NONE":
@@ -276,11 +277,8 @@ def mounting_words(mounting: Any) -> str:
     return yaw if yaw.isdigit() else mounting
 
 
-# --- the file on disk
-
-
 def sample() -> str:
-    """The sample configuration that this companion brings."""
+    """Return the sample configuration of this version."""
     return installing.content(installing.SAMPLE).decode()
 
 

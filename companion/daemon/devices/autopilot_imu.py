@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
@@ -31,13 +31,7 @@ logger = logging.getLogger(__name__)
 RETRY_S: Final = 3.0
 REREAD_EVERY_S: Final = 0.5
 CONFIRMED_WITHIN_S: Final = 3.0
-"""A reading that comes later does not tell what was in force in between."""
-
-
-class _Announced(NamedTuple):
-    name: str
-    value: float
-    t_s: float
+"""A later reading does not show which offsets were in force in between."""
 
 
 class AutopilotImu:
@@ -56,7 +50,7 @@ class AutopilotImu:
         self.on_counting: Listeners[ImuSample] = Listeners()
         """Listeners to samples that count, before the collector."""
         self.on_raw: Listeners[float, Six, float | None] = Listeners()
-        """Told of every mean of raw readings: time, output less the offsets in force, temperature in deg C."""
+        """Listeners to means of raw readings: time, output less the offsets in force, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Listeners to readings: the one before, unless we have written since, and the present one."""
         self.on_change: Listeners[[]] = Listeners()
@@ -65,7 +59,8 @@ class AutopilotImu:
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._known: ImuCalibration | None = None
         self._ours = 0
-        self._announced: _Announced | None = None
+        self._announced: tuple[str, float, float] | None = None
+        """Name, value and time of a parameter that somebody says was changed."""
         self._pause_s = 0.0
         self._stale = asyncio.Event()
         self._stale.set()
@@ -90,7 +85,7 @@ class AutopilotImu:
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:
-        """While we write its offsets ourselves: no samples count, and nobody reads in between."""
+        """Count no samples, and read no offsets, while we write them ourselves."""
         self._ours += 1
         self.calibration = self._known = None
         self.on_change.tell()
@@ -103,7 +98,7 @@ class AutopilotImu:
 
     @property
     def obstacle(self) -> str | None:
-        """Why nothing of it counts at this moment, in one line; None: it does."""
+        """Reason why no sample counts at this moment, in one line, or None."""
         return self.stream.problem or (self.problem if self.calibration is None else None)
 
     @property
@@ -123,7 +118,7 @@ class AutopilotImu:
     async def refresh(self) -> bool:
         """Read the offsets; False, with samples voided, where they differ. Raise AutopilotError if unreadable."""
         assumed, announced, self._announced = self.calibration, self._announced, None
-        why = "the autopilot's offsets were read anew" if announced is None else f"{announced.name} was changed"
+        why = "the autopilot's offsets were read anew" if announced is None else f"{announced[0]} was changed"
         try:
             fresh = await read_calibration(self._parameters, self.instance, self._slots)
         except AutopilotError:
@@ -140,12 +135,13 @@ class AutopilotImu:
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
         holds = assumed is not None and assumed.corrects_like(fresh)
-        if announced is not None and holds:
-            words = "%s: %s = %.6g was announced and is not in force"
-            logger.warning(words, self.name, announced.name, announced.value)
-            holds = now_s - announced.t_s <= CONFIRMED_WITHIN_S
-        elif announced is not None:
-            logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, announced.name, announced.value)
+        if announced is not None:
+            name, value, t_s = announced
+            words = "%s: somebody set %s to %.6g; measuring afresh"
+            if holds:
+                words = "%s: %s = %.6g was announced and is not in force"
+                holds = now_s - t_s <= CONFIRMED_WITHIN_S
+            logger.warning(words, self.name, name, value)
         if not holds:
             if assumed is not None:
                 self.upsets, self.upset = self.upsets + 1, why
@@ -161,7 +157,7 @@ class AutopilotImu:
         return self.calibration is not None and kind is not None and kind.gyro_step_rad_s > 0.0
 
     def take_raw(self, raw: RawMean) -> None:
-        """Take a mean of its raw readings, less the offsets in force: what its telemetry shows in integers."""
+        """Hand on a mean of raw readings, less the offsets in force."""
         known = self.calibration
         if known is None:
             return
@@ -206,7 +202,7 @@ class AutopilotImu:
             return
         if known.contradicts({name: value}):
             # Anybody can say so; `refresh` asks the autopilot, and voids what was collected if it is true.
-            self._announced = self._announced or _Announced(name, value, asyncio.get_running_loop().time())
+            self._announced = self._announced or (name, value, asyncio.get_running_loop().time())
         else:
             rivals = {rival.parameter: rival.value for rival in known.rivals}
             if name not in self._vehicle.kind.rivals or rivals.get(name, 0) == value:
@@ -254,7 +250,7 @@ class AutopilotImu:
 
 @contextlib.contextmanager
 def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
-    """While we write offsets of these."""
+    """Enter `changing` of several IMUs."""
     with contextlib.ExitStack() as stack:
         for imu in imus:
             stack.enter_context(imu.changing())

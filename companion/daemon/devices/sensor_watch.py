@@ -1,4 +1,4 @@
-"""What shows only beside the others: a gradienter or compass that hangs while the IMUs see the aircraft move."""
+"""Finds a gradienter or compass that hangs while the IMUs see the aircraft move."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NO_OFFSETS: Final = object()
 
 
 class MotionWitness:
-    """Whether the aircraft has tilted or turned, as its IMUs saw it in their own axes: no mounting is needed."""
+    """Knows how far the aircraft has tilted or turned, from its IMUs in their own axes: no mounting is needed."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
@@ -49,8 +49,8 @@ class MotionWitness:
     def update(self, latest: Mapping[str, Batch], offsets_of: Callable[[str], object]) -> None:
         """Note the last whole second of each IMU.
 
-        `offsets_of`: what an owner has taken off its readings, or None while that is not known. An IMU with other
-        offsets, or another orientation of the board, begins anew as a witness: they must not look like a tilt.
+        `offsets_of`: the offsets subtracted from its readings, or None while unknown. An IMU with other offsets, or
+        another orientation of the board, begins anew as a witness: the change must not look like a tilt.
         """
         for name, batch in latest.items():
             seconds = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S))
@@ -86,7 +86,7 @@ class MotionWitness:
         return min(turns, default=0.0)
 
     def _heard(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
-        """The whole seconds in between, of each IMU that has seen as much as the others."""
+        """Return the whole seconds in between, of each IMU that has seen as much as the others."""
         # Not as the clock: while a sensor is implausible, nothing is collected of any IMU.
         newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
         found = [
@@ -99,7 +99,7 @@ class MotionWitness:
 
 
 class SensorWatch:
-    """Looks at every sensor twice a second; `run` it beside them."""
+    """Checks every sensor twice a second."""
 
     def __init__(
         self,
@@ -115,26 +115,26 @@ class SensorWatch:
         self._say = say
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Check until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             try:
                 self.update(loop.time())
             except Exception:
-                # What merely watches must not end what is watched, nor fill the log.
+                # A fault of the watch must not end the sensors, nor fill the log.
                 if not self._has_failed:
                     logger.exception("looking after the sensors failed")
                 self._has_failed = True
             await asyncio.sleep(PERIOD_S)
 
     def update(self, now_s: float) -> None:
-        """One look at all of them."""
+        """Check all sensors once."""
         self._witness.update(self._collector.imu_seconds(), self._offsets_of)
         for sensor in self._sensors:
             found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:
                 if is_news:
-                    # No calibration comes to an end with it, and what was written with it may be wrong.
+                    # No calibration can end with it, and values written with it may be wrong.
                     words = found.words.removeprefix(f"{sensor.link.settings}: ")
                     self._say(Severity.WARNING, f"{sensor.name}: {words}", Weight.NEWS)
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
@@ -159,7 +159,7 @@ class SensorWatch:
         return Trouble("stuck", f"{words}; switch its power off and on", implausible=True)
 
     def implausible(self) -> str | None:
-        """A sensor whose readings look good and are not, and why; None where there is none."""
+        """Return a sensor whose readings look good and are not, and why, or None."""
         return next((words for plausible, words in self._troubles() if not plausible), None)
 
     def worst(self) -> str | None:

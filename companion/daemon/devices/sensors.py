@@ -1,4 +1,4 @@
-"""The companion's own devices: a port, a decoder, what is said to it, and where the samples go."""
+"""The companion's own devices: port, decoder, dialogue, and where the samples go."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.configured.models import Role, SerialDevice, parts_of
 from companion.daemon.core import Offload
 from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
-from companion.links.system.connection import Budget
+from companion.links.system.connection import BYTES_PER_S, Budget
 from companion.links.system.listeners import Listeners
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.decoding.clock import LATE
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 RATE_SPAN_S: Final = 2.0
 TICK_S: Final = 0.02
-"""Between two things that are said, and between two looks while a conversation goes on."""
+"""Shortest time between two messages to a device, and period of the dialogue while it goes on."""
 COARSE_S: Final = 0.25
 LIVELY_S: Final = 1.0
 LOOK_AGAIN_S: Final = 60.0
@@ -57,8 +57,6 @@ class SensorHealth:
         self._began_s = 0.0
         self._good_since_s: float | None = None
         self._warned_s: dict[str, float] = {}
-        self._received = (0.0, 0)
-        self._bytes_per_s = 0.0
 
     def opened(self) -> None:
         """Forget the stream of before: the port was opened (again)."""
@@ -66,35 +64,24 @@ class SensorHealth:
         self.stream.opened()
 
     def trouble(self, now_s: float) -> Trouble | None:
-        """Return what is wrong with it, worst first; None while good samples come."""
+        """Return the worst fault; None while good samples come."""
         if not self.link.connected:
             return Trouble(ABSENT, self.link.last_error or f"{self.link.settings.url}: not open yet")
-        found = self._flood(now_s) or self.stream.trouble(now_s) or self._stuck
+        found = _flood(self.link.budget, now_s) or self.stream.trouble(now_s) or self._stuck
         if found is None:
             return None
         return Trouble(found.key, f"{self.link.settings}: {found.words}", found.implausible)
 
-    def _flood(self, now_s: float) -> Trouble | None:
-        budget = self.link.budget
-        if budget is None or budget.exceeded_s is None or now_s - budget.exceeded_s >= FLOOD_S:
-            return None
-        rate = f"{self._bytes_per_s / 1e3:.0f} kB/s" if self._bytes_per_s else "too much"
-        return Trouble(FLOOD, f"floods us ({rate}); the surplus is thrown away: another device, or a loop-back?")
-
     def update(self, now_s: float, stuck: Trouble | None = None) -> tuple[Trouble | None, bool]:
         """Count and log changes, twice a second; return the trouble, and whether it was logged as a warning now."""
         self._stuck = stuck
-        since_s, before = self._received
-        if now_s - since_s >= 1.0:
-            self._bytes_per_s = (self.link.bytes_received - before) / (now_s - since_s) if since_s else 0.0
-            self._received = (now_s, self.link.bytes_received)
         if (breaks := self._decoder.times.clock.breaks) != self._breaks:
             self.counts[RESTARTED] += breaks - self._breaks
             self._breaks = breaks
             self._warn(Trouble(RESTARTED, "the device restarted, or its clock jumped; measuring afresh"), now_s)
         found = self.trouble(now_s)
         if found is not None and found.key == FLOOD:
-            # What was thrown away has damaged its frames; two calls fall into FLOOD_S.
+            # The bytes thrown away have damaged its frames; two calls fall into FLOOD_S.
             self.stream.excuse()
         return found, self._report(found, now_s)
 
@@ -112,7 +99,7 @@ class SensorHealth:
         if found.key == self._reported:
             return False
         if found.key == ABSENT or (now_s - self._opened_s < SILENT_AFTER_S and not found.implausible):
-            return False  # the port reports itself that it is gone; what was just opened has a moment to begin
+            return False  # the port reports its own loss; a port just opened has a moment to begin
         if self._reported is None:
             self._began_s = now_s
         self._reported = found.key
@@ -138,6 +125,13 @@ class SensorHealth:
         }
 
 
+def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
+    if budget is None or budget.exceeded_s is None or now_s - budget.exceeded_s >= FLOOD_S:
+        return None
+    most = f"{BYTES_PER_S / 1e3:.0f} kB/s"
+    return Trouble(FLOOD, f"floods us (above {most}); the surplus is thrown away: another device, or a loop-back?")
+
+
 class SensorRole:
     """One use of a device, as `companion status` shows it."""
 
@@ -150,7 +144,7 @@ class SensorRole:
         self._rate_hz = 0.0
 
     def count(self, t_s: float) -> None:
-        """A sample has been taken from bytes that were read at `t_s`."""
+        """Count a sample from bytes that were read at `t_s`."""
         self._samples += 1
         self._last_s = t_s
         since_s, before = self._counted
@@ -160,7 +154,7 @@ class SensorRole:
 
     @property
     def problem(self) -> str | None:
-        """Return what is wrong in one line, or None while samples come."""
+        """Return the fault in one line, or None while samples come."""
         sensor = self._sensor
         if (problem := sensor.problem) is not None:
             return problem
@@ -200,7 +194,7 @@ class SensorRole:
 
 
 class SerialSensor:
-    """One serial device: read once, decoded once, for all its roles; `take` gets what each takes of each sample."""
+    """One serial device, read and decoded once for all its roles; `take` gets the part of each sample for each role."""
 
     def __init__(
         self, device: SerialDevice, take: Callable[[Role, Sample], None], offload: Offload = asyncio.to_thread
@@ -210,7 +204,7 @@ class SerialSensor:
         self.name, self.protocol = device.name, device.info.name
         self.roles = [SensorRole(self, role) for role in device.roles]
         self.decoder = device.info.decoder(settings.seconds_per_byte)
-        # Whoever is only read is not even thought about: without a dialogue there is nothing that could be sent.
+        # A device that is only read has no dialogue, so nothing can be sent to it.
         self.dialogue = None if device.read_only or device.info.dialogue is None else device.info.dialogue()
         name = ", ".join(role.name for role in device.roles)
         self.kinds = frozenset(role.kind for role in device.roles)
@@ -219,9 +213,9 @@ class SerialSensor:
         )
         self.health = SensorHealth(self.link, self.protocol, self.decoder)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
-        """Listeners to name, bytes and time before decoding; without bytes: some are missing."""
+        """Listeners to name, bytes and time before decoding; None for bytes that are missing."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
-        """Listeners to all samples of a read, and its time, before anybody else gets them."""
+        """Listeners to all samples of a read and its time, before the collector."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
@@ -234,7 +228,7 @@ class SerialSensor:
         self._told: set[str] = set()
 
     async def run(self) -> None:
-        """Read, and say what has to be said, until cancelled."""
+        """Read, and hold the dialogue, until cancelled."""
         if self.dialogue is None:
             await self.link.run()
             return
@@ -261,7 +255,7 @@ class SerialSensor:
         self.decoder.interrupted()
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take bytes that were read at `t_s`."""
+        """Decode bytes that were read at `t_s`, and hand on the samples."""
         if self.on_bytes:
             self.on_bytes.tell(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
@@ -278,10 +272,8 @@ class SerialSensor:
             self.dialogue.heard(data, len(samples), t_s)
             self._speak(t_s)
 
-    # --- what is said to it
-
     async def _converse(self) -> None:
-        """Ask what is due: often while a conversation goes on, seldom otherwise, so that a stream costs no ticks."""
+        """Send what is due: often while the dialogue goes on, seldom otherwise, so that a stream costs no ticks."""
         loop = asyncio.get_running_loop()
         while True:
             is_lively = loop.time() - self._spoke_s < LIVELY_S
@@ -291,7 +283,7 @@ class SerialSensor:
             self._speak(loop.time())
 
     async def _look_for_others(self) -> None:
-        """Two that speak to one device, or to one that is no sensor at all (a login, a modem), do harm."""
+        """Check that no other program has the port: two that write to one device, a login or a modem, do harm."""
         opening, port = self._openings, self.link.settings
         holders = () if port.is_tcp else await self._offload(find_holders, port.url)
         if opening != self._openings:
@@ -323,10 +315,8 @@ class SerialSensor:
             return f"nothing is said to it: {self._held_by} has the port open too"
         return self.dialogue.words if self.dialogue is not None else ""
 
-    # --- how it is
-
     @property
     def problem(self) -> str | None:
-        """Return what is wrong with the device in one line, or None while samples come."""
+        """Return the fault of the device in one line, or None while samples come."""
         found = self.health.trouble(asyncio.get_running_loop().time())
         return found.words if found is not None else None

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections import Counter
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -35,9 +35,8 @@ AFTER_S: Final = 3.0
 AHEAD_OF_CLOCK_S: Final = 86400.0
 """Signature time this far ahead of the system's clock comes from a wrong clock, not from a board without power."""
 
-_Fault = Literal["wants ours", "other key", "unsigned", "old", "ahead"]
-_COUNTED: Final[tuple[Literal["other key", "unsigned", "old"], ...]] = ("other key", "unsigned", "old")
-_FAULTS: Final[dict[_Fault, str]] = {
+_COUNTED: Final[tuple[Reason, ...]] = ("other key", "unsigned", "old")
+_FAULTS: Final = {
     "wants ours": "the autopilot wants signatures: give the companion its key (signing_key_file)",
     "other key": "the autopilot signs with another key: give both the same one",
     "unsigned": "the autopilot does not sign on this link: give it the companion's key",
@@ -68,7 +67,8 @@ class LinkSigning:
         self._write_failed = False
         self._named: set[Reason] = set()
         """Reasons for which a sender other than the autopilot was named."""
-        self._fault: _Fault | None = None
+        self._fault: str | None = None
+        """Key of the present fault."""
         self._refused: Counter[Reason] = Counter()
         """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
         self._verified = False
@@ -111,8 +111,6 @@ class LinkSigning:
             if signing is not None and signing.key is not None:
                 await asyncio.shield(self._reserve(signing, 0.0))
 
-    # --- key and time
-
     def _read_key(self, signing: Signing) -> None:
         path = self._config.mavlink.signing_key_path
         assert path is not None  # the configuration's rules
@@ -142,8 +140,6 @@ class LinkSigning:
             logger.log(level, "mavlink signing: after a restart its time may go back: %s", error)
             self._write_failed = True
 
-    # --- messages
-
     def _is_autopilot(self, system: int, component: int) -> bool:
         return component == self._vehicle.component_id and self._vehicle.system_id in (None, system)
 
@@ -169,8 +165,6 @@ class LinkSigning:
         if message.tc1 and message.ts1 == self._asked and self._vehicle.sent(message):
             self._unanswered, self._ask_s = 0, asyncio.get_running_loop().time() + ASK_AGAIN_S
 
-    # --- faults
-
     def _update(self, now_s: float) -> None:
         found = self._refused_by_autopilot(now_s) if self.signing is None else self._refuses(self.signing, now_s)
         if found == self._fault:
@@ -184,7 +178,7 @@ class LinkSigning:
             logger.info("mavlink: %s", words)
             self._say(Severity.NOTICE, words, Weight.NEWS)
 
-    def _refused_by_autopilot(self, now_s: float) -> _Fault | None:
+    def _refused_by_autopilot(self, now_s: float) -> str | None:
         if not self._vehicle.alive or not self._vehicle.signs:
             self._unanswered, self._ask_s = 0, -math.inf
         elif now_s >= self._ask_s:
@@ -192,7 +186,7 @@ class LinkSigning:
             self._link.send(mavlink.MAVLink_timesync_message(0, self._asked))
         return "wants ours" if self._unanswered > UNANSWERED else None
 
-    def _refuses(self, signing: Signing, now_s: float) -> _Fault | None:
+    def _refuses(self, signing: Signing, now_s: float) -> str | None:
         if self._verified:
             self._verified = False
             self._refused.clear()
@@ -208,10 +202,8 @@ class LinkSigning:
             return self._fault
         return self._cause(signing, found)
 
-    def _cause(self, signing: Signing, reason: Literal["other key", "unsigned", "old"]) -> _Fault:
+    def _cause(self, signing: Signing, reason: Reason) -> str:
         return "ahead" if reason == "old" and signing.clock.ahead_of_wall_s > AHEAD_OF_CLOCK_S else reason
-
-    # --- status
 
     @property
     def warning(self) -> str | None:
@@ -236,9 +228,8 @@ class LinkSigning:
             return None
         signing = self.signing or Signing(required=False)
         fault = self.rejecting or self.trouble or self.warning
-        doubted = signing.doubted.total()
         counts = f"{signing.verified} messages checked"
-        if doubted:
+        if doubted := signing.doubted.total():
             counts += f", {doubted} {'dropped' if signing.required else 'not signed with our key'}"
         return {
             "good": not fault,

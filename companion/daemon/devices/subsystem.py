@@ -46,7 +46,7 @@ RETRY_S: Final = 10.0
 
 
 class Reach:
-    """Listens for ground stations and reads what the autopilot says about forwarding."""
+    """Knows whether a ground station reaches the companion, and what the autopilot's parameters say of forwarding."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
         self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
@@ -66,7 +66,7 @@ class Reach:
         )
 
     def text(self) -> tuple[bool, str]:
-        """For `companion check`: whether all is well, and the facts with the fix."""
+        """Return whether all is well, and the facts with the remedy, for `companion check`."""
         if not self._vehicle.alive:
             return True, "not known: no autopilot"
         if not self.answered:
@@ -81,7 +81,7 @@ class Reach:
         return self._vehicle.kind.forwarding_words(self._closed)
 
     async def run(self) -> None:
-        """Read what there is to know, again after every restart, until cancelled."""
+        """Read the parameters, again after every restart, until cancelled."""
         while True:
             await self._stale.wait()
             self._stale.clear()
@@ -103,7 +103,7 @@ class Reach:
 
 
 class Devices(Subsystem):
-    """Where samples come from; without `imu_rate_hz` each IMU is asked for as many as the connection can carry."""
+    """Sources of samples; without `imu_rate_hz` each IMU is asked for as many as the connection can carry."""
 
     def __init__(self, core: Core, imu_rate_hz: float | None) -> None:
         self._core = core
@@ -128,7 +128,7 @@ class Devices(Subsystem):
 
     @property
     def not_heard(self) -> str:
-        """Return that no autopilot has been heard, and why."""
+        """Words: no autopilot has been heard, and why."""
         why = self.signing.rejecting
         behind = f": {why}" if why else ""
         return f"not heard yet on {self._core.config.mavlink.url}{behind}"
@@ -139,10 +139,8 @@ class Devices(Subsystem):
     def status(self) -> Object:  # noqa: D102
         sources = self._core.collector.status(asyncio.get_running_loop().time()).sources
         counts = {source.name: {"lost": source.lost, "dropped": source.dropped} for source in sources}
-        found: list[AutopilotImu | SensorRole] = [
-            *self.imus.values(),
-            *(role for sensor in self.sensors for role in sensor.roles),
-        ]
+        roles = [role for sensor in self.sensors for role in sensor.roles]
+        found: list[AutopilotImu | SensorRole] = [*self.imus.values(), *roles]
         devices = []
         for device in found:
             said = device.status() | counts.get(device.name, {})
@@ -161,7 +159,7 @@ class Devices(Subsystem):
         }
 
     def _misplaced(self, name: str) -> str | None:
-        """Why an IMU's gravity lies along another axis than by the gradienter, in the last second; else None."""
+        """Return why an IMU's gravity lies along another axis than by the gradienter, in the last second, or None."""
         config, collector = self._core.config, self._core.collector
         tilt, model = collector.tilt_second(), models.gradienter_model(config.gradienter)
         imu, batch = next((imu for imu in config.imu if imu.name == name), None), collector.imu_seconds().get(name)

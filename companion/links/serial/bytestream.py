@@ -7,9 +7,9 @@ import errno
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 from urllib.parse import urlsplit
 
+from companion.config.sections import Parity
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.system.connection import Backoff, Budget, OnState, Reconnection, connect_tcp, words_of
@@ -42,7 +42,7 @@ class PortSettings:
 
     url: str
     baud: int
-    parity: Literal["none", "even", "odd"] = "none"
+    parity: Parity = "none"
 
     @property
     def is_tcp(self) -> bool:

@@ -16,12 +16,10 @@ import stat
 import termios
 import threading
 from collections.abc import Callable
-from typing import Literal
 
+from companion.config.sections import Parity
 from companion.errors import LinkError
 from companion.links.serial.ports import find_holders
-
-Parity = Literal["none", "even", "odd"]
 
 OPEN_DEADLINE_S = 5.0
 """A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
