@@ -1,1 +1,1 @@
-"""From the configuration to the devices and models that daemon and replay work with."""
+"""Devices and models made from the configuration, for daemon and replay."""

@@ -4,19 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import time
 from collections.abc import Iterator, Sequence
 from typing import Final, Literal
 
+import msgspec
+
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu, Parity
+from companion.config.sections import (
+    UNKNOWN,
+    Compass,
+    Config,
+    Gradienter,
+    GradienterProtocol,
+    Imu,
+    NoiseProfile,
+    Parity,
+    Profile,
+)
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.deck.deck import KEPT_S, Deck
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
-from companion.estimation.noise.allan import noise_profile
+from companion.estimation.noise.allan import PROFILES, noise_profile, predicted_sigma
 from companion.estimation.records.record import AlignmentUsed
 from companion.estimation.solution.site import Whereabouts
 from companion.links.serial.bytestream import PortSettings
@@ -25,6 +38,7 @@ from companion.physics.units import DEG_H, MG
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo, part_for
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
+from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
 """Rate asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
@@ -301,3 +315,67 @@ def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | Co
         case MagSample():
             return into.add_field(part)
     return None
+
+
+def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
+    """Predict how well the gyros of each part of the catalogue can be known; one sigma, "unknown" last.
+
+    The estimator's own V(T, H) of the longest window. A warm-up and integer telemetry add to it.
+    """
+    mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
+    return {name: predicted_sigma(one.gyro, mean_s, horizon_s) / DEG_H for name, one in PROFILES.items()}
+
+
+class Profiles:
+    """The profile of each IMU: as configured; else that of the part which its autopilot names."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._imus = {imu.name: imu for imu in config.imu}
+        self._parts: dict[str, Profile | None] = {}
+
+    def found(self, name: str, part: Profile | None) -> bool:
+        """Set the part that the autopilot names for an IMU, None where it knows none; return whether that matters."""
+        before = self.of(name)
+        self._parts[name] = part
+        return self.of(name) != before
+
+    def of(self, name: str) -> str | NoiseProfile | None:
+        """Return the profile of an IMU; None: nobody has named its part."""
+        return self._imus[name].profile or self._parts.get(name)
+
+    def imu(self, name: str) -> Imu:
+        """Return the configuration of an IMU with its profile."""
+        return msgspec.structs.replace(self._imus[name], profile=self.of(name))
+
+    def status(self) -> list[dict[str, object]]:
+        """Describe each IMU's profile for `companion status`."""
+        found: list[dict[str, object]] = []
+        for name, imu in self._imus.items():
+            profile, file = self.of(name), None
+            by_device_id = imu.profile is None and profile is not None
+            if isinstance(profile, NoiseProfile):
+                file, summary = ProfileStore(self._config.storage.path).path(profile.name), profile.origin
+                profile = profile.name
+            elif profile in (None, UNKNOWN):
+                summary = self._price_of_unknown
+            else:
+                summary = f"of the catalogue{', by its device id' if by_device_id else ''}"
+            label = "part unknown: " if profile in (None, UNKNOWN) else f"{profile}, "
+            found.append(
+                {
+                    "imu": name,
+                    "name": profile,
+                    "fitted": file is not None,
+                    "by_device_id": by_device_id,
+                    "file": None if file is None else str(file),
+                    "summary": label + summary,
+                }
+            )
+        return found
+
+    @functools.cached_property
+    def _price_of_unknown(self) -> str:
+        *known, (_, unknown) = gyro_sigmas_deg_h(self._config).items()
+        others = ", ".join(f"{part} {sigma:.0f}" for part, sigma in known)
+        return f"gyros known to {unknown:.0f} deg/h at best ({others})"

@@ -14,7 +14,7 @@ from companion.component.statustext import Severity, StatusText, Weight
 from companion.component.tunes import Tune, Tunes
 from companion.config.sections import AtArm, Config
 from companion.configured import models
-from companion.configured.profiles import Profiles
+from companion.configured.models import Profiles
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.machine import Machine
 from companion.estimation.means.windows import Window

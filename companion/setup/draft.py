@@ -185,7 +185,7 @@ class Draft:
 
     def part_questions(self, names: Collection[str]) -> Iterator[Question]:
         """Ask for the parts of these IMUs: the estimator knows their noise by them."""
-        from companion.configured.profiles import gyro_sigmas_deg_h  # numpy takes a second on a small board
+        from companion.configured.models import gyro_sigmas_deg_h  # numpy takes a second on a small board
 
         sigmas = gyro_sigmas_deg_h(self.parsed())
         price = ", ".join(f"{part} {sigma:.0f}" for part, sigma in sigmas.items())

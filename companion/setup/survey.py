@@ -1,4 +1,4 @@
-"""What is connected: autopilots on serial and UDP ports, devices on serial ports. Only listens, never says a byte."""
+"""Finds autopilots on serial and UDP ports, and devices on serial ports, by listening alone."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def same_port(one: str, other: str) -> bool:
 
 
 def same_url(one: str, other: str) -> bool:
-    """Whether two MAVLink urls lead to the same place; whom a UDP port listens to does not matter."""
+    """Return whether two MAVLink urls lead to the same place; of a UDP port only the number counts."""
     (kind, where, number), theirs = parse_url(one), parse_url(other)
     if kind == "udpin":
         return theirs[::2] == (kind, number)
@@ -171,7 +171,7 @@ async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed:
 
 
 def in_words(place: str, found: Heard | HeardUdp | str) -> str:
-    """What was heard at a place, in one line."""
+    """Describe what was heard at a place, in one line."""
     if isinstance(found, str):
         return f"left alone: {found.removeprefix(f'{place}: ')}"
     if isinstance(found, HeardUdp):

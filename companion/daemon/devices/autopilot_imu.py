@@ -152,7 +152,7 @@ class AutopilotImu:
 
     @property
     def wants_raw(self) -> bool:
-        """Whether its telemetry is integers, so that raw means tell more."""
+        """True: its telemetry is integers, and means of raw readings are finer."""
         kind = self.stream.kind
         return self.calibration is not None and kind is not None and kind.gyro_step_rad_s > 0.0
 

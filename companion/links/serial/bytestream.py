@@ -20,8 +20,8 @@ QUICK_READS = 20
 QUICK_S = 0.0015
 """Mean interval of `QUICK_READS` reads of a stream whose every byte would wake the loop."""
 COLLECT_S = 0.0205
-"""How long such a stream is collected before the next read, as behind a USB adapter: a wake-up costs far more than its
-bytes. A little more than the 20 ms within which an autopilot takes one heading (autopilots 6)."""
+"""Time for which such a stream is collected before the next read, as behind a USB adapter: a wake-up costs far more
+than its bytes. A little more than the 20 ms within which an autopilot takes one heading (autopilots 6)."""
 FULLEST_LINE = 0.9
 """The greatest share of a line's time that a stream may fill to be collected."""
 OUT_BUFFER_BYTES = 16384
@@ -50,7 +50,7 @@ class PortSettings:
         return self.url.startswith("tcp://")
 
     def __str__(self) -> str:
-        """For people."""
+        """Format it for people."""
         return self.url if self.is_tcp else f"{self.url} at {self.baud} baud, parity {self.parity}"
 
     @property
@@ -214,7 +214,7 @@ class ByteLink:
         return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)
 
     def _read(self, now_s: float) -> bool:
-        """Read once and hand it on; whether anything came. A dead port is closed."""
+        """Read once and hand on the bytes; return whether any came. A dead port is closed."""
         if self._descriptor is None:
             return False
         try:

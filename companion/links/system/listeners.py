@@ -1,4 +1,4 @@
-"""Who wants to be told of something: in the order in which they came, and none of them can keep it from the others."""
+"""Listeners to an event, called in the order of their subscription; a failing one does not stop the others."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ FRAME_BYTES: Final = {name: values.size + CRC_BYTES for name, (values, _) in NOR
 
 
 def is_whole(frame: bytes) -> bool:
-    """Whether the CRC-32/MPEG-2 at the end of a datagram, padded with zeros to whole words, is right.
+    """Return whether the CRC-32/MPEG-2 at the end of a datagram, padded with zeros to whole words, is right.
 
     It is zlib's CRC with all bits in the other order and without the last inversion: zlib works on mirrored bytes.
     """

@@ -9,7 +9,7 @@ import pytest
 from companion.config import parse
 from companion.config.sections import Config
 from companion.daemon.process.check import system_findings
-from companion.links.serial.faults import port_faults, same_ports
+from companion.links.serial.ports import port_faults, same_ports
 from tests.support.usb_tree import UsbTree
 
 CONFIG = """

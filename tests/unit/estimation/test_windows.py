@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from companion.config import parse
 from companion.config.sections import AllanModel, NoiseProfile
-from companion.configured.profiles import gyro_sigmas_deg_h
+from companion.configured.models import gyro_sigmas_deg_h
 from companion.estimation.means.pose import heading_window, tilt_window
 from companion.estimation.means.windows import ImuInput, imu_estimates
 from companion.estimation.noise.allan import noise_profile, predicted_sigma

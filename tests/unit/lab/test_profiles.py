@@ -17,7 +17,7 @@ from companion.cli import main as companion
 from companion.config import parse
 from companion.config.sections import AllanModel
 from companion.configured import models
-from companion.configured.profiles import Profiles
+from companion.configured.models import Profiles
 from companion.errors import ConfigError, StorageError
 from companion.estimation.noise.allan import noise_profile
 from companion.lab.logs.log_files import read_logs

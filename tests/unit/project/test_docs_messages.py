@@ -20,7 +20,7 @@ ALSO = ROOT / "docs/service.md"
 AT_A_DESK = (
     "companion/cli", "companion/setup", "companion/lab", "companion/recording", "companion/fleet",
     "companion/estimation/solution/by_temperature.py", "companion/estimation/records/flight_record.py",
-    "companion/summary.py", "companion/configured/profiles.py",
+    "companion/summary.py", "companion/configured/models.py",
 )  # fmt: skip
 """Packages of which commands print the texts, beside what was typed: their documents explain them."""
 
