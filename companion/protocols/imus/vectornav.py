@@ -19,62 +19,43 @@ import functools
 import math
 import re
 import struct
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import WAIT, RejectedError, SentenceDecoder, check_imu, xor_checksum
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
-_Fields = tuple[tuple[str, str], ...]
-
-_COMMON: _Fields = (
-    ("time_startup_ns", "Q"),
-    ("time_gps_ns", "Q"),
-    ("time_sync_in_ns", "Q"),
-    ("yaw_pitch_roll_deg", "3f"),
-    ("quaternion", "4f"),
-    ("angular_rate_rad_s", "3f"),
-    ("position", "3d"),
-    ("velocity", "3f"),
-    ("accel_m_s2", "3f"),
-    ("uncompensated_accel_and_gyro", "6f"),
-    ("mag_temperature_pressure", "5f"),
-    ("delta_theta_velocity", "7f"),
-    ("ins_status", "H"),
-    ("sync_in_count", "I"),
-    ("time_gps_pps_ns", "Q"),
-)
-_IMU: _Fields = (
-    ("imu_status", "H"),
-    ("uncompensated_mag_gauss", "3f"),
-    ("uncompensated_accel_m_s2", "3f"),
-    ("uncompensated_gyro_rad_s", "3f"),
-    ("temperature_degc", "f"),
-    ("pressure_kpa", "f"),
-    ("delta_theta", "4f"),
-    ("delta_velocity", "3f"),
-    ("mag_gauss", "3f"),
-    ("imu_accel_m_s2", "3f"),
-    ("imu_angular_rate_rad_s", "3f"),
-    ("saturation", "H"),
-)
-_GROUPS: dict[int, _Fields] = {0x01: _COMMON, 0x04: _IMU}
-_KNOWN_GROUPS = 0x05
-
-# Rate and acceleration that belong together first: compensated ones, as $VNYMR has them, before uncompensated ones.
-_RATES: tuple[str, ...] = (
-    "angular_rate_rad_s",
-    "imu_angular_rate_rad_s",
-    "uncompensated_gyro",
-    "uncompensated_gyro_rad_s",
-)
-_ACCELERATIONS: tuple[str, ...] = ("accel_m_s2", "imu_accel_m_s2", "uncompensated_accel", "uncompensated_accel_m_s2")
-_TEMPERATURES = ("temperature_degc", "temperature")
-_PARTS = {
-    "uncompensated_accel_and_gyro": {"uncompensated_accel": 0, "uncompensated_gyro": 3},
-    "mag_temperature_pressure": {"temperature": 3},
+_GROUPS: Final[dict[int, tuple[str, dict[int, dict[str, int]]]]] = {
+    # Times since start, by GPS and of a sync pulse; yaw, pitch, roll; quaternion; rate (5), position, velocity,
+    # acceleration (8); uncompensated acceleration and rate (9); field, temperature, pressure (10); increments; states.
+    0x01: (
+        "Q Q Q 3f 4f 3f 3d 3f 3f 6f 5f 7f H I Q",
+        {
+            0: {"time": 0},
+            5: {"gyro": 0},
+            8: {"accel": 0},
+            9: {"raw accel": 0, "raw gyro": 3},
+            10: {"temperature": 3},
+        },
+    ),
+    # State; uncompensated field, acceleration (2), rate (3); temperature (4), pressure; increments; field,
+    # acceleration (9), rate (10); saturation.
+    0x04: (
+        "H 3f 3f 3f f f 4f 3f 3f 3f 3f H",
+        {
+            2: {"imu raw accel": 0},
+            3: {"imu raw gyro": 0},
+            4: {"imu temperature": 0},
+            9: {"imu accel": 0},
+            10: {"imu gyro": 0},
+        },
+    ),
 }
+"""Known groups: the formats of their fields by bit, and the places of the used values in a field."""
+_KNOWN_GROUPS: Final = 0x05
+# Rate and acceleration that belong together first: compensated ones, as $VNYMR has them, before uncompensated ones.
+_SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
 
 
 @functools.lru_cache(maxsize=16)
@@ -87,32 +68,30 @@ def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
     places: dict[str, int] = {}
     code, count = f"<{len(header)}x", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
-    for group, fields in _GROUPS.items():
+    for group, (formats, used) in _GROUPS.items():
         if not header[1] & group:
             continue
         mask = next(masks)
+        fields = formats.split()
         if mask == 0 or mask >> len(fields):
             raise RejectedError(reasons.UNKNOWN_FIELD)
-        for bit, (name, field_code) in enumerate(fields):
+        for bit, field in enumerate(fields):
             if mask & 1 << bit:
-                parts = _PARTS.get(name, {name: 0})
-                places.update({part: count + offset for part, offset in parts.items()})
-                code += field_code
-                count += int(field_code[:-1] or 1)
-    used = {
-        "gyro": None, "accel": None, "temperature": _first(places, _TEMPERATURES),
-        "time": places.get("time_startup_ns"),
-    }  # fmt: skip
-    for kind in (slice(0, 2), slice(2, 4), slice(0, 4)):
-        gyro, accel = _first(places, _RATES[kind]), _first(places, _ACCELERATIONS[kind])
+                places.update({part: count + offset for part, offset in used.get(bit, {}).items()})
+                code += field
+                count += int(field[:-1] or 1)
+    found = {name: places[name] for name in ("time", "temperature") if name in places}
+    if "imu temperature" in places:
+        found["temperature"] = places["imu temperature"]
+    for sources in (_SOURCES[:2], _SOURCES[2:], _SOURCES):
+        gyro, accel = (
+            next((places[source + part] for source in sources if source + part in places), None)
+            for part in ("gyro", "accel")
+        )
         if gyro is not None and accel is not None:
-            used |= {"gyro": gyro, "accel": accel}
+            found |= {"gyro": gyro, "accel": accel}
             break
-    return struct.Struct(code), {name: place for name, place in used.items() if place is not None}
-
-
-def _first(places: dict[str, int], names: tuple[str, ...]) -> int | None:
-    return next((places[name] for name in names if name in places), None)
+    return struct.Struct(code), found
 
 
 _SYNC = 0xFA
