@@ -118,7 +118,6 @@ def doubtful(config: Config) -> list[str]:
 
 def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
     """Describe an IMU to the collector; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already."""
-    integers = kind is not None and kind.truncates
     return ImuInput(
         name=imu.name,
         rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),

@@ -17,7 +17,7 @@ from companion.protocols.compasses.nmea import NmeaDecoder
 from companion.protocols.compasses.os5000 import Os5000Decoder
 from companion.protocols.compasses.pni import LONGEST as PNI_LONGEST
 from companion.protocols.compasses.pni import PniDecoder
-from companion.protocols.decoding.base import Decoder, FrameDecoder, LineDecoder, SentenceDecoder
+from companion.protocols.decoding.base import Decoder, LineDecoder, SentenceDecoder
 from companion.protocols.imus import xsens as xsens_protocol
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.imus.mip import MipDecoder
@@ -227,13 +227,6 @@ def feed_in(decoder: Decoder, stream: bytes, cuts: list[int]) -> list[Sample]:
     return samples
 
 
-def held_bytes(decoder: Decoder) -> int:
-    if isinstance(decoder, FrameDecoder):
-        return len(decoder._buffer)
-    assert isinstance(decoder, LineDecoder)
-    return len(decoder._partial)
-
-
 LIMITS: dict[type[Decoder], int] = {
     VectorNavDecoder: max(VECTORNAV_BYTES, VectorNavDecoder.LIMIT + 1),
     MipDecoder: MIP_BYTES,
@@ -264,7 +257,7 @@ def test_how_a_stream_is_cut_changes_nothing(kind: type[Decoder], data: st.DataO
     assert feed_in(cut, stream, cuts) == expected
     for other in (by_byte, cut):
         assert (other.accepted, other.rejected) == (whole.accepted, whole.rejected)
-        assert held_bytes(other) == held_bytes(whole)
+        assert len(other._buffer) == len(whole._buffer)
 
 
 @pytest.mark.parametrize("kind", DECODERS)
@@ -273,11 +266,11 @@ def test_nothing_raises_and_what_waits_is_bounded(kind: type[Decoder], data: st.
     decoder = kind()
     for chunk in data.draw(st.lists(st.one_of(streams(kind), st.binary(max_size=600)), max_size=8)):
         samples = decoder.feed(chunk, 0.0)
-        assert held_bytes(decoder) <= limit_of(decoder)
+        assert len(decoder._buffer) <= limit_of(decoder)
         assert all(is_sane(sample) for sample in samples)
         if data.draw(st.booleans()):
             decoder.interrupted()
-            assert held_bytes(decoder) == 0
+            assert len(decoder._buffer) == 0
     assert all(count > 0 for count in decoder.rejected.values())
     assert all(reason for reason in decoder.rejected)
 

@@ -165,7 +165,7 @@ class Supervisor:
             return
         logger.info("%s: stopping", why)
         self._stopping = True
-        self._manager.stopping()
+        self._manager.notify("STOPPING=1")
         self._work.cancel()
 
     async def _watch(self) -> None:
@@ -181,7 +181,7 @@ class Supervisor:
             overdue = [each for each in self.watched if each.overdue(passed_s) and not self._stopping]
             self._report(overdue)
             if not overdue:
-                self._manager.alive()
+                self._manager.notify("WATCHDOG=1")
             self._manager.status(self._words(overdue))
             await asyncio.sleep(period_s)
 

@@ -12,7 +12,7 @@ logger = logging.getLogger(__name__)
 
 
 class ServiceManager:
-    """Notify the service manager at a path or "@" name, if any; `watchdog_s`: its limit between two `alive`."""
+    """Notify the service manager at a path or "@" name, if any; `watchdog_s`: longest time between two WATCHDOG=1."""
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
         self._address = address or ""
@@ -27,7 +27,7 @@ class ServiceManager:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ, process_id: int | None = None) -> Self:
-        """The manager that NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID name; what they get wrong is logged."""
+        """Make the one that NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID name; log a wrong one."""
         address = environment.get("NOTIFY_SOCKET") or None
         if address is not None and address[0] not in "/@":
             logger.warning("NOTIFY_SOCKET: found %r; allowed: a path or @NAME; nobody is told", address)
@@ -45,41 +45,30 @@ class ServiceManager:
         """Return whether a service manager listens."""
         return self._socket is not None
 
-    def ready(self) -> bool:
-        """Report that the start is complete."""
-        return self._send("READY=1")
-
-    def stopping(self) -> bool:
-        """The end begins."""
-        return self._send("STOPPING=1")
-
-    def alive(self) -> bool:
-        """Feed the watchdog."""
-        return self._send("WATCHDOG=1")
-
     def status(self, words: str) -> bool:
         """Send the status line, unless it is the last one."""
         line = " ".join(words.split())
         if line == self._status:
             return True
-        sent = self._send(f"STATUS={line}")
+        sent = self.notify(f"STATUS={line}")
         if sent:
             self._status = line
         return sent
 
     def close(self) -> None:
-        """Tell nothing any more."""
+        """Stop to notify."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
-    def _send(self, *lines: str) -> bool:
+    def notify(self, line: str) -> bool:
+        """Send a line such as READY=1, WATCHDOG=1 or STOPPING=1; return whether it was sent."""
         if self._socket is None:
             return False
         # A name that begins with "@" is in no folder, and begins with a zero to the kernel.
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
-            self._socket.sendto("\n".join(lines).encode(), address)
+            self._socket.sendto(line.encode(), address)
         except OSError as error:
             level, why = logging.DEBUG if self._warned else logging.WARNING, error.strerror or error
             logger.log(level, "the service manager cannot be told at %s: %s", self._address, why)

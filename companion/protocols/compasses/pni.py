@@ -22,7 +22,7 @@ import struct
 from typing import Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import ECHO, WAIT, FrameDecoder, RejectedError
+from companion.protocols.decoding.base import ECHO, NO_FRAME, WAIT, Decoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
@@ -64,7 +64,7 @@ _SIZES: Final = {**dict.fromkeys(_LIMITS, 4), _QUATERNION: 16, **dict.fromkeys(_
 _UT_PER_GAUSS: Final = 100.0
 
 
-class PniDecoder(FrameDecoder):
+class PniDecoder(Decoder):
     """Frames of a PNI compass; gives `CompassSample`, `MagSample`, and `TiltSample` where there is no heading."""
 
     _little = False
@@ -78,7 +78,7 @@ class PniDecoder(FrameDecoder):
             return WAIT
         size = buffer[at + 1]
         if not SHORTEST <= size <= LONGEST or (available >= 3 and buffer[at + 2] not in _KNOWN):
-            return 1
+            return NO_FRAME
         if available < 3:
             return WAIT
         frame = buffer[at : at + size]

@@ -23,6 +23,11 @@ AHEAD_S = 0.5
 """Largest lead of a stream over its line; beyond, the baud rate means nothing (USB without a UART)."""
 _STALL_S = 10.0
 
+NO_FRAME: Final = 0
+WAIT: Final = -1
+ECHO: Final = "echo of a command"
+"""A command of ours, or of another master, on a line that both sides hear."""
+
 
 class RejectedError(Exception):
     """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Never leaves this room."""
@@ -33,8 +38,13 @@ class RejectedError(Exception):
 
 
 class Decoder(ABC):
-    """Bytes of one device to samples; the line time of one byte is 0 where unknown (sockets, USB)."""
+    """Finds frames in the bytes of one device; a subclass checks and reads each.
 
+    `seconds_per_byte`: line time of one byte, 0 where unknown (sockets, USB).
+    """
+
+    START: ClassVar[re.Pattern[bytes]]
+    """The bytes that may begin a frame."""
     device_clock_wraps_s: ClassVar[float | None] = None
     """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
     clock_from_start: ClassVar[bool] = False
@@ -45,12 +55,19 @@ class Decoder(ABC):
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
-        self.frame_bytes = 0
+        self.frame_bytes = self._earlier_bytes = 0
+        """Length of the latest frame, and of earlier ones that belong to its reading."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
         self.warned: Counter[str] = Counter()
+        self._buffer = b""
+        """Bytes of a possible frame; never longer than the longest frame."""
+        self._received = self._origin = 0
+        """Stream positions of the last byte and of the buffer."""
+        self._chunks: deque[tuple[int, float]] = deque()
+        """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
         """Decode bytes read at `t_s` on the host's clock; return their samples, timed and counted."""
@@ -69,60 +86,75 @@ class Decoder(ABC):
                 self.times.clock.remap()
         self._read_s = t_s
 
-    @abstractmethod
     def feed(self, data: bytes, t_s: float) -> list[Sample]:
         """Decode bytes read at `t_s` on the host's clock; a sample's time is that of its frame's last byte."""
-
-    @abstractmethod
-    def interrupted(self) -> None:
-        """Bytes are missing before the next ones (the port was opened again): forget the frame under way."""
-
-
-class LineDecoder(Decoder):
-    r"""Frames a protocol of lines that end in "\n"; a longer line is given as its last `LIMIT` bytes, marked as cut."""
-
-    LIMIT: ClassVar[int] = 80
-    _partial = b""
-    _cut = False
-
-    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
-        text = self._partial + data
-        remaining = len(text)
-        *lines, partial = text.split(b"\n")
+        if not data:
+            return []
+        self._received += len(data)
+        self._chunks.append((self._received, t_s))
+        buffer = self._buffer + data if self._buffer else bytes(data)
+        self._origin = self._received - len(buffer)
         samples: list[Sample] = []
-        for line in lines:
-            remaining -= len(line) + 1
-            cut = self._cut or len(line) > self.LIMIT
-            self._cut = False
-            try:
-                sample = self._line(line[-self.LIMIT :], t_s - self.seconds_per_byte * remaining, cut=cut)
-            except RejectedError as error:
-                self.rejected[error.reason] += 1
-            else:
-                if sample is not None:
-                    self.accepted += 1
-                    self.frame_bytes = self._frame_bytes(line)
-                    samples.append(sample)
-        if len(partial) > self.LIMIT:
-            partial, self._cut = partial[-self.LIMIT :], True
-        self._partial = partial
+        at, find = 0, self.START.search
+        while match := find(buffer, at):
+            at = match.start()
+            size = self._take(buffer, at, samples)
+            if size == WAIT:
+                break
+            at += size
+        else:
+            at = len(buffer)
+        self._buffer = buffer[at:]
+        while self._chunks and self._chunks[0][0] <= self._origin + at:
+            self._chunks.popleft()
         return samples
 
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
-        if self._partial:
+    def interrupted(self) -> None:
+        """Forget the frame under way: bytes are missing before the next ones (the port was opened again)."""
+        if self._buffer:
             self.rejected[reasons.CUT_SHORT] += 1
-        self._partial, self._cut = b"", False
+        self._buffer = b""
+        self._chunks.clear()
 
-    def _frame_bytes(self, line: bytes) -> int:
-        return len(line) + 1
+    def _take(self, buffer: bytes, at: int, samples: list[Sample]) -> int:
+        """Append the samples of the frame at `at`, if it is one; return the bytes to pass over, or `WAIT`."""
+        try:
+            size = self._size(buffer, at)
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+            return 1
+        if size <= 0:  # NO_FRAME or WAIT
+            return size or 1
+        end = at + size
+        try:
+            found = self._decode(buffer[at:end], self._time_of(self._origin + end))
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+            return size
+        if found:
+            samples += found
+            self.accepted += 1
+            self.frame_bytes = self._earlier_bytes + size
+        return size
 
     @abstractmethod
-    def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
-        r"""Read one line, without its "\n"; None where it is whole and right but (yet) gives no sample.
+    def _size(self, buffer: bytes, at: int) -> int:
+        """Return the length of the frame at `at`, checked; `NO_FRAME`, or `WAIT` for more bytes.
 
         Raises:
-            RejectedError: the line is to be counted as rejected.
+            RejectedError: what begins there is to be counted as rejected; only its first byte is passed over.
         """
+
+    @abstractmethod
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        """Read a whole frame; raise RejectedError where it gives no sample and is to be counted so."""
+
+    def _time_of(self, end: int) -> float:
+        chunks = self._chunks
+        while chunks[0][0] < end:
+            chunks.popleft()
+        chunk_end, t_s = chunks[0]
+        return t_s - self.seconds_per_byte * (chunk_end - end)
 
 
 def xor_checksum(body: bytes) -> int:
@@ -187,96 +219,44 @@ def check_vector(vector: Vector) -> None:
         raise RejectedError(reasons.NON_FINITE)
 
 
-WAIT: Final = -1
-ECHO: Final = "echo of a command"
-"""A command of ours, or of another master, on a line that both sides hear."""
+class LineDecoder(Decoder):
+    r"""Lines that end in "\n"; a longer line is given as its last `LIMIT` bytes, marked as cut."""
 
-
-class FrameDecoder(Decoder):
-    """Finds frames in a stream of bytes; a subclass checks and reads each."""
-
-    START: ClassVar[re.Pattern[bytes]]
-    """The bytes that may begin a frame."""
-
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._buffer = b""
-        """Bytes of a possible frame; never longer than the longest frame."""
-        self._received = self._origin = 0
-        """Stream positions of the last byte and of the buffer."""
-        self._chunks: deque[tuple[int, float]] = deque()
-        """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""
-
-    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
-        if not data:
-            return []
-        self._received += len(data)
-        self._chunks.append((self._received, t_s))
-        buffer = self._buffer + data if self._buffer else bytes(data)
-        self._origin = self._received - len(buffer)
-        samples: list[Sample] = []
-        at, find = 0, self.START.search
-        while match := find(buffer, at):
-            at = match.start()
-            size = self._take(buffer, at, samples)
-            if size == WAIT:
-                break
-            at += size
-        else:
-            at = len(buffer)
-        self._buffer = buffer[at:]
-        while self._chunks and self._chunks[0][0] <= self._origin + at:
-            self._chunks.popleft()
-        return samples
+    START = re.compile(rb".", re.DOTALL)
+    LIMIT: ClassVar[int] = 80
+    _cut = False
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
-        if self._buffer:
-            self.rejected[reasons.CUT_SHORT] += 1
-        self._buffer = b""
-        self._chunks.clear()
+        super().interrupted()
+        self._cut = False
 
     def _take(self, buffer: bytes, at: int, samples: list[Sample]) -> int:
-        """Append the samples of the frame at `at`, if it is one; return the bytes to pass over, or `WAIT`."""
-        try:
-            size = self._size(buffer, at)
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-            return 1
-        if size <= 1:
-            return size
-        end = at + size
-        try:
-            found = self._decode(buffer[at:end], self._time_of(self._origin + end))
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-            return size
-        if found:
-            samples += found
-            self.accepted += 1
-            self.frame_bytes = size
-        return size
+        end = buffer.find(b"\n", at)
+        excess = (end if end >= 0 else len(buffer)) - at - self.LIMIT
+        if excess > 0:
+            self._cut = True
+            return excess
+        return super()._take(buffer, at, samples)
+
+    def _size(self, buffer: bytes, at: int) -> int:
+        end = buffer.find(b"\n", at)
+        return WAIT if end < 0 else end + 1 - at
+
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        cut, self._cut = self._cut, False
+        sample = self._line(frame[:-1], t_s, cut=cut)
+        return [] if sample is None else [sample]
 
     @abstractmethod
-    def _size(self, buffer: bytes, at: int) -> int:
-        """Return the length of the frame at `at`, checked; 1 where none begins, or `WAIT` for more bytes.
+    def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
+        r"""Read one line, without its "\n"; None where it is whole and right but (yet) gives no sample.
 
         Raises:
-            RejectedError: what begins there is to be counted as rejected; only its first byte is passed over.
+            RejectedError: the line is to be counted as rejected.
         """
 
-    @abstractmethod
-    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
-        """Read a whole frame; raise RejectedError where it gives no sample and is to be counted so."""
 
-    def _time_of(self, end: int) -> float:
-        chunks = self._chunks
-        while chunks[0][0] < end:
-            chunks.popleft()
-        chunk_end, t_s = chunks[0]
-        return t_s - self.seconds_per_byte * (chunk_end - end)
-
-
-class SentenceDecoder(FrameDecoder):
+class SentenceDecoder(Decoder):
     r"""Sentences `$...` that end in "\r" or "\n"; one that the next "$" ends is cut short."""
 
     START = re.compile(rb"\$")

@@ -18,7 +18,7 @@ from typing import ClassVar, Final
 
 from companion.physics.units import G
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu, check_vector
+from companion.protocols.decoding.base import WAIT, Decoder, RejectedError, check_imu, check_vector
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
@@ -29,7 +29,7 @@ _TIME = struct.Struct(">dHH")
 _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 
 
-class MipDecoder(FrameDecoder):
+class MipDecoder(Decoder):
     """MIP packets; gives `ImuSample`."""
 
     device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week

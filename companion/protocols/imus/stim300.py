@@ -31,7 +31,7 @@ from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu
+from companion.protocols.decoding.base import NO_FRAME, WAIT, Decoder, RejectedError, check_imu
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 CRC_BYTES: Final = 4
@@ -116,7 +116,7 @@ _SYSTEM, _START_UP, _CONDITIONS, _OVERLOAD, _CHANNEL = 0x80, 0x40, 0x20, 0x10, 0
 _IDENTIFIERS = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in sorted(FRAME_BYTES)) + b"]")
 
 
-class Stim300Decoder(FrameDecoder):
+class Stim300Decoder(Decoder):
     """STIM300 datagrams; gives `ImuSample` where they hold acceleration, `TiltSample` where they hold inclination.
 
     There is no start mark: after a loss the next datagram is the next one whose CRC is right. A tilt that cannot be
@@ -150,7 +150,7 @@ class Stim300Decoder(FrameDecoder):
         was_in_step, self._in_step = self._in_step, is_whole(frame)
         if was_in_step and not self._in_step:
             raise RejectedError(reasons.CHECKSUM)
-        return size if self._in_step else 1
+        return size if self._in_step else NO_FRAME
 
     def _configure(self, frame: bytes) -> None:
         codes = (frame[_ACCEL_RANGE] >> 4, frame[_ACCEL_RANGE] & 0x0F, frame[_ACCEL_RANGE + 1] >> 4)

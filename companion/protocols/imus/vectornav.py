@@ -80,7 +80,7 @@ def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
                 places.update({part: count + offset for part, offset in used.get(bit, {}).items()})
                 code += field
                 count += int(field[:-1] or 1)
-    found = {name: places[name] for name in ("time", "temperature") if name in places}
+    found: dict[str, int] = {name: places[name] for name in ("time", "temperature") if name in places}
     if "imu temperature" in places:
         found["temperature"] = places["imu temperature"]
     for sources in (_SOURCES[:2], _SOURCES[2:], _SOURCES):
@@ -108,6 +108,8 @@ class VectorNavDecoder(SentenceDecoder):
     """The longest asynchronous sentence has some 200 bytes."""
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
     clock_from_start: ClassVar[bool] = True
+    _layout: tuple[struct.Struct, dict[str, int]]
+    """Layout of the binary frame that was checked last."""
 
     def _size(self, buffer: bytes, at: int) -> int:
         if buffer[at] != _SYNC:
@@ -118,7 +120,8 @@ class VectorNavDecoder(SentenceDecoder):
         header_bytes = _header_bytes(buffer[at + 1])
         if available < header_bytes:
             return WAIT
-        size = layout_of(buffer[at : at + header_bytes])[0].size + 2
+        self._layout = layout_of(buffer[at : at + header_bytes])
+        size = self._layout[0].size + 2
         if available < size:
             return WAIT
         if binascii.crc_hqx(buffer[at + 1 : at + size], 0) != 0:
@@ -128,7 +131,7 @@ class VectorNavDecoder(SentenceDecoder):
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[0] != _SYNC:
             return super()._decode(frame, t_s)
-        layout, places = layout_of(frame[: _header_bytes(frame[1])])
+        layout, places = self._layout
         if "gyro" not in places:
             raise RejectedError(reasons.NOTHING_OF_USE)
         values, gyro, accel = layout.unpack_from(frame), places["gyro"], places["accel"]

@@ -26,7 +26,7 @@ from typing import Final
 
 from companion.physics.units import DEG, MG
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError
+from companion.protocols.decoding.base import NO_FRAME, WAIT, Decoder, RejectedError
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
@@ -42,7 +42,7 @@ _ANGLE_SCALE: Final = 180.0 / 32768.0
 _LEAST, _GREATEST = -32768, 32767
 
 
-class WitMotionDecoder(FrameDecoder):
+class WitMotionDecoder(Decoder):
     """Frames of a WitMotion device; gives `ImuSample`, of neighbouring acceleration and rate, and `TiltSample`."""
 
     _good_at = -1
@@ -64,8 +64,8 @@ class WitMotionDecoder(FrameDecoder):
         try:
             following = _good(buffer, at + FRAME_BYTES)
         except RejectedError:
-            following = 1
-        if following == 1:
+            following = NO_FRAME
+        if following == NO_FRAME:
             raise RejectedError(ALONE)
         if following == FRAME_BYTES:
             self._good_at = here + FRAME_BYTES
@@ -104,16 +104,16 @@ class WitMotionDecoder(FrameDecoder):
 
 
 def _good(buffer: bytes, at: int) -> int:
-    """Return `FRAME_BYTES` where a frame begins, else 1 or `WAIT`; raise RejectedError for a wrong sum."""
+    """Return `FRAME_BYTES` where a frame begins, `NO_FRAME` or `WAIT`; raise RejectedError for a wrong sum."""
     available = len(buffer) - at
     if available < 1:
         return WAIT
     if buffer[at] != 0x55:
-        return 1
+        return NO_FRAME
     if available < 2:
         return WAIT
     if not _FIRST_TYPE <= buffer[at + 1] <= _LAST_TYPE:
-        return 1
+        return NO_FRAME
     if available < FRAME_BYTES:
         return WAIT
     last = at + FRAME_BYTES - 1

@@ -19,7 +19,7 @@ import struct
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu
+from companion.protocols.decoding.base import WAIT, Decoder, RejectedError, check_imu
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
@@ -39,7 +39,7 @@ _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 _FLOAT32 = struct.Struct(">3f")
 
 
-class XsensDecoder(FrameDecoder):
+class XsensDecoder(Decoder):
     """MTData2 messages; gives `ImuSample`."""
 
     START = re.compile(rb"\xfa(?:\xff|\Z)")

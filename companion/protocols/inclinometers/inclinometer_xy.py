@@ -36,7 +36,7 @@ class InclinometerXyDecoder(LineDecoder):
     LIMIT: ClassVar[int] = 64
     _x_deg: float | Literal["spoiled"] | None = None
     """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
-    _x_bytes = _decimals = _fewer_running = 0
+    _decimals = _fewer_running = 0
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         super().interrupted()
@@ -61,11 +61,8 @@ class InclinometerXyDecoder(LineDecoder):
         if axis == b"Y":
             return self._y(text, t_s)
         self._x(text)
-        self._x_bytes = len(line) + 1
+        self._earlier_bytes = len(line) + 1
         return None
-
-    def _frame_bytes(self, line: bytes) -> int:
-        return self._x_bytes + len(line) + 1
 
     def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
         if DAMAGED.search(line):

@@ -19,7 +19,7 @@ import re
 from typing import Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import ECHO, WAIT, FrameDecoder, RejectedError
+from companion.protocols.decoding.base import ECHO, NO_FRAME, WAIT, Decoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, Sample, TiltSample
 
@@ -37,7 +37,7 @@ _LENGTHS: Final[dict[int, frozenset[int]]] = {
 """The lengths that a command or an answer may have; for most no more is documented than that they are short."""
 
 
-class RionDecoder(FrameDecoder):
+class RionDecoder(Decoder):
     """Frames of a RION device; gives `CompassSample`, or `TiltSample` for the inclinometer's longer frame."""
 
     START = re.compile(b"\x68")
@@ -48,7 +48,7 @@ class RionDecoder(FrameDecoder):
             return WAIT
         length = buffer[at + 1]
         if not 4 <= length < LONGEST or (available >= 4 and length not in _LENGTHS.get(buffer[at + 3], ())):
-            return 1
+            return NO_FRAME
         if available <= length:
             return WAIT
         frame = buffer[at : at + 1 + length]

@@ -24,28 +24,28 @@ def listener(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[s
 def test_what_is_sent(listener: tuple[str, socket.socket]) -> None:
     address, listening = listener
     manager = ServiceManager.from_environment({"NOTIFY_SOCKET": address})
-    assert manager.ready()
+    assert manager.notify("READY=1")
     assert manager.status("two\nlines")
     assert manager.status("two lines")  # the same: not sent again
-    assert manager.alive()
-    assert manager.stopping()
+    assert manager.notify("WATCHDOG=1")
+    assert manager.notify("STOPPING=1")
     manager.close()
     came = [listening.recv(4096).decode() for _ in range(4)]
     assert came == ["READY=1", "STATUS=two lines", "WATCHDOG=1", "STOPPING=1"]
-    assert not manager.alive()
+    assert not manager.notify("WATCHDOG=1")
 
 
 def test_without_a_manager_nothing_happens() -> None:
     manager = ServiceManager.from_environment({"WATCHDOG_USEC": "1000000"})
     assert not manager.listens
     assert manager.watchdog_s is None
-    assert not manager.ready()
+    assert not manager.notify("READY=1")
 
 
 def test_a_manager_that_is_gone_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     manager = ServiceManager(str(tmp_path / "nobody"))
-    assert not manager.ready()
-    assert not manager.alive()
+    assert not manager.notify("READY=1")
+    assert not manager.notify("WATCHDOG=1")
     (said,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "cannot be told" in said
     manager.close()
