@@ -11,7 +11,7 @@ import re
 import stat
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -48,17 +48,13 @@ class Question:
     key: str = ""
 
 
-@dataclass
 class Draft:
     """A configuration file and its wanted content; a new one is the sample, whose values nobody has chosen."""
 
-    text: str
-    is_new: bool
-    wanted: Table = field(init=False)
-    guessed: set[str] = field(init=False, default_factory=set)
-
-    def __post_init__(self) -> None:
-        self.wanted = tomllib.loads(self.text)
+    def __init__(self, text: str, *, is_new: bool) -> None:
+        self.text, self.is_new = text, is_new
+        self.wanted: Table = tomllib.loads(text)
+        self.guessed: set[str] = set()
 
     def result(self) -> str:
         """Return the new text; raise CompanionError where single lines of it cannot be changed."""

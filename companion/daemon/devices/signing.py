@@ -1,4 +1,4 @@
-"""Signing in the daemon: the key, read each second until there is one; the time over restarts; refused senders."""
+"""Signing in the daemon: key, time over restarts, and refused senders."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ class LinkSigning:
         self._write_failed = False
         self._named: set[Reason] = set()
         """Reasons for which a sender other than the autopilot was named."""
-        self._fault: str | None = None
-        """Key of the present fault."""
+        self.warning: str | None = None
+        """Present fault of the autopilot's signatures, with its remedy."""
         self._refused: Counter[Reason] = Counter()
         """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
         self._verified = False
@@ -167,12 +167,12 @@ class LinkSigning:
 
     def _update(self, now_s: float) -> None:
         found = self._refused_by_autopilot(now_s) if self.signing is None else self._refuses(self.signing, now_s)
-        if found == self._fault:
+        if found == self.warning:
             return
-        self._fault = found
+        self.warning = found
         if found is not None:
-            logger.warning("mavlink: %s", _FAULTS[found])
-            self._say(Severity.WARNING, _FAULTS[found], Weight.NEWS)
+            logger.warning("mavlink: %s", found)
+            self._say(Severity.WARNING, found, Weight.NEWS)
         elif self.signing is not None or self._vehicle.alive:
             words = "Autopilot answers again" if self.signing is None else "Autopilot's signatures are right again"
             logger.info("mavlink: %s", words)
@@ -184,7 +184,7 @@ class LinkSigning:
         elif now_s >= self._ask_s:
             self._asked, self._unanswered = round(now_s * 1e9), self._unanswered + 1
             self._link.send(mavlink.MAVLink_timesync_message(0, self._asked))
-        return "wants ours" if self._unanswered > UNANSWERED else None
+        return _FAULTS["wants ours"] if self._unanswered > UNANSWERED else None
 
     def _refuses(self, signing: Signing, now_s: float) -> str | None:
         if self._verified:
@@ -199,20 +199,12 @@ class LinkSigning:
         if self._bad_since_s is None:
             self._bad_since_s = now_s
         if now_s - self._bad_since_s < AFTER_S:
-            return self._fault
-        return self._cause(signing, found)
-
-    def _cause(self, signing: Signing, reason: Reason) -> str:
-        return "ahead" if reason == "old" and signing.clock.ahead_of_wall_s > AHEAD_OF_CLOCK_S else reason
-
-    @property
-    def warning(self) -> str | None:
-        """The present fault with its remedy."""
-        return None if self._fault is None else _FAULTS[self._fault]
+            return self.warning
+        return _fault_of(signing, found)
 
     @property
     def rejecting(self) -> str | None:
-        """Why no autopilot is found although messages arrive; None when signing is not the reason."""
+        """Reason of signing why no autopilot is found although messages arrive, or None."""
         if self.signing is None or not self.signing.required:
             return None
         if self.trouble:
@@ -220,11 +212,11 @@ class LinkSigning:
         if not self._refused or self._vehicle.alive:
             return None
         found = max(_COUNTED, key=lambda reason: self._refused[reason])
-        return f"{self._refused[found]} messages dropped: {_FAULTS[self._cause(self.signing, found)]}"
+        return f"{self._refused[found]} messages dropped: {_fault_of(self.signing, found)}"
 
     def status(self) -> dict[str, Any] | None:
         """For `companion status`; None while signing is off and no fault is found."""
-        if self.signing is None and self._fault is None:
+        if self.signing is None and self.warning is None:
             return None
         signing = self.signing or Signing(required=False)
         fault = self.rejecting or self.trouble or self.warning
@@ -238,3 +230,8 @@ class LinkSigning:
             "verified": signing.verified,
             "doubted": dict(signing.doubted),
         }
+
+
+def _fault_of(signing: Signing, reason: Reason) -> str:
+    is_ahead = reason == "old" and signing.clock.ahead_of_wall_s > AHEAD_OF_CLOCK_S
+    return _FAULTS["ahead" if is_ahead else reason]

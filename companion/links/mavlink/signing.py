@@ -125,9 +125,9 @@ class SigningClock:
 
 
 class Signing:
-    """Sign what one link sends and verify what it receives; without a key everything is refused.
+    """Sign and verify the messages of one link; with `required` a refused one is dropped, else only counted.
 
-    With `required` a refused message is dropped, else only counted.
+    Without a key every message is refused.
     """
 
     def __init__(self, *, required: bool, key: bytes | None = None, clock: SigningClock | None = None) -> None:

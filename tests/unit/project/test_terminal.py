@@ -164,6 +164,14 @@ def test_the_monitor_in_a_pipe(replies: dict[str, Object], capsys: pytest.Captur
     assert SHOWN in out.splitlines()[0]
 
 
+def test_other_figures_are_no_news_in_a_pipe(replies: dict[str, Object], capsys: pytest.CaptureFixture[str]) -> None:
+    view, status = monitor._Lines(), dict(replies["status"]["status"])
+    for reason, lines in (("still for 3.5 s", None), ("still for 4 s", 0), ("it moves", 1), ("still for 5 s", 1)):
+        view.show(status | {"headline": status["headline"] | {"reason": reason}})
+        printed = capsys.readouterr().out.splitlines()
+        assert lines is None or len(printed) == lines
+
+
 OURS = re.compile(r"\x1b\[(2J|\?25[lh]|H|K|J|[0-9;]*m)")
 
 
