@@ -22,6 +22,7 @@ from companion.cli.terminal import (
     Command,
     Parser,
     add_fields,
+    adder,
     how_to_start,
     print_json,
     print_lines,
@@ -81,12 +82,7 @@ def _parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
     subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    def add(name: str, command: Command, words: str) -> Parser:
-        sub = subcommands.add_parser(name, parents=[common], help=words, description=words)
-        sub.set_defaults(command=command)
-        return sub
-
+    add = adder(subcommands, common)
     local.add_command(add)
     run = add("run", local.run, "run the daemon in the foreground")
     run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")

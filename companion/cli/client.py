@@ -206,7 +206,7 @@ def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float]
         return [f"  {words:16} {'mg':6} {show.axes(left, sigma, '+.3f')}"]
     return [
         f"  {words:16} {'mg':6} {show.axes(whole, sigma, '+.3f')}",
-        f"  {'  change':16} {'mg':6} {show.changes(left, '+.3f')}",
+        f"  {'  change':16} {'mg':6} {show.axes(left, None, '+.3f')}",
     ]
 
 

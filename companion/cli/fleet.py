@@ -6,11 +6,11 @@ import argparse
 import asyncio
 import contextlib
 import signal
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from companion.cli.terminal import DONE, Parser, print_lines
+from companion.cli.terminal import DONE, Parser, adder, print_lines
 from companion.errors import ConfigError
 from companion.links.system import logs
 
@@ -27,13 +27,7 @@ _NEEDS_MORE: Final = (
 def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
     words = "many aircraft: collect what they tell over MQTT in one database"
     fleet = commands.add_parser("fleet", help=words, description=words)
-    subcommands = fleet.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    def add(name: str, command: Callable[[argparse.Namespace], Awaitable[int]], words: str) -> argparse.ArgumentParser:
-        sub = subcommands.add_parser(name, parents=[common], help=words, description=words)
-        sub.set_defaults(command=command)
-        return sub
-
+    add = adder(fleet.add_subparsers(title="commands", metavar="COMMAND", required=True), common)
     words = "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
     run = add("run", _run, words)
     words = "postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)"

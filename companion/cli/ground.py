@@ -13,7 +13,7 @@ from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli.terminal import Parser, add_fields, conclude, request_of, seconds, within
+from companion.cli.terminal import Parser, add_fields, adder, conclude, request_of, seconds, within
 from companion.commands import Calibrate, Interface
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
@@ -36,13 +36,7 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     link.add_argument("--within", type=seconds, metavar="S", help=words)
     words = "sign with this key and believe nobody else (docs/security.md)"
     link.add_argument("--signing-key-file", type=Path, metavar="FILE", help=words)
-    subcommands = ground.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    def add(name: str, command: Callable[[argparse.Namespace], Awaitable[int]], words: str) -> argparse.ArgumentParser:
-        sub = subcommands.add_parser(name, parents=[common, link], help=words, description=words)
-        sub.set_defaults(command=command)
-        return sub
-
+    add = adder(ground.add_subparsers(title="commands", metavar="COMMAND", required=True), common, link)
     calibrate = add("calibrate", _calibrate, "calibrate now and show how it goes; Ctrl-C cancels")
     add_fields(calibrate, Calibrate, Interface.GROUND)
     for name, words in (

@@ -61,7 +61,7 @@ def _imu_lines(imu: Object) -> list[str]:
             continue
         lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
         if imu["written"] and imu.get(left) not in (None, imu[bias]):
-            lines.append(f"      change {unit} {changes(imu[left], form, scale)}")
+            lines.append(f"      change {unit} {axes(imu[left], None, form, scale)}")
     lines += written_lines(imu["written"])
     lines += [f"  warning: {warning}" for warning in imu["warnings"]]
     return lines
@@ -74,17 +74,13 @@ def written_lines(written: Object) -> list[str]:
     ]
 
 
-def axes(values: Sequence[float], sigmas: Sequence[float], form: str, scale: float = 1.0) -> str:
-    """Format three values with their sigmas, divided by `scale`; `form` such as "+9.1f"."""
-    return "  ".join(
-        f"{axis} {value / scale:{form}} +- {sigma / scale:.{form[-2]}f}"
-        for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
-    )
-
-
-def changes(values: Sequence[float], form: str, scale: float = 1.0) -> str:
-    """Format three values without sigmas: the change by a write."""
-    return "  ".join(f"{axis} {value / scale:{form}}" for axis, value in zip("xyz", values, strict=True))
+def axes(values: Sequence[float], sigmas: Sequence[float] | None, form: str, scale: float = 1.0) -> str:
+    """Format three values divided by `scale`, with their sigmas if given; `form` such as "+9.1f"."""
+    cells = [f"{axis} {value / scale:{form}}" for axis, value in zip("xyz", values, strict=True)]
+    if sigmas is not None:
+        pairs = zip(cells, sigmas, strict=True)
+        cells = [f"{cell} +- {sigma / scale:.{form[-2]}f}" for cell, sigma in pairs]
+    return "  ".join(cells)
 
 
 def _number(value: float | None, form: str) -> str:

@@ -29,7 +29,7 @@ NO_DAEMON: Final = 3
 
 Command = Callable[[argparse.Namespace], Awaitable[int]]
 AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
-"""Adds a command to the parser of the command line: its name, what it does, and its line of help."""
+"""Adds a command to a parser: its name, function and line of help."""
 
 
 def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
@@ -143,6 +143,17 @@ class Parser(argparse.ArgumentParser):
         near = difflib.get_close_matches(str(value), choices, n=1)
         hint = f"did you mean {near[0]}?" if near else f"allowed: {', '.join(choices)}"
         raise argparse.ArgumentError(action, f"found {str(value)!r}; {hint}")
+
+
+def adder(to: argparse._SubParsersAction[Parser], *parents: Parser) -> AddCommand:
+    """Return a function that adds commands with the options of `parents`."""
+
+    def add(name: str, command: Command, words: str) -> Parser:
+        sub = to.add_parser(name, parents=parents, help=words, description=words)
+        sub.set_defaults(command=command)
+        return sub
+
+    return add
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
