@@ -33,7 +33,7 @@ SHIPPED: Final = {
     MODULES: f"lib/{MODULES}",
     SAMPLE: "companion.toml.sample",
 }
-"""Where each file of `systemd/` goes: lib/ is below a prefix, the installation's own folder (an owner changes units
+"""Target of each file of `systemd/`: lib/ is below a prefix, the installation's own folder (an owner changes units
 with `systemctl edit`, in /etc); all else is below /etc/companion, the owner's."""
 
 

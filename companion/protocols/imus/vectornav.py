@@ -6,8 +6,9 @@ r"""VectorNav VN-100 and relatives: ASCII and binary asynchronous outputs on one
 
 Source: VectorNav UM001. Axes are X forward, Y right, Z down; level and at rest the accelerometer reads z = -9.8.
 
-A binary frame is 0xFA, a byte with one bit a group, one little-endian 16-bit mask of fields a group, the fields in
-ascending order of their bits, and a CRC-16/XMODEM, big-endian, over all but the first byte ("Binary Output Messages").
+A binary frame is 0xFA, a byte with one bit a group, and one little-endian 16-bit mask of fields a group. The fields
+follow in ascending order of their bits, then a CRC-16/XMODEM, big-endian, over all but the first byte ("Binary Output
+Messages").
 Only groups 1 (common) and 3 (IMU) are known here. The length of an unknown field is unknown, and so is everything
 after it; older firmware gave some bits other meanings, which then fails the CRC. Nothing is guessed.
 """
