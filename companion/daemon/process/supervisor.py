@@ -138,7 +138,7 @@ class Supervisor:
     async def run(self) -> None:
         """Run until a signal or a fault."""
         loop = asyncio.get_running_loop()
-        self._work = work = loop.create_task(self._service.run(self._manager.ready), name="service")
+        self._work = work = loop.create_task(self._service.run(lambda: self._manager.notify("READY=1")), name="service")
         watching = loop.create_task(self._watch(), name="supervisor")
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._stop, signal.Signals(number).name)
