@@ -14,7 +14,6 @@ from sim.imu_model import Bias, ImuModel
 from sim.px4.defaults import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, default_parameters
 from sim.px4.parameters import ParameterStore
 from sim.px4.port import NORMAL_RATES, ONBOARD_RATES, PX4Port
-from sim.px4.thermal import Module, ThermalCompensation
 from sim.px4.vehicle_imu import Sample, VehicleImu
 
 Version = Literal["1.18", "1.16"]
@@ -45,7 +44,6 @@ class Board(AutopilotDouble):
         imu_rate_hz: of the integrated samples; streams are quantised by it.
         default_streams: False: nothing but heartbeats and TIMESYNC runs by itself (quick tests).
         up_s: how long it has been running when the simulation begins.
-        thermal: whether there is a module for TC_*.
         console: whether `listener` is built, which some small boards leave out.
     """
 
@@ -65,7 +63,6 @@ class Board(AutopilotDouble):
         imu_rate_hz: float = 250.0,
         default_streams: bool = True,
         up_s: float = 30.0,
-        thermal: Module = "idle",
         console: bool = True,
         seed: int = 0,
     ) -> None:
@@ -98,13 +95,12 @@ class Board(AutopilotDouble):
         self.timesync_answers = 0
         """Answers to its own TIMESYNC requests."""
         ids = [EXTERNAL_IDS[n] if n in external else SIMULATED_IDS[n] for n in range(len(imus))]
-        table = default_parameters(thermal=thermal != "absent")
+        table = default_parameters()
         self.parameters = self._new_store(table, parameters or {}, ids, slots or range(len(imus)))
         self.vehicle_imus = [
             VehicleImu(model, n, ids[n], self.parameters, external=n in external, rate_hz=imu_rate_hz, seed=seed)
             for n, model in enumerate(imus)
         ]
-        self.thermal = ThermalCompensation(thermal, self.parameters, self.vehicle_imus)
         self.primary_imu = 0
         """Number of the IMU that flies, which HIGHRES_IMU shows."""
         self._frozen: dict[int, Sample] = {}

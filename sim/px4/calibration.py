@@ -1,6 +1,6 @@
 """One sensor's correction as PX4 keeps it in memory: which slot is its own, which offset is in use, what is refused.
 
-    corrected = R ((raw - thermal - OFF) o SCALE)
+    corrected = R ((raw - OFF) o SCALE)
     R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT), external: R(CAL_x_ROT)
 
 Every reader of the parameters in the firmware has such an object of its own (each IMU, the background gyro calibration,
@@ -42,8 +42,6 @@ class SensorCalibration:
         self.offset = np.zeros(3)
         """In use: rad/s or m/s^2, sensor axes."""
         self.scale = np.ones(3)
-        self.thermal = np.zeros(3)
-        """What the thermal compensation takes off besides, sensor axes."""
         self.rotation = np.eye(3)
         """Sensor to vehicle."""
         self.count = 0
@@ -63,7 +61,7 @@ class SensorCalibration:
 
     def correct(self, raw: Array) -> Array:
         """A reading (3) in sensor axes, corrected and turned into the vehicle's."""
-        result: Array = self.rotation @ ((raw - self.thermal - self.offset) * self.scale)
+        result: Array = self.rotation @ ((raw - self.offset) * self.scale)
         return result
 
     def reset(self) -> None:

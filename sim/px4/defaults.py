@@ -24,20 +24,14 @@ _FIXED: dict[str, float] = {
 }  # fmt: skip
 
 
-def default_parameters(*, thermal: bool = True) -> dict[str, float]:
-    """Name to default: an int is an INT32, a float a REAL32. `thermal`: the module of TC_* is built."""
+def default_parameters() -> dict[str, float]:
+    """Name to default: an int is an INT32, a float a REAL32."""
     table = dict(_FIXED)
     for slot in range(SLOTS):
         for kind in ("GYRO", "ACC"):
             table |= {f"CAL_{kind}{slot}_ID": 0, f"CAL_{kind}{slot}_PRIO": -1, f"CAL_{kind}{slot}_ROT": -1}
             table |= {f"CAL_{kind}{slot}_{axis}OFF": 0.0 for axis in "XYZ"}
         table |= {f"CAL_ACC{slot}_{axis}SCALE": 1.0 for axis in "XYZ"}
-        if thermal:
-            prefix = f"TC_G{slot}_"
-            table |= {f"{prefix}ID": 0, f"{prefix}TMAX": 100.0, f"{prefix}TMIN": 0.0, f"{prefix}TREF": 25.0}
-            table |= {f"{prefix}X{power}_{axis}": 0.0 for power in range(4) for axis in range(3)}
-    if thermal:
-        table["TC_G_ENABLE"] = 0
     # Port 0 is TELEM1 with a ground station, port 1 TELEM2 with a companion: streams, and no forwarding there.
     for port, config, mode, rate, forward in ((0, 101, 0, 1200, 1), (1, 102, 2, 0, 0), (2, 0, 0, 0, 0)):
         table |= {f"MAV_{port}_CONFIG": config, f"MAV_{port}_MODE": mode, f"MAV_{port}_RATE": rate}

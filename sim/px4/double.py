@@ -32,7 +32,6 @@ from sim.px4.parameter_server import ParameterServer
 from sim.px4.port import PX4Port
 from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, LearnedOffsets
 from sim.px4.shell import Shell
-from sim.px4.thermal import POLL_S
 
 __all__ = ["Applied", "Faults", "PX4Double", "Write"]
 
@@ -55,7 +54,7 @@ class Applied(NamedTuple):
 class PX4Double(Board):
     """An autopilot with up to four IMUs on a virtual aircraft; its port is TELEM2 (MAV_1), `ground` is TELEM1 (MAV_0).
 
-    Not modelled: flight, thermal compensation of accelerometers and its own calibration, calibrations but the gyros',
+    Not modelled: flight, thermal compensation, calibrations but the gyros',
     PREFLIGHT_STORAGE, ODOMETRY, boards that save to flash, the data rate of a port, MAVFTP, missions, logs, events,
     SETUP_SIGNING, the target fields of TIMESYNC.
 
@@ -156,7 +155,6 @@ class PX4Double(Board):
         if consumers:
             for consumer in self._consumers:
                 consumer.notify()
-            self.thermal.parameters_updated()
         self._parameter_server.tell_changes()
         if not self._saving:
             self._saving = True
@@ -198,9 +196,6 @@ class PX4Double(Board):
         self.gyro_rival.restart(loop_s)
         self.checks.restart()
         self.learned_offsets.restart()
-        self.thermal.restart()
-        if self.thermal.running:
-            self.later(POLL_S, self._compensate)
         for imu in self.vehicle_imus:
             error = self.residual(imu.index + 1, loop_s)
             imu.estimator.reset(since_s, error.accel_m_s2)
@@ -224,12 +219,6 @@ class PX4Double(Board):
                 imu.estimator.forget_accel_bias()
             if (gyro, accel) != (imu.gyro.count, imu.accel.count):
                 self.learned_offsets.calibration_changed(now_s)
-
-    def _compensate(self) -> None:
-        now_s = self.now_s()
-        self.update_estimators(now_s)
-        self.thermal.poll(self.aircraft.time_at(now_s))
-        self.later(POLL_S, self._compensate)
 
     def _update_gyro_rival(self, now_s: float) -> None:
         if self.gyro_rival.running:

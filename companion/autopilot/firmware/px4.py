@@ -5,9 +5,8 @@
 
 so the level adjustment, unlike ArduPilot's trim, turns IMU data.
 
-Thermal compensation of the gyros, TC_G*, is read and never written (autopilots 10.2). In the sensor's axes it takes off
-X0 + X1 d + X2 d^2 + X3 d^3, with d = T - TREF and T held within TMIN and TMAX, in steps of a kelvin; the offsets in
-CAL_GYROn come off besides. Most boards are built without it, and then have no such parameters.
+Thermal compensation, TC_* (autopilots 10.2), is neither read nor written: common boards are built without it. Where it
+acts, it counts as a part of the sensor.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
     ImuParameters,
     Range,
-    Thermal,
     offset_ranges,
 )
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
@@ -38,13 +36,11 @@ from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Slot, SlotMemo
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import SCALES, FirmwareName, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError
-from companion.estimation.temperature.curve import NOTHING, Polynomial
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix, vector
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Triad, Vector
 
-THERMAL_ENABLE: Final = "TC_G_ENABLE"
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 _LEVEL_RANGE: Final = Range(-45.0, 45.0, unit="deg")
 """Anything that a user may have set."""
@@ -93,13 +89,6 @@ def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
     )
 
 
-def thermal_names(sensor: int) -> tuple[str, ...]:
-    """Return ID, TREF, TMIN and TMAX of one gyro, then the coefficients: the constants first, by axis."""
-    own = f"TC_G{sensor}_"
-    head = (f"{own}ID", f"{own}TREF", f"{own}TMIN", f"{own}TMAX")
-    return (*head, *(f"{own}X{power}_{axis}" for power in range(4) for axis in range(3)))
-
-
 _RIVALS: Final = {
     "IMU_GYRO_CAL_EN": RivalKind(
         "while still",
@@ -116,12 +105,13 @@ _RIVALS: Final = {
 
 
 def _ranges() -> dict[str, Range]:
-    found = dict.fromkeys((*_RIVALS, THERMAL_ENABLE), SWITCH_RANGE) | dict.fromkeys(LEVEL[:2], _LEVEL_RANGE)
+    found = dict.fromkeys((*_RIVALS, "TC_G_ENABLE"), SWITCH_RANGE) | dict.fromkeys(LEVEL[:2], _LEVEL_RANGE)
     for slot in range(SLOTS):
-        # Former versions have written TC_G*: their undo or restore still restores the old values.
-        device_id, *rest = thermal_names(slot)
-        found |= {**offset_ranges(parameters_of(slot, slot)), device_id: DEVICE_ID_RANGE}
-        found |= {**dict.fromkeys(rest[:3], DEGC_RANGE), **dict.fromkeys(rest[3:], _TC_RANGE)}
+        # Former versions wrote TC_G*: their undo still restores the old values.
+        own = f"TC_G{slot}_"
+        found |= {**offset_ranges(parameters_of(slot, slot)), f"{own}ID": DEVICE_ID_RANGE}
+        found |= {f"{own}{name}": DEGC_RANGE for name in ("TREF", "TMIN", "TMAX")}
+        found |= {f"{own}X{power}_{axis}": _TC_RANGE for power in range(4) for axis in range(3)}
     return found
 
 
@@ -172,7 +162,6 @@ class PX4(Firmware):
             gyro_id=gyro.device_id,
             accel_id=accel.device_id,
             orientation=orientation,
-            thermal=await _read_thermal(parameters, gyro.device_id),
             far_step=_far_step(orientation),
             scale_unused_within=MARGIN * IGNORED_STEP,
             accel_offset_may_be_unused=_too_small_to_apply_at_boot(offset)
@@ -340,40 +329,4 @@ def _far_step(orientation: Matrix) -> FarStep:
         gyro_rad_s=vector(FAR_GYRO_RAD_S * vertical),
         accel_m_s2=vector(FAR_ACCEL_M_S2 * vertical),
         scale=vector(FAR_SCALE * vertical),
-    )
-
-
-async def _read_thermal(parameters: Parameters, gyro_id: int) -> Thermal:
-    """Read the thermal compensation of one gyro; it takes nothing off where it is switched off or not built in.
-
-    Whether the module runs cannot be read: it counts as running where it is switched on, as the start script has it.
-    """
-    enable = await read_integer(parameters, THERMAL_ENABLE)
-    if enable is None:
-        return Thermal()
-    switch = {THERMAL_ENABLE: float(enable)}
-    if enable != 1:
-        return Thermal(values=switch)
-    ids = [await read_integer(parameters, thermal_names(sensor)[0]) for sensor in range(SLOTS)]
-    if gyro_id not in ids:
-        return Thermal(values=switch)
-    sensor = ids.index(gyro_id)
-    found = await parameters.read_many(thermal_names(sensor))
-    if (wrong := next((name for name, value in found.items() if not math.isfinite(value)), None)) is not None:
-        raise AutopilotError(f"{wrong} is {found[wrong]}; a number was expected")
-    polynomial = polynomial_of(sensor, found)
-    acts = any(map(any, polynomial.coefficients))
-    return Thermal(
-        enabled_by=THERMAL_ENABLE if acts else "",
-        values={**switch, **found},
-        gyro=polynomial if acts else NOTHING,
-    )
-
-
-def polynomial_of(sensor: int, values: Mapping[str, float]) -> Polynomial:
-    """Return the bias over temperature that these parameters take off."""
-    _, reference, low, high, *terms = (values[name] for name in thermal_names(sensor))
-    constant, first, second, third = map(vector, np.reshape(terms, (4, 3)))
-    return Polynomial(
-        coefficients=(constant, first, second, third), reference_degc=reference, low_degc=low, high_degc=high
     )
