@@ -18,7 +18,7 @@ from companion.commands import Calibrate, Interface
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
-    from companion.ground.station import Outcome, Station
+    from companion.ground.station import RequestOutcome, Station
 
 URLS: Final = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
 DEFAULT_URL: Final = "udpin:0.0.0.0:14550"
@@ -52,14 +52,14 @@ async def _calibrate(options: argparse.Namespace) -> int:
     return await _on_the_link(options, lambda one: one.calibrate(wanted.biases, wanted.timeout_s, reboot=wanted.reboot))
 
 
-async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
-    from companion.ground.heard import Heard
+async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[RequestOutcome]]) -> int:
+    from companion.ground.heard import GroundListener
     from companion.ground.link import open_link
     from companion.ground.station import Display, Station
 
     url, key_file = getattr(options, "url", DEFAULT_URL), getattr(options, "signing_key_file", None)
     key = None if key_file is None else _key(key_file)
-    heard = Heard(getattr(options, "component", 191))
+    heard = GroundListener(getattr(options, "component", 191))
     # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
     with contextlib.redirect_stdout(sys.stderr):
         async with open_link(url, heard, key) as link:

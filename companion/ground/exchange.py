@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.commands import REMEMBER_FINAL_S
-from companion.ground.heard import Ack, Target
+from companion.ground.heard import Address, Fields, whole
 from companion.links.system.waiting import comes
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 
 
-class Answer(NamedTuple):
+class ExchangeEnd(NamedTuple):
     """End of an exchange."""
 
     result: int | None
@@ -55,7 +55,7 @@ class Exchange:
     def __init__(
         self,
         link: GroundLink,
-        target: Target,
+        target: Address,
         command: int,
         *parameters: float,
         busy: Callable[[float], bool | None],
@@ -71,15 +71,15 @@ class Exchange:
         self._confirmation = 0
         self.percent = 0
 
-    async def run(self) -> Answer:
+    async def run(self) -> ExchangeEnd:
         """Ask and wait for the end; without an answer or a heartbeat at most 20 s."""
-        stop_watching = self._link.on_ack.add(self._take)
+        stop_watching = self._link.on_ack.add(self._on_ack)
         try:
             if not await self._begin():
-                return Answer(None, begun=False)
+                return ExchangeEnd(None, begun=False)
             while self._result is None and await self._follow():
                 pass
-            return Answer(self._result, begun=True, detail=self._detail)
+            return ExchangeEnd(self._result, begun=True, detail=self._detail)
         finally:
             stop_watching()
 
@@ -116,12 +116,13 @@ class Exchange:
         self._answered.clear()
         return True
 
-    def _take(self, ack: Ack) -> None:
-        if ack.source != self._target or ack.command != self._command or self._result is not None:
+    def _on_ack(self, source: Address, ack: Fields) -> None:
+        if source != self._target or whole(ack, "command") != self._command or self._result is not None:
             return
         self._heard_s = asyncio.get_running_loop().time()
-        if ack.result != mavlink.MAV_RESULT_IN_PROGRESS:
-            self._result, self._detail = ack.result, ack.detail
-        elif ack.progress <= 100:
-            self.percent = max(self.percent, ack.progress)
+        result, progress = whole(ack, "result"), whole(ack, "progress")
+        if result != mavlink.MAV_RESULT_IN_PROGRESS:
+            self._result, self._detail = result, whole(ack, "result_param2")
+        elif progress <= 100:
+            self.percent = max(self.percent, progress)
         self._answered.set()

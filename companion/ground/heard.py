@@ -21,14 +21,14 @@ MAX_TEXTS: Final = 200
 Fields = Mapping[str, object]
 
 
-class Target(NamedTuple):
+class Address(NamedTuple):
     """A component of a vehicle."""
 
     system_id: int
     component_id: int
 
 
-class Heartbeat(NamedTuple):
+class PeerState(NamedTuple):
     """The last heartbeat of a component."""
 
     kind: int
@@ -46,17 +46,7 @@ class Text(NamedTuple):
     at_s: float
 
 
-class Ack(NamedTuple):
-    """A COMMAND_ACK that is addressed to us."""
-
-    source: Target
-    command: int
-    result: int
-    progress: int
-    detail: int
-
-
-class Vehicle(NamedTuple):
+class AutopilotSeen(NamedTuple):
     """The autopilot as its heartbeat shows it."""
 
     system_id: int
@@ -64,21 +54,21 @@ class Vehicle(NamedTuple):
     armed: Literal["armed", "disarmed", "unknown"]
 
 
-class Heard:
-    """Takes messages as they come; never raises, whatever they hold. What other components say is not kept."""
+class GroundListener:
+    """Keeps heartbeats of all components, and texts of the companions; never raises, whatever the messages hold."""
 
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
         self.first_s: float | None = None
         """Time of the first heartbeat."""
-        self.heartbeats: dict[Target, Heartbeat] = {}
+        self.heartbeats: dict[Address, PeerState] = {}
         self.texts: list[tuple[int, Text]] = []
         """Texts of the companions of all vehicles with their system ids, oldest first, at most 200."""
         self.on_text: Listeners[[int, Text]] = Listeners()
         """Listeners for every text, with its system id."""
 
-    def update(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
-        """Take a HEARTBEAT or STATUSTEXT; others are not looked at."""
+    def update(self, name: str, source: Address, fields: Fields, now_s: float) -> None:
+        """Keep a HEARTBEAT or STATUSTEXT; ignore other messages."""
         if name == "HEARTBEAT":
             self._heartbeat(source, fields, now_s)
         elif name == "STATUSTEXT" and source.component_id == self.component_id:
@@ -88,19 +78,19 @@ class Heard:
         """List the system ids of the vehicles whose companion was heard."""
         return sorted(target.system_id for target in self.heartbeats if target.component_id == self.component_id)
 
-    def vehicle(self, system_id: int, now_s: float) -> Vehicle:
+    def vehicle(self, system_id: int, now_s: float) -> AutopilotSeen:
         """Describe a vehicle's autopilot."""
-        beat = self.heartbeats.get(Target(system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
+        beat = self.heartbeats.get(Address(system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
         if beat is None:
-            return Vehicle(system_id, None, "unknown")
+            return AutopilotSeen(system_id, None, "unknown")
         armed: Literal["armed", "disarmed", "unknown"] = "unknown"
         if now_s - beat.at_s <= FRESH_S:
             armed = "armed" if beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED else "disarmed"
-        return Vehicle(system_id, FIRMWARES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
+        return AutopilotSeen(system_id, FIRMWARES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
         """Return whether the companion is at work by a heartbeat later than `since_s`; None: there was none."""
-        beat = self.heartbeats.get(Target(system_id, self.component_id))
+        beat = self.heartbeats.get(Address(system_id, self.component_id))
         if beat is None or beat.at_s <= since_s:
             return None
         return beat.system_status == mavlink.MAV_STATE_CALIBRATING
@@ -131,24 +121,25 @@ class Heard:
                 others.append(f"{system}/{component}{station}")
         return ", ".join([*vehicles, *others])
 
-    def _heartbeat(self, source: Target, fields: Fields, now_s: float) -> None:
+    def _heartbeat(self, source: Address, fields: Fields, now_s: float) -> None:
         if self.first_s is None:
             self.first_s = now_s
         if source in self.heartbeats or len(self.heartbeats) < MAX_PEERS:
-            self.heartbeats[source] = Heartbeat(
-                _whole(fields, "type"), _whole(fields, "autopilot"), _whole(fields, "base_mode"),
-                _whole(fields, "system_status"), now_s,
+            self.heartbeats[source] = PeerState(
+                whole(fields, "type"), whole(fields, "autopilot"), whole(fields, "base_mode"),
+                whole(fields, "system_status"), now_s,
             )  # fmt: skip
 
     def _text(self, system_id: int, fields: Fields, now_s: float) -> None:
-        # Whatever it was: on a terminal it can do nothing but be read.
-        text = Text(_whole(fields, "severity"), to_ascii(str(fields.get("text", "")).rstrip("\0")), now_s)
+        # A terminal must not obey it.
+        text = Text(whole(fields, "severity"), to_ascii(str(fields.get("text", "")).rstrip("\0")), now_s)
         self.texts.append((system_id, text))
         del self.texts[:-MAX_TEXTS]
         self.on_text.tell(system_id, text)
 
 
-def _whole(fields: Fields, name: str) -> int:
+def whole(fields: Fields, name: str) -> int:
+    """Return a field that must be an integer; 0 for anything else."""
     value = fields.get(name)
     return value if isinstance(value, int) else 0
 
@@ -160,7 +151,7 @@ def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
     return ", ".join(filter(None, (gyro, accel)))
 
 
-def nobody_heard(heard: Heard, url: str, system_id: int | None, within_s: float) -> str:
+def nobody_heard(heard: GroundListener, url: str, system_id: int | None, within_s: float) -> str:
     """Say in one line why no companion was found: what was heard, and what to try."""
     others, component = heard.summary(), heard.component_id
     if not others:

@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import AutopilotError, ConfigError, LinkError
-from companion.ground.heard import Ack, Heard, Target
+from companion.ground.heard import Address, Fields, GroundListener, whole
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.mavlink.signing import Signing
 from companion.links.mavlink.transport import parse_url, run_transport
@@ -98,17 +98,17 @@ class GroundLink:
     """
 
     def __init__(
-        self, sdk: Any, direct: Any, own: Target, heard: Heard, unbelieved: Callable[[], str] = lambda: ""
+        self, sdk: Any, direct: Any, own: Address, heard: GroundListener, unbelieved: Callable[[], str] = lambda: ""
     ) -> None:
         self.own, self.heard, self.unbelieved = own, heard, unbelieved
         self._sdk, self._direct = sdk, direct
-        self.on_ack: Listeners[[Ack]] = Listeners()
+        self.on_ack: Listeners[[Address, Fields]] = Listeners()
         """Listeners for every COMMAND_ACK to us."""
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
 
-    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+    def send_command(self, target: Address, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
         from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServerError, MavlinkMessage
 
@@ -126,12 +126,12 @@ class GroundLink:
         except MavlinkDirectServerError as error:
             logger.debug("not sent: %s", error)
 
-    async def parameters(self, target: Target) -> dict[str, float]:
+    async def parameters(self, target: Address) -> dict[str, float]:
         """All parameters of a component; empty when it does not answer."""
         found = await asyncio.to_thread(self._client(target).get_all_params)
         return {one.name: one.value for one in (*found.float_params, *found.int_params)}
 
-    async def get_parameter(self, target: Target, name: str) -> float | None:
+    async def get_parameter(self, target: Address, name: str) -> float | None:
         """One parameter; None when there is no answer, or no such parameter."""
         from mavsdk.plugins.param import ParamError
 
@@ -141,7 +141,7 @@ class GroundLink:
             logger.debug("%s not read: %s", name, error)
             return None
 
-    def _client(self, target: Target) -> Any:
+    def _client(self, target: Address) -> Any:
         from mavsdk.plugins.param import Param, ParamError, ParamResult, ProtocolVersion
 
         for system in self._sdk.get_systems():
@@ -158,10 +158,13 @@ class GroundLink:
 
     def _in_a_thread(self, message: Any, _: object) -> None:
         self._loop.call_soon_threadsafe(
-            self._take, message.message_name, Target(message.system_id, message.component_id), message.fields_json
+            self._on_message,
+            message.message_name,
+            Address(message.system_id, message.component_id),
+            message.fields_json,
         )
 
-    def _take(self, name: str, source: Target, fields_json: str) -> None:
+    def _on_message(self, name: str, source: Address, fields_json: str) -> None:
         try:
             fields = json.loads(fields_json)
         except ValueError:
@@ -169,13 +172,10 @@ class GroundLink:
             return
         if name != "COMMAND_ACK":
             self.heard.update(name, source, fields, self._loop.time())
-        elif fields.get("target_system") in (0, self.own.system_id) and fields.get("target_component") in (
-            0,
-            self.own.component_id,
-        ):
-            self.on_ack.tell(
-                Ack(source, *(fields.get(name, 0) for name in ("command", "result", "progress", "result_param2")))
-            )
+            return
+        system, component = whole(fields, "target_system"), whole(fields, "target_component")
+        if system in (0, self.own.system_id) and component in (0, self.own.component_id):
+            self.on_ack.tell(source, fields)
 
 
 class _Log:
@@ -207,7 +207,7 @@ class _Log:
 
 
 @asynccontextmanager
-async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIterator[GroundLink]:
+async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -> AsyncIterator[GroundLink]:
     """Be a ground station on a link; `heard` learns what comes; with a key, only what is signed with it.
 
     Raises:
@@ -222,7 +222,7 @@ async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIt
     kind, where, number = parse_url(url)
     log = _Log()
     configuration = mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
-    own = Target(configuration.system_id, configuration.component_id)
+    own = Address(configuration.system_id, configuration.component_id)
     with mavsdk.Mavsdk(configuration) as sdk:
         direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
         if key is not None:

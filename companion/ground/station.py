@@ -17,8 +17,8 @@ from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
 from companion.estimation.request import What
 from companion.ground import heard
-from companion.ground.exchange import Answer, Exchange
-from companion.ground.heard import FRESH_S, Heard, Target, Text, Vehicle
+from companion.ground.exchange import Exchange, ExchangeEnd
+from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListener, Text
 from companion.ground.link import GroundLink
 from companion.printable import printable
 
@@ -54,7 +54,7 @@ _SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class RequestOutcome:
     """Outcome of a request: for programs (`answer`, with `state` and `reason` first) and for people (`lines`)."""
 
     state: State
@@ -92,14 +92,14 @@ class Station:
 
     def __init__(self, link: GroundLink, url: str, display: Display) -> None:
         self._link, self._url, self._display = link, url, display
-        self._heard: Heard = link.heard
-        self._target = Target(0, self._heard.component_id)
+        self._heard: GroundListener = link.heard
+        self._target = Address(0, self._heard.component_id)
         self._interrupted = asyncio.Event()
         self._why_cancelled = ""
         self._heard.on_text.add(self._on_text)
 
     @property
-    def vehicle(self) -> Vehicle:
+    def vehicle(self) -> AutopilotSeen:
         """Autopilot beside the companion."""
         return self._heard.vehicle(self._target.system_id, asyncio.get_running_loop().time())
 
@@ -131,9 +131,9 @@ class Station:
             raise ConfigError(
                 f"companions of systems {', '.join(map(str, wanted))} are heard: say which with --system N"
             )
-        self._target = Target(wanted[0], self._heard.component_id)
+        self._target = Address(wanted[0], self._heard.component_id)
 
-    async def calibrate(self, what: What, timeout_s: float | None, *, reboot: bool) -> Outcome:
+    async def calibrate(self, what: What, timeout_s: float | None, *, reboot: bool) -> RequestOutcome:
         """Calibrate, and follow it to its end.
 
         Raises:
@@ -160,12 +160,12 @@ class Station:
         lines = [f"{outcome.state.upper()} after {more['duration_s']:.0f} s: {reason}", *outcome.lines[1:]]
         return dataclasses.replace(outcome, reason=reason, lines=lines, more={**outcome.more, **more})
 
-    async def undo(self) -> Outcome:
+    async def undo(self) -> RequestOutcome:
         """Put the old values back; raises as `calibrate`."""
         begun_s = asyncio.get_running_loop().time()
         return await self._judge(await self._cancellable(self._exchange(UNDO), None), begun_s)
 
-    async def cancel(self) -> Outcome:
+    async def cancel(self) -> RequestOutcome:
         """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
@@ -181,7 +181,7 @@ class Station:
         reason = f"the companion's last calibration: {last}" if last else "there was no calibration"
         return self._ended("cancelled", reason, begun_s, good=True)
 
-    async def status(self) -> Outcome:
+    async def status(self) -> RequestOutcome:
         """Describe what the companion is doing, its settings and its last result."""
         doing = self._heard.heartbeats[self._target].system_status
         state, reason = _DOING.get(doing, ("unknown", "it does not say what it is doing"))
@@ -205,14 +205,14 @@ class Station:
         else:
             lines.append("settings: no answer to the question for its parameters (a bad link?)")
         more = {**self._more(0.0), "last": last, **sigma, "parameters": found}
-        return Outcome(state, reason, good=True, lines=lines, more=more)
+        return RequestOutcome(state, reason, good=True, lines=lines, more=more)
 
     # --- asking
 
     def _exchange(self, command: int) -> Exchange:
         return Exchange(self._link, self._target, command, busy=self._is_busy)
 
-    async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> Answer:
+    async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> ExchangeEnd:
         """Run an exchange; Ctrl-C or the timeout cancel it, and its end is waited for all the same."""
         running = asyncio.create_task(exchange.run())
         try:
@@ -225,12 +225,12 @@ class Station:
                 finally:
                     cancelling.cancel()
                     await asyncio.gather(cancelling, return_exceptions=True)
-            return running.result() if running.done() else Answer(None, begun=True)
+            return running.result() if running.done() else ExchangeEnd(None, begun=True)
         finally:
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
 
-    async def _ends(self, running: asyncio.Task[Answer], within_s: float | None) -> bool:
+    async def _ends(self, running: asyncio.Task[ExchangeEnd], within_s: float | None) -> bool:
         """Wait for the end, the timeout or the next Ctrl-C; return whether it ended."""
         interrupted = asyncio.create_task(self._interrupted.wait())
         try:
@@ -240,7 +240,7 @@ class Station:
             self._interrupted.clear()
         return running.done()
 
-    async def _judge(self, answer: Answer, begun_s: float) -> Outcome:
+    async def _judge(self, answer: ExchangeEnd, begun_s: float) -> RequestOutcome:
         """Translate an answer into an outcome, with the companion's reason."""
         if not answer.begun:
             raise NobodyHeardError(
@@ -260,7 +260,7 @@ class Station:
             reason += f" ({self._why_cancelled})"
         return self._ended(state, reason, begun_s, said, good=state == "done")
 
-    async def _judge_unheard_end(self, begun_s: float) -> Outcome:
+    async def _judge_unheard_end(self, begun_s: float) -> RequestOutcome:
         """Describe an end that was not heard, or not waited for."""
         busy = self._is_busy(asyncio.get_running_loop().time() - FRESH_S)
         if busy is False:
@@ -325,11 +325,11 @@ class Station:
 
     def _ended(
         self, state: State, reason: str, begun_s: float, said: Text | None = None, *, good: bool = False
-    ) -> Outcome:
+    ) -> RequestOutcome:
         """Make an outcome, with the warnings of the companion meanwhile."""
         warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text != said]
         lines = [f"{state.upper()}: {reason}", *(f"warning: {text.words}" for text in warned)]
-        return Outcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
+        return RequestOutcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
 
     def _more(self, begun_s: float) -> dict[str, Any]:
         texts = [text.words for text in self._texts(begun_s)]

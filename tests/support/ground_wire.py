@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.heard import Ack, Heard, Target
+from companion.ground.heard import Address, Fields, GroundListener
 from companion.links.system.listeners import Listeners
 from tests.support.component import Ground, command_message
 
-COMPANION = Target(1, 191)
+COMPANION = Address(1, 191)
 
 
 def is_final(message: mavlink.MAVLink_message) -> bool:
@@ -23,10 +23,10 @@ class StationOnTheWire(Ground):
 
     def __init__(self) -> None:
         super().__init__(245, 190)
-        self.on_ack: Listeners[[Ack]] = Listeners()
+        self.on_ack: Listeners[[Address, Fields]] = Listeners()
         self.confirmations: list[int] = []
         self.deaf_to: Callable[[mavlink.MAVLink_message], bool] = lambda message: False
-        self.heard = Heard(COMPANION.component_id)
+        self.heard = GroundListener(COMPANION.component_id)
         self.values: dict[str, float] = {}
         """The companion's parameters, as if read."""
 
@@ -36,18 +36,17 @@ class StationOnTheWire(Ground):
         for _, message in self.received[known:]:
             if self.deaf_to(message):
                 continue
-            source = Target(message.get_srcSystem(), message.get_srcComponent())
+            source = Address(message.get_srcSystem(), message.get_srcComponent())
             self.heard.update(message.get_type(), source, message.to_dict(), t_s)
             if isinstance(message, mavlink.MAVLink_command_ack_message):
-                ack = Ack(source, message.command, message.result, message.progress, message.result_param2)
-                self.on_ack.tell(ack)
+                self.on_ack.tell(source, message.to_dict())
 
-    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+    def send_command(self, target: Address, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         self.confirmations.append(confirmation)
         self.send(command_message(command, *parameters, target=target, confirmation=confirmation))
 
-    async def parameters(self, target: Target) -> dict[str, float]:
+    async def parameters(self, target: Address) -> dict[str, float]:
         return self.values
 
-    async def get_parameter(self, target: Target, name: str) -> float | None:
+    async def get_parameter(self, target: Address, name: str) -> float | None:
         return self.values.get(name)

@@ -9,8 +9,7 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.exchange import Answer, Exchange
-from companion.ground.heard import Ack
+from companion.ground.exchange import Exchange, ExchangeEnd
 from companion.ground.link import GroundLink
 from tests.support.component import (
     ACCEPTED,
@@ -69,10 +68,10 @@ def test_answers_to_others_and_of_others_are_not_ours() -> None:
                 (COMPANION._replace(system_id=2), CALIBRATE),
                 (COMPANION, UNDO),
             ):
-                station.on_ack.tell(Ack(source, command, mavlink.MAV_RESULT_DENIED, 0, 0))
+                station.on_ack.tell(source, {"command": command, "result": mavlink.MAV_RESULT_DENIED})
             await asyncio.sleep(0.5)
             assert not asking.done()
             b.service.jobs[0].finish("done")
-            assert await asking == Answer(ACCEPTED, begun=True)
+            assert await asking == ExchangeEnd(ACCEPTED, begun=True)
 
     run_virtual(main())

@@ -6,40 +6,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.ground import heard as ground_heard
-from companion.ground.heard import Fields, Heard, Target, Vehicle
+from companion.ground.heard import Address, AutopilotSeen, Fields, GroundListener
 
 ARDUPILOT, PX4, NO_AUTOPILOT = 3, 12, 8
 QUADROTOR, GCS, ONBOARD = 2, 6, 18
 
 
-def beat(heard: Heard, system: int, component: int, *, now_s: float = 10.0, **fields: int) -> None:
+def beat(heard: GroundListener, system: int, component: int, *, now_s: float = 10.0, **fields: int) -> None:
     defaults = {"type": ONBOARD, "autopilot": NO_AUTOPILOT, "base_mode": 0, "system_status": 3}
-    heard.update("HEARTBEAT", Target(system, component), {**defaults, **fields}, now_s)
+    heard.update("HEARTBEAT", Address(system, component), {**defaults, **fields}, now_s)
 
 
-def say(heard: Heard, text: str, *, component: int = 191) -> None:
+def say(heard: GroundListener, text: str, *, component: int = 191) -> None:
     fields: Fields = {"severity": 6, "text": text}
-    heard.update("STATUSTEXT", Target(1, component), fields, 10.0)
+    heard.update("STATUSTEXT", Address(1, component), fields, 10.0)
 
 
-def said(heard: Heard) -> list[str]:
+def said(heard: GroundListener) -> list[str]:
     return [text.words for _, text in heard.texts]
 
 
 def test_the_vehicle_as_its_heartbeats_show_it() -> None:
-    heard = Heard(191)
+    heard = GroundListener(191)
     beat(heard, 1, 191, now_s=10.0)
     assert heard.companions() == [1]
-    assert heard.vehicle(1, 10.0) == Vehicle(1, None, "unknown")
+    assert heard.vehicle(1, 10.0) == AutopilotSeen(1, None, "unknown")
     beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4, base_mode=0x80 | 1, now_s=11.0)
-    assert heard.vehicle(1, 12.0) == Vehicle(1, "PX4", "armed")
+    assert heard.vehicle(1, 12.0) == AutopilotSeen(1, "PX4", "armed")
     beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4, base_mode=1, now_s=12.0)
-    assert heard.vehicle(1, 12.5) == Vehicle(1, "PX4", "disarmed")
-    assert heard.vehicle(1, 16.0) == Vehicle(1, "PX4", "unknown"), "that heartbeat says nothing about now"
+    assert heard.vehicle(1, 12.5) == AutopilotSeen(1, "PX4", "disarmed")
+    assert heard.vehicle(1, 16.0) == AutopilotSeen(1, "PX4", "unknown"), "that heartbeat says nothing about now"
 
 
 def test_lines_that_go_on_are_one_text() -> None:
-    heard = Heard(191)
+    heard = GroundListener(191)
     say(heard, "Calibration failed: armed in the middle;")
     say(heard, "... old values back")
     say(heard, "another vehicle's autopilot", component=1)
@@ -50,7 +50,7 @@ def test_lines_that_go_on_are_one_text() -> None:
 
 
 def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
-    heard = Heard(191)
+    heard = GroundListener(191)
     say(heard, "calm \x1b[31mred\x07 \ufffd 5\u00b0")
     assert said(heard) == ["calm ?[31mred? ? 5 deg"]
 
@@ -67,14 +67,14 @@ anything = st.sampled_from([None, True, -1, 0, 2**70, 1.5, float("nan"), "", "x"
     )
 )
 def test_nothing_on_the_wire_raises(messages: list[tuple[str, dict[str, object]]]) -> None:
-    heard = Heard(191)
+    heard = GroundListener(191)
     for name, fields in messages:
-        heard.update(name, Target(1, 191), fields, 0.0)
+        heard.update(name, Address(1, 191), fields, 0.0)
     heard.summary()
 
 
 def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
-    heard = Heard(191)
+    heard = GroundListener(191)
     nothing = ground_heard.nobody_heard(heard, "udpin:0.0.0.0:14550", None, 5.0)
     for part in ("nothing heard", "udpin:0.0.0.0:14550", "5 s", "--url"):
         assert part in nothing

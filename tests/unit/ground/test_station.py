@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.statustext import Severity, Weight
 from companion.errors import ConfigError, NobodyHeardError
 from companion.estimation.request import What
-from companion.ground.heard import Target
+from companion.ground.heard import Address
 from companion.ground.link import GroundLink
 from companion.ground.station import Display, Station
 from tests.support.component import Bench, bench
@@ -41,7 +41,7 @@ def station_on(wire: StationOnTheWire, notes: Notes | None = None) -> Station:
 
 def beat(wire: StationOnTheWire, system_id: int, component_id: int, kind: int, autopilot: int) -> None:
     fields = {"type": kind, "autopilot": autopilot, "base_mode": 0, "system_status": mavlink.MAV_STATE_STANDBY}
-    wire.heard.update("HEARTBEAT", Target(system_id, component_id), fields, asyncio.get_running_loop().time())
+    wire.heard.update("HEARTBEAT", Address(system_id, component_id), fields, asyncio.get_running_loop().time())
 
 
 async def until_started(b: Bench, jobs: int = 1) -> None:

@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.cli import main, monitor
 from companion.daemon.process.check import CheckLine
 from companion.errors import LinkError
-from companion.ground.heard import Heard, Target
+from companion.ground.heard import Address, GroundListener
 from companion.links.serial.ports import Holder, SerialPort
 from companion.links.system.logs import JournalFormatter, OneLineFormatter
 from companion.printable import printable
@@ -228,13 +228,13 @@ def test_what_is_heard_on_the_ground(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, form: list[str]
 ) -> None:
     @contextlib.asynccontextmanager
-    async def open_link(_url: str, heard: Heard, _key: bytes | None) -> AsyncIterator[StationOnTheWire]:
+    async def open_link(_url: str, heard: GroundListener, _key: bytes | None) -> AsyncIterator[StationOnTheWire]:
         wire, beat = StationOnTheWire(), {"type": 18, "autopilot": 8, "base_mode": 0, "system_status": 3}
         wire.heard = heard
         wire.values = {"CMP_STATE": 1.0, f"CMP_{EVIL}": 1.0}
-        heard.update("HEARTBEAT", Target(1, 191), beat, asyncio.get_running_loop().time())
+        heard.update("HEARTBEAT", Address(1, 191), beat, asyncio.get_running_loop().time())
         text = {"severity": mavlink.MAV_SEVERITY_CRITICAL, "text": EVIL, "id": 0, "chunk_seq": 0}
-        heard.update("STATUSTEXT", Target(1, 191), text, asyncio.get_running_loop().time())
+        heard.update("STATUSTEXT", Address(1, 191), text, asyncio.get_running_loop().time())
         yield wire
 
     monkeypatch.setattr("companion.ground.link.open_link", open_link)
