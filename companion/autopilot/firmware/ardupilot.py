@@ -20,7 +20,6 @@ from companion.autopilot.firmware.ardupilot_calibration import (
     AT_START,
     INSTANCES,
     ArduPilotParameters,
-    GyrosAtRest,
     parameters_of,
 )
 from companion.autopilot.firmware.base import (
@@ -100,7 +99,7 @@ class ArduPilot(Firmware):
     """4 s with its own gyro calibration in between."""
     ekf_reset_s = 3.0
     imu_messages = {1: (HIGHRES, SCRIPT[1], SCALED, RAW), 2: (SCRIPT[2], SCALED2), 3: (SCRIPT[3], SCALED3)}
-    gyro_calibration = GyrosAtRest()
+    gyro_calibration_resets_ekf = True
     estimator_message = mavlink.MAVLink_ekf_status_report_message
     faster_log = "LOG_BITMASK with IMU_FAST"
     ranges = _ranges()

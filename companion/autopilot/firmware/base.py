@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
-from companion.autopilot.firmware.ardupilot_calibration import GyrosAtRest
 from companion.autopilot.firmware.imu_calibration import Acts, ImuCalibration, Range, Rival
 from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.firmware.px4_slots import SlotMemory
@@ -164,8 +163,8 @@ class Firmware:
         """Return the tilt that the EKF may keep from before these changes until a restart; 0: none owes one."""
         return 0.0
 
-    gyro_calibration: GyrosAtRest | None = None
-    """Own gyro calibration, where that resets the EKF's gyro bias and AHRS shows that bias."""
+    gyro_calibration_resets_ekf = False
+    """Its own gyro calibration resets the EKF's gyro bias, and AHRS shows that bias."""
 
     why_no_thermal_write: str | None = None
     """Why no curve is written into the firmware's temperature calibration; None: it is."""

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
-from typing import ClassVar, Final, Literal, Protocol
+from collections.abc import Awaitable, Callable, Sequence
+from typing import ClassVar, Final, Literal
 
 from companion.autopilot.parameters.wire import float32
 from companion.errors import AutopilotError, NotDisarmedError
@@ -94,18 +94,16 @@ class WriteFailedError(AutopilotError):
         self.left_changed = left_changed
 
 
-class FarProbe(Protocol):
-    """Verifies in the telemetry that a far value (`Change.via`) is in use."""
+FarProbe = Callable[[str], Callable[[], Awaitable[str | None]]]
+"""Called with a parameter just before its far value (`Change.via`) is written; returns the verification.
 
-    def mark(self, parameter: str) -> None:
-        """Keep the telemetry until now: the far value of this parameter is written next."""
-
-    async def verify(self, parameter: str) -> str | None:
-        """Compare with the telemetry since; the reason to restore the old values, if there is one."""
+The verification compares the telemetry since with that before, and returns the reason to restore the old values, if
+there is one.
+"""
 
 
 @dataclasses.dataclass(slots=True)
-class Item:
+class PendingChange:
     """One parameter of a write, and its state."""
 
     change: Change
@@ -126,16 +124,16 @@ class Item:
         )
 
 
-ItemVector = tuple[Item, list[Item]]
+PendingVector = tuple[PendingChange, list[PendingChange]]
 """The axis with a far value, and the others of its vector."""
 
 
-def by_vector(items: Sequence[Item]) -> tuple[list[Item], list[ItemVector]]:
+def by_vector(items: Sequence[PendingChange]) -> tuple[list[PendingChange], list[PendingVector]]:
     """Split into parameters that need no far value, and vectors that do, in order."""
-    vectors: dict[str, ItemVector] = {
+    vectors: dict[str, PendingVector] = {
         _AXIS.sub("", item.change.parameter): (item, []) for item in items if item.change.via is not None
     }
-    plain: list[Item] = []
+    plain: list[PendingChange] = []
     for item in items:
         if item.change.via is None:
             vector = vectors.get(_AXIS.sub("", item.change.parameter))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Iterable
 from typing import Final, Literal, Protocol
@@ -50,40 +49,6 @@ class Parameters(Protocol):
 
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
         """Read several; where `optional`, what does not exist is left out."""
-
-
-class DisarmedGuard(Protocol):
-    """Proof that an autopilot is disarmed."""
-
-    async def ensure(self) -> None:
-        """Return in the moment in which it is surely disarmed; raises NotDisarmedError."""
-
-
-class CommandSender(Protocol):
-    """Commands to an autopilot."""
-
-    def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> asyncio.Future[int | None]:
-        """Send one; the future brings its MAV_RESULT, or None."""
-
-
-class LiveOwner(Owner, Protocol):
-    """An autopilot that takes commands."""
-
-    @property
-    def disarmed(self) -> DisarmedGuard:
-        """To be asked before each command that may only leave while it is disarmed."""
-
-    @property
-    def commands(self) -> CommandSender:
-        """Commands to it."""
-
-
-class LiveParameters(Parameters, Protocol):
-    """Parameters of an autopilot that takes commands."""
-
-    @property
-    def vehicle(self) -> LiveOwner:
-        """Their owner."""
 
 
 async def read_vector(

@@ -72,7 +72,7 @@ class AxisVerdict:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Verdict:
+class EffectVerdict:
     """One vector."""
 
     axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
@@ -95,7 +95,7 @@ class Verdict:
         return "verified" if word == "seen" else "stored"
 
 
-def judge(seen: Observation) -> Verdict:
+def judge(seen: Observation) -> EffectVerdict:
     """Judge one vector."""
     rotation = np.eye(3) if seen.orientation is None else seen.orientation
     made = rotation.T @ (np.asarray(seen.after) - np.asarray(seen.before))
@@ -124,7 +124,7 @@ def judge(seen: Observation) -> Verdict:
                 f" ({_family(seen.parameters)})"
             )
     hidden = [axis.parameter for axis in axes if axis.word == "too small to see" and axis.expected != 0.0]
-    return Verdict(
+    return EffectVerdict(
         axes=axes,
         fraction_sigma=fraction_sigma,
         problems=tuple(problems),

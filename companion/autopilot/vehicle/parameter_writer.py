@@ -20,15 +20,15 @@ from companion.autopilot.parameters.change import (
     Change,
     FailureKind,
     FarProbe,
-    Item,
-    ItemVector,
     NothingWrittenError,
+    PendingChange,
+    PendingVector,
     WriteFailedError,
     by_vector,
 )
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
-from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer
 from companion.errors import (
     AutopilotError,
     AutopilotRebootedError,
@@ -149,11 +149,11 @@ class ParameterWriter:
 
     # --- forward
 
-    def _begin(self, changes: Sequence[Change]) -> list[Item]:
+    def _begin(self, changes: Sequence[Change]) -> list[PendingChange]:
         names = [change.parameter for change in changes]
         if len(set(names)) != len(names):
             raise ValueError("a parameter is named twice")
-        items = [Item(change) for change in changes]
+        items = [PendingChange(change) for change in changes]
         self._publish(items)
         if (why := self._vehicle.arm_state.why_not_written) is not None:
             raise NothingWrittenError(f"nothing is written: {why}")
@@ -162,7 +162,7 @@ class ParameterWriter:
         self._boots = self._vehicle.boots
         return items
 
-    async def _check_before(self, items: list[Item]) -> None:
+    async def _check_before(self, items: list[PendingChange]) -> None:
         for item in items:
             name, before = item.change.parameter, item.change.before
             now = await self._read(name)
@@ -172,14 +172,14 @@ class ParameterWriter:
                     f"{name} is {_words(now)} now but was {_words(before)} when it was measured; nothing was written",
                 )
 
-    async def _write_by_far(self, vectors: Sequence[ItemVector], probe: FarProbe | None) -> None:
+    async def _write_by_far(self, vectors: Sequence[PendingVector], probe: FarProbe | None) -> None:
         """Write one vector after another: its far value, and when that is in use all new values, the far axis last.
 
         So whatever ends this, the far axis differs from its old value as long as any other axis does.
         """
         wrong: list[str] = []
         for far, others in vectors:
-            await Moment(self._vehicle).let_pass(2.0 * POLL_S)
+            await VehicleTimer(self._vehicle).let_pass(2.0 * POLL_S)
             words = await self._write_far(far, probe)
             if words is None:
                 for item in others:
@@ -192,26 +192,25 @@ class ParameterWriter:
             far.is_far = False
         if vectors:
             # Whoever is told that it is done may arm.
-            await Moment(self._vehicle).let_pass(POLL_S)
+            await VehicleTimer(self._vehicle).let_pass(POLL_S)
         if wrong:
             raise _Failure("not as believed", "; ".join(wrong))
 
-    async def _write_far(self, item: Item, probe: FarProbe | None) -> str | None:
+    async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
         """Write the far value and wait until it is in use; why it is not as believed, if so."""
-        if probe is not None:
-            probe.mark(item.change.parameter)
+        verify = None if probe is None else probe(item.change.parameter)
         await self._write(item, item.change.far)
         item.is_far = True
-        if probe is not None:
-            return await probe.verify(item.change.parameter)
-        await Moment(self._vehicle).let_pass(POLL_S)
+        if verify is not None:
+            return await verify()
+        await VehicleTimer(self._vehicle).let_pass(POLL_S)
         return None
 
-    async def _write_new(self, item: Item) -> None:
+    async def _write_new(self, item: PendingChange) -> None:
         if item.change.before != item.change.after or item.sent:
             await self._write(item, item.change.after)
 
-    async def _write(self, item: Item, value: float) -> None:
+    async def _write(self, item: PendingChange, value: float) -> None:
         name = item.change.parameter
         sent_before = self._parameters.writes
         try:
@@ -223,7 +222,7 @@ class ParameterWriter:
             item.sent |= self._parameters.writes > sent_before
         self._check_boot(f"after {name} was written")
 
-    async def _read_back(self, items: list[Item]) -> None:
+    async def _read_back(self, items: list[PendingChange]) -> None:
         await asyncio.sleep(_LATE_ECHO_S)
         for item in items:
             name, wanted = item.change.parameter, item.change.after
@@ -258,7 +257,7 @@ class ParameterWriter:
 
     # --- back
 
-    async def _fail(self, items: list[Item], failure: _Failure) -> None:
+    async def _fail(self, items: list[PendingChange], failure: _Failure) -> None:
         kind, reason = failure.kind, str(failure)
         if not self._vehicle.alive and any(item.sent for item in items):
             # It fell silent: if it comes back, learn first whether it restarted.
@@ -275,7 +274,7 @@ class ParameterWriter:
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
-    async def _put_back(self, items: list[Item], *, leave_foreign: bool) -> None:
+    async def _put_back(self, items: list[PendingChange], *, leave_foreign: bool) -> None:
         touched = [item for item in reversed(items) if item.sent]
         for item in touched:
             item.outcome, item.left, item.read_back = "failed", True, None  # until known better
@@ -294,7 +293,7 @@ class ParameterWriter:
                     if not far.is_far:
                         await self._put_back_one(far, far.change.far, leave_foreign=foreign)
                     if self._vehicle.alive and not self._late():
-                        await Moment(self._vehicle).let_pass(2.0 * POLL_S)
+                        await VehicleTimer(self._vehicle).let_pass(2.0 * POLL_S)
                     for item in (*others, far):
                         await self._put_back_one(item, item.change.before, leave_foreign=foreign)
                 await asyncio.sleep(TAKEN_S if vectors and self._vehicle.alive else _LATE_ECHO_S)
@@ -306,7 +305,7 @@ class ParameterWriter:
         finally:
             self._publish(items)
 
-    async def _put_back_one(self, item: Item, value: float, *, leave_foreign: bool) -> None:
+    async def _put_back_one(self, item: PendingChange, value: float, *, leave_foreign: bool) -> None:
         """Set one parameter to its old value, or to the far one."""
         change = item.change
         if not await self._wait_disarmed() or self._late():
@@ -348,7 +347,7 @@ class ParameterWriter:
     def _late(self) -> bool:
         return asyncio.get_running_loop().time() > self._deadline_s
 
-    def _kind_now(self, items: list[Item]) -> FailureKind:
+    def _kind_now(self, items: list[PendingChange]) -> FailureKind:
         if self._vehicle.arm_state is ArmState.ARMED:
             return "armed in the middle"
         if self._vehicle.arm_state is ArmState.UNKNOWN:
@@ -358,7 +357,7 @@ class ParameterWriter:
         foreign = any(item.left and not any(_same(item.read_back, own) for own in item.change.ours) for item in items)
         return "changed by someone else" if foreign else "answered another value"
 
-    def _publish(self, items: list[Item]) -> dict[str, WrittenParameter]:
+    def _publish(self, items: list[PendingChange]) -> dict[str, WrittenParameter]:
         self.written = {item.change.parameter: item.seen() for item in items}
         self.left_changed = tuple(item.change.parameter for item in items if item.left)
         self.left_far = tuple(item.change.parameter for item in items if item.left and item.is_far)

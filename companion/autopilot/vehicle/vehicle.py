@@ -33,7 +33,7 @@ from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
 from companion.links.system.listeners import Listeners
 
-__all__ = ["ArmState", "Moment", "Vehicle", "VehicleEvent"]
+__all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 
 logger = logging.getLogger(__name__)
 
@@ -347,7 +347,7 @@ class Vehicle:
             self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
 
-class Moment:
+class VehicleTimer:
     """This instant on our clock and on the autopilot's, which a simulated one on a busy machine lets run slower.
 
     What an autopilot does "at most once a second" (autopilots 9.2) it does by its own clock. To conclude after so many

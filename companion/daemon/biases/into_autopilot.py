@@ -16,7 +16,7 @@ from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import CurvesWritten, Job
-from companion.daemon.offsets.plan import Plan, Target, WriteLog, left_in
+from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog, left_in
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
@@ -75,10 +75,10 @@ class IntoAutopilot:
         job.product = CurvesWritten(log.written, warnings)
         return f"written: {'; '.join(words)}"
 
-    async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:
+    async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[ImuPlan], list[str], list[str]]:
         """Return the targets of the write, their words, and why other IMUs are left as they are."""
         exchanged = self._memory.forgotten()  # the curve of an IMU that was replaced must not be written
-        targets: list[Target] = []
+        targets: list[ImuPlan] = []
         words: list[str] = []
         left: list[str] = []
         for means in (means for means in window.imus if means.name in self._imus):
@@ -101,7 +101,9 @@ class IntoAutopilot:
                 named = {change.parameter for target in targets for change in target.unseen}
                 unseen = tuple(change for change in changes if change.parameter not in named)
                 nothing = left_in(means, np.zeros(3), np.zeros(3))
-                targets.append(Target(name, calibration, (), nothing, imu.stream.own_kind, watched=True, unseen=unseen))
+                targets.append(
+                    ImuPlan(name, calibration, (), nothing, imu.stream.own_kind, watched=True, unseen=unseen)
+                )
                 low, high = curve.span_degc
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
         return targets, words, left

@@ -27,8 +27,8 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import (
+    ImuPlan,
     Plan,
-    Target,
     WriteLog,
     as_good,
     refuse_shared,
@@ -233,7 +233,7 @@ class CalibrationRun(Job):
         core, rivalry, slots = self._core, self._parts.offsets.rivalry, self._parts.offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}
         push = core.wanted.push  # may be switched while parameters are read: for all IMUs or for none
-        targets: list[Target] = []
+        targets: list[ImuPlan] = []
         for estimate in self.solution.imus:
             imu, instance = self._imus.get(estimate.name), sources[estimate.name].autopilot_instance
             found = without(estimate, [triad for name, triad in self.held_back if name == estimate.name])

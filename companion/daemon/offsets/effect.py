@@ -16,11 +16,11 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.verify import Observation, Verdict, judge
-from companion.autopilot.vehicle.vehicle import ArmState, Moment
+from companion.autopilot.parameters.verify import EffectVerdict, Observation, judge
+from companion.autopilot.vehicle.vehicle import ArmState, VehicleTimer
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
-from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.plan import ImuPlan, Plan
 from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import MIN_BATCHES
@@ -44,7 +44,7 @@ TELEMETRY: Final = "waiting for the telemetry"
 """Progress shown until then: the step of the new offsets itself looks like a movement."""
 POLL_S: Final = 0.2
 
-Verdicts = Mapping[str, list[Verdict]]
+Verdicts = Mapping[str, list[EffectVerdict]]
 """Verdicts by IMU."""
 
 # Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
@@ -67,7 +67,7 @@ async def watch_effect(
         return None, "no autopilot IMU is in the telemetry"
     loop, vehicle = asyncio.get_running_loop(), core.vehicle
     most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
-    written = Moment(vehicle)
+    written = VehicleTimer(vehicle)
     words = TELEMETRY
     while not written.has_passed(vehicle.kind.settle_s):
         go_on(words)
@@ -112,7 +112,7 @@ def _in_the_way(core: Core, looked_s: float) -> str:
     return words
 
 
-def _judge(core: Core, px4: Px4Writes, target: Target, before: Window, after: Window) -> list[Verdict]:
+def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: Window) -> list[EffectVerdict]:
     sides = BeforeAfter(
         before=next(imu for imu in before.imus if imu.name == target.name),
         after=next(imu for imu in after.imus if imu.name == target.name),
@@ -165,7 +165,7 @@ def judge_vectors(
     kind: StreamKind | None,
     profile: str | NoiseProfile | None,
     on_the_way: OnTheWay,
-) -> list[Verdict]:
+) -> list[EffectVerdict]:
     """Judge the written vectors: accelerometers, gyros, or both.
 
     Where the output followed a far value and then left it as it had to, the new value is in use, however small the
@@ -175,7 +175,7 @@ def judge_vectors(
     names, noise = calibration.parameters, noise_profile(profile)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
     flicker: Mapping[Triad, float] = {} if profile is not None else ORDINARY_FLICKER
-    verdicts: list[Verdict] = []
+    verdicts: list[EffectVerdict] = []
     halves: tuple[tuple[Triad, Array | None, Vector, tuple[str, str, str], str], ...] = (
         ("accel", sides.accel_residual, accel_step, names.accel_offset, "m/s^2"),
         ("gyro", sides.gyro_residual, gyro_step, names.gyro_offset, "rad/s"),
@@ -258,7 +258,7 @@ def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> V
     return x, y, z
 
 
-def in_short(verdict: Verdict) -> str:
+def in_short(verdict: EffectVerdict) -> str:
     """Summarise a verdict in one short line for people; `verdict.problems` has the figures."""
     unused = [axis.parameter for axis in verdict.axes if axis.word == "not seen"]
     if unused:

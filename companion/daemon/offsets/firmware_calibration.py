@@ -17,18 +17,18 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.ardupilot_calibration import GyroOutcome, GyroParameters, GyrosAtRest
+from companion.autopilot.firmware.ardupilot_calibration import AT_START
 from companion.autopilot.parameters.change import Change, WriteFailedError
+from companion.autopilot.vehicle import gyro_calibration
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
-from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.autopilot.vehicle.gyro_calibration import GyroOutcome
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter, kind_of
-from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.config.sections import Platform
+from companion.daemon.core import Core
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import Plan, WriteLog
 from companion.errors import AutopilotError, CompanionError
@@ -51,41 +51,33 @@ SETTLE_ALONE_S: Final = 150.0
 class FirmwareCalibration:
     """Decides whether the firmware's gyro calibration is wanted, and writes around it."""
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        parameters: ParameterClient,
-        writer: ParameterWriter,
-        ledger: Ledger,
-        ekf: EkfWatch,
-        platform: Platform,
-    ) -> None:
-        self._vehicle, self._parameters, self._platform = vehicle, parameters, platform
-        self._writer, self._ledger, self._ekf = writer, ledger, ekf
+    def __init__(self, core: Core, writer: ParameterWriter, ledger: Ledger) -> None:
+        self._vehicle, self._parameters = core.vehicle, core.parameters
+        self._on_deck = core.config.vehicle.platform == "deck"
+        self._writer, self._ledger, self._ekf = writer, ledger, EkfWatch(core.vehicle)
 
-    async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> GyroParameters | None:
+    async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> dict[str, float] | None:
         """Read what it would overwrite; None when it is not worth it, or not allowed (then `warn` is called).
 
         Raises:
             AutopilotError: the autopilot does not answer.
         """
-        own = self._vehicle.kind.gyro_calibration
-        if own is None or not gyros or self._platform == "deck":
+        if not self._vehicle.kind.gyro_calibration_resets_ekf or not gyros or self._on_deck:
             # On a deck its mean of half a second is the deck's rate, and would be written to all its gyros.
             return None
         step = max(abs(change.after - change.before) for change in gyros)
         if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:
             return None
-        before = await own.read(self._parameters)
-        if before.tcal:
+        before = await gyro_calibration.read_overwritten(self._parameters)
+        if active := await gyro_calibration.read_active_tcal(self._parameters, before):
             warn(
-                f"{', '.join(before.tcal)} is on: the firmware's own gyro calibration, which would reset its EKF, would"
+                f"{', '.join(active)} is on: the firmware's own gyro calibration, which would reset its EKF, would"
                 " also change what the offsets mean, so it was left out; the EKF settles by itself"
             )
             return None
         return before
 
-    async def write(self, plan: Plan, before: GyroParameters, log: WriteLog, go_on: Callable[[str], None]) -> Plan:
+    async def write(self, plan: Plan, before: Mapping[str, float], log: WriteLog, go_on: Callable[[str], None]) -> Plan:
         """Write all offsets, calibrate, write the gyro offsets again: all of it, or all the old values are restored.
 
         Runs in a transaction, which grows with what the firmware changes besides. Returns the plan with those changes
@@ -94,40 +86,37 @@ class FirmwareCalibration:
         Raises:
             NothingWrittenError, WriteFailedError: as `ParameterWriter.apply`.
         """
-        own = self._vehicle.kind.gyro_calibration
-        assert own is not None
         boots, changes, system_id = self._vehicle.boots, plan.changes, self._vehicle.system_id
         written = await self._writer.apply(changes)
         wanted = {change.parameter: change.after for change in changes}
-        now = dataclasses.replace(before, values={n: wanted.get(n, value) for n, value in before.values.items()})
+        now = {name: wanted.get(name, value) for name, value in before.items()}
         try:
-            ours = [change for change in changes if change.parameter not in before.values]
-            await self._ledger.widen(ChangeSet.of(system_id, ours, before.values))
-            calibration = await own.run(self._parameters, now, go_on)
+            ours = [change for change in changes if change.parameter not in before]
+            await self._ledger.widen(ChangeSet.of(system_id, ours, before))
+            outcome, warning, coarse = await gyro_calibration.calibrate(self._parameters, now, go_on)
             go_on(f"writing {len(plan.gyros)} fine gyro offsets")
-            coarse = calibration.after.values
             fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
-            changed = before.changed_in(calibration.after).items()
-            collateral = tuple(Change(name, old, new) for name, (old, new) in changed if name not in wanted)
+            others = gyro_calibration.changed(before, coarse).items()
+            collateral = tuple(Change(name, old, new) for name, (old, new) in others if name not in wanted)
             await self._ledger.widen(ChangeSet.of(system_id, (*changes, *collateral)))
         except CompanionError as error:
-            await self._restore(own, changes, before, boots, error)
+            await self._restore(changes, before, boots, error)
             raise
         # The record holds what was in force before all this, not the firmware's coarse value in between.
         written |= {c.parameter: msgspec.structs.replace(fine[c.parameter], before=c.before) for c in plan.gyros}
         plan.note(log, written)
-        if calibration.words:
-            log.warnings.append(calibration.words)
+        if warning:
+            log.warnings.append(warning)
         if collateral:
             log.warnings.append(
                 "the firmware's gyro calibration, which resets its EKF, has changed others too:"
                 f" {', '.join(c.parameter for c in collateral)}; undo puts them back"
             )
-        return dataclasses.replace(plan, collateral=collateral, firmware=calibration.outcome)
+        return dataclasses.replace(plan, collateral=collateral, firmware=outcome)
 
     async def settle(self, plan: Plan, go_on: Callable[[str], None]) -> str | None:
         """After new gyro offsets, wait until the EKF agrees; returns what a pilot should know if it has not."""
-        if self._vehicle.kind.gyro_calibration is None or not plan.gyros:
+        if not self._vehicle.kind.gyro_calibration_resets_ekf or not plan.gyros:
             return None
         try:
             return await self._ekf.settle(settles_within_s(plan.firmware), go_on)
@@ -135,12 +124,7 @@ class FirmwareCalibration:
             self._ekf.stop()
 
     async def _restore(
-        self,
-        own: GyrosAtRest,
-        changes: Sequence[Change],
-        before: GyroParameters,
-        boots: int,
-        error: CompanionError,
+        self, changes: Sequence[Change], before: Mapping[str, float], boots: int, error: CompanionError
     ) -> None:
         """Restore our old values, and everything that the firmware's calibration may have changed.
 
@@ -149,20 +133,19 @@ class FirmwareCalibration:
         """
         logger.warning("writing around the firmware's gyro calibration: %s; putting everything back", error)
         reason = error.reason if isinstance(error, WriteFailedError) else str(error)
-        back = [change for change in changes if change.parameter not in before.values]
+        back = [change for change in changes if change.parameter not in before]
         left: tuple[str, ...] = ()
         try:
-            again = await own.runs_at_start(self._parameters) if self._vehicle.boots != boots else None
-            if again is not None:
-                reason += f"; the restart has measured the gyros anew ({again}), so those stay"
+            if self._vehicle.boots != boots and await self._parameters.read_optional(AT_START):
+                reason += f"; the restart has measured the gyros anew ({AT_START}), so those stay"
             else:
-                now = await own.read(self._parameters)
-                back += [Change(name, old, new) for name, (old, new) in before.changed_in(now).items()]
+                now = await gyro_calibration.read_overwritten(self._parameters)
+                back += [Change(name, old, new) for name, (old, new) in gyro_calibration.changed(before, now).items()]
             await self._writer.restore(back)
         except WriteFailedError as failure:
             left = failure.left_changed
         except AutopilotError:
-            left = tuple(dict.fromkeys((*(change.parameter for change in back), *before.values)))
+            left = tuple(dict.fromkeys((*(change.parameter for change in back), *before)))
         outcomes = {
             change.parameter: WrittenParameter(
                 before=change.before,

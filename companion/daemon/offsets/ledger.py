@@ -16,6 +16,7 @@ import msgspec
 
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.vehicle.gyro_calibration import wait_until_over
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.statustext import Severity, Weight
@@ -234,9 +235,9 @@ class Recovery:
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
         unknown = {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}
-        if unknown and (own := self._vehicle.kind.gyro_calibration) is not None:
+        if unknown:
             # The firmware stores its result at its end, over whatever was restored before.
-            await own.wait_until_over(self._parameters, unknown)
+            await wait_until_over(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
             with changing(self._imus.values()):

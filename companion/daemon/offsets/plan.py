@@ -11,12 +11,12 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.ardupilot_calibration import GyroOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
+from companion.autopilot.vehicle.gyro_calibration import GyroOutcome
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.errors import AutopilotError
 from companion.estimation.means.windows import ImuWindow
@@ -58,7 +58,7 @@ class WriteLog:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Target:
+class ImuPlan:
     """New offsets of one autopilot IMU."""
 
     name: str
@@ -83,7 +83,7 @@ class Target:
 class Plan:
     """Changes of one write."""
 
-    targets: tuple[Target, ...]
+    targets: tuple[ImuPlan, ...]
     boots: int
     """Restarts of the autopilot seen when the plan was made."""
     collateral: tuple[Change, ...] = ()
@@ -130,15 +130,15 @@ def target_of(
     estimate: ImuSolution,
     residual: tuple[Array | None, Array | None],
     imu: AutopilotImu | None,
-) -> Target:
+) -> ImuPlan:
     """Plan the changes that take a residual (gyro, accelerometer) out of the output of one IMU."""
     gyro, accel = residual
     changes = changes_for(calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel))
     kind = imu.stream.own_kind if imu is not None else None
-    return Target(estimate.name, calibration, tuple(changes), estimate, kind, watched=imu is not None)
+    return ImuPlan(estimate.name, calibration, tuple(changes), estimate, kind, watched=imu is not None)
 
 
-def warnings_of(target: Target) -> list[str]:
+def warnings_of(target: ImuPlan) -> list[str]:
     """Warnings about planned changes."""
     name, estimate, found = target.name, target.solution, list[str]()
     coarse_mg = math.sqrt(np.diag(estimate.covariance)[3:].max()) / MG if estimate.accel_m_s2 is not None else 0.0
@@ -150,7 +150,7 @@ def warnings_of(target: Target) -> list[str]:
     return [*found, *warnings_about(target.calibration, target.changes)]
 
 
-def refuse_shared(targets: Sequence[Target], memory: SlotMemory) -> None:
+def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
     """Check that no two IMUs share one of PX4's parameter slots.
 
     Raises:

@@ -14,7 +14,7 @@ import functools
 import logging
 import math
 from collections import defaultdict, deque
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -26,7 +26,7 @@ from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, accel_offset_
 from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, SlotMemory
 from companion.autopilot.parameters.change import Change, FarProbe, WriteFailedError
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
-from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
@@ -118,7 +118,7 @@ class Px4Writes:
             self._steps |= far_steps(calibration, changes, read)
         try:
             async with self._listening():
-                yield self if self._steps else None
+                yield self.watch if self._steps else None
         except WriteFailedError as error:
             if self._vehicle.arm_state is ArmState.ARMED:
                 # One offset may be wrong on purpose, and while it is armed nobody may mend that.
@@ -165,18 +165,20 @@ class Px4Writes:
 
     # --- the probe
 
-    def mark(self, parameter: str) -> None:
-        """Keep the means until now."""
-        if (step := self._steps.get(parameter)) is not None:
+    def watch(self, parameter: str) -> Callable[[], Awaitable[str | None]]:
+        """Keep the means until now, as a `FarProbe`."""
+        step = self._steps.get(parameter)
+        if step is not None:
             now_s = asyncio.get_running_loop().time()
             imus = self._vehicle.kind.imu_messages
             self._before = {instance: self._mean(instance, step.sensor, now_s - BEFORE_S, now_s) for instance in imus}
+        return functools.partial(self._verify, step)
 
-    async def verify(self, parameter: str) -> str | None:
+    async def _verify(self, step: ExpectedStep | None) -> str | None:
         """Learn whose output moved; returns why this is not as it was believed, or None."""
-        if (step := self._steps.get(parameter)) is None:
+        if step is None:
             return None
-        since, loop = Moment(self._vehicle), asyncio.get_running_loop()
+        since, loop = VehicleTimer(self._vehicle), asyncio.get_running_loop()
         from_s = to_s = loop.time()
         while not since.has_passed(PATIENCE_S):
             await asyncio.sleep(CHECK_S)

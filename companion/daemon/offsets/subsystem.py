@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from companion.autopilot.vehicle.ekf import EkfWatch
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
@@ -32,8 +31,7 @@ class Offsets(Subsystem):
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry, self.owed = Rivalry(core, imus), RebootOwed(core)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
-        ekf, platform = EkfWatch(vehicle), config.vehicle.platform
-        firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, ekf, platform)
+        firmware = FirmwareCalibration(core, self.writer, self.ledger)
         self.write_path = WritePath(core, imus, self.writer, self.ledger, px4, firmware, self.owed)
         self.recovery = Recovery(core, self.writer, self.ledger, imus, self.owed)
 

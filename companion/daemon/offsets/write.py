@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapp
 from typing import Final
 
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
-from companion.autopilot.parameters.verify import Verdict
+from companion.autopilot.parameters.verify import EffectVerdict
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
@@ -25,7 +25,7 @@ from companion.daemon.job import GoOn, Job, JobCancelledError
 from companion.daemon.offsets.effect import in_short, watch_effect
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
 from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.offsets.plan import Plan, Target, WriteLog
+from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.reboot import BACK_WITHIN_S, NotRebootedError, RebootOwed, harm_of_reboot, reboot
 from companion.errors import (
@@ -314,7 +314,7 @@ class WritePath:
         return ""
 
 
-def _note_verdicts(plan: Plan, target: Target, verdicts: Sequence[Verdict], log: WriteLog) -> list[str]:
+def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict], log: WriteLog) -> list[str]:
     """Enter the outcomes of one IMU's parameters; returns what is wrong, in words."""
     hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
     if hidden:

@@ -9,8 +9,8 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot_calibration import TIMEOUT_S, GyroParameters, GyrosAtRest
-from companion.autopilot.parameters.reading import LiveParameters
+from companion.autopilot.vehicle.gyro_calibration import TIMEOUT_S, calibrate
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.errors import NotDisarmedError
 from tests.support.virtual_time import run_virtual
@@ -47,11 +47,10 @@ class _Autopilot:
 @pytest.mark.parametrize("result", [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED])
 def test_offsets_that_stay_at_zero_after_the_answer_are_looked_at_four_times_a_second(result: int) -> None:
     autopilot = _Autopilot(result)
-    before = GyroParameters(OFFSETS, gyros=(1,), tcal=())
 
     async def main() -> float:
         began_s = asyncio.get_running_loop().time()
-        await GyrosAtRest().run(cast("LiveParameters", autopilot), before, lambda words: None)
+        await calibrate(cast("ParameterClient", autopilot), OFFSETS, lambda words: None)
         return asyncio.get_running_loop().time() - began_s
 
     assert TIMEOUT_S <= run_virtual(main()) < TIMEOUT_S + 2.0
@@ -61,7 +60,6 @@ def test_offsets_that_stay_at_zero_after_the_answer_are_looked_at_four_times_a_s
 @pytest.mark.parametrize("arm_state", [ArmState.ARMED, ArmState.UNKNOWN])
 def test_it_is_not_asked_for_unless_the_aircraft_is_surely_disarmed(arm_state: ArmState) -> None:
     autopilot = _Autopilot(mavlink.MAV_RESULT_ACCEPTED, arm_state)
-    before = GyroParameters(OFFSETS, gyros=(1,), tcal=())
     with pytest.raises(NotDisarmedError, match=r"not started: .*armed"):
-        run_virtual(GyrosAtRest().run(cast("LiveParameters", autopilot), before, lambda words: None))
+        run_virtual(calibrate(cast("ParameterClient", autopilot), OFFSETS, lambda words: None))
     assert autopilot.sent == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 from collections.abc import AsyncIterator
 from typing import NamedTuple
@@ -310,17 +311,13 @@ async def test_what_is_seen_on_the_way_may_put_everything_back() -> None:
         changes = small_changes(await read_calibration(stage.client, 1))
         seen: list[list[float]] = []
 
-        class Probe:
-            def mark(self, parameter: str) -> None:
-                pass
-
-            async def verify(self, parameter: str) -> str | None:
-                await asyncio.sleep(0.1)
-                seen.append(in_use(stage.px4, "GYRO"))
-                return "it acts on another IMU" if parameter.startswith("CAL_GYRO") else None
+        async def verify(parameter: str) -> str | None:
+            await asyncio.sleep(0.1)
+            seen.append(in_use(stage.px4, "GYRO"))
+            return "it acts on another IMU" if parameter.startswith("CAL_GYRO") else None
 
         with pytest.raises(WriteFailedError, match="not as believed: it acts on another IMU") as caught:
-            await stage.writer.apply(changes, Probe())
+            await stage.writer.apply(changes, lambda parameter: functools.partial(verify, parameter))
         assert caught.value.kind == "not as believed"
         assert max(seen[-1]) == pytest.approx(0.0228)
         await asyncio.sleep(1.5)
@@ -331,17 +328,12 @@ async def test_armed_between_the_two_steps_nothing_more_is_written_until_it_is_d
     async with aboard(ScriptedPx4()) as stage:
         changes = small_changes(await read_calibration(stage.client, 1))
 
-        class Arms:
-            def mark(self, parameter: str) -> None:
-                pass
-
-            async def verify(self, parameter: str) -> str | None:
-                stage.px4.armed = True
-                await asyncio.sleep(1.5)
-                return None
+        async def verify() -> None:
+            stage.px4.armed = True
+            await asyncio.sleep(1.5)
 
         with pytest.raises(WriteFailedError) as caught:
-            await stage.writer.apply(changes, Arms())
+            await stage.writer.apply(changes, lambda _parameter: verify)
         assert caught.value.kind == "armed in the middle"
         assert set(caught.value.left_changed) == {"CAL_ACC0_ZOFF"}
         assert not any(armed for _, _, armed in stage.px4.sets)

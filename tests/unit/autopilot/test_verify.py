@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from companion.autopilot.parameters.verify import Observation, Verdict, judge
+from companion.autopilot.parameters.verify import EffectVerdict, Observation, judge
 from companion.samples import Vector
 
 NAMES = ("INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z")
@@ -29,7 +29,7 @@ def observation(step: Vector, made: Vector, sigma: float = 1e-5) -> Observation:
     )
 
 
-def words(verdict: Verdict) -> list[str]:
+def words(verdict: EffectVerdict) -> list[str]:
     return [axis.word for axis in verdict.axes]
 
 

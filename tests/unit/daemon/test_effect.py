@@ -10,7 +10,7 @@ import pytest
 from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.verify import Verdict
+from companion.autopilot.parameters.verify import EffectVerdict
 from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, BeforeAfter, judge_vectors, why_look_longer
 from companion.estimation.means.windows import ImuWindow
 
@@ -52,7 +52,9 @@ def window(seconds: Any, offset: Any) -> ImuWindow:
     )
 
 
-def verdict_of(rng: np.random.Generator, spans: tuple[int, int], noise: Any, step: Any, made: Any = None) -> Verdict:
+def verdict_of(
+    rng: np.random.Generator, spans: tuple[int, int], noise: Any, step: Any, made: Any = None
+) -> EffectVerdict:
     """Judge a write of `step` (3,) after which the output moved by `made`; None: by `step`."""
     before = window(rng.normal(0.0, noise, (spans[0], 3)), 0.0)
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if made is None else made)
@@ -100,5 +102,5 @@ def test_a_longer_look_is_worth_it_where_it_can_change_the_verdict(
     problems: tuple[str, ...], sigma: float, looked_s: float, words: str
 ) -> None:
     axes: Any = ()
-    verdict = Verdict(axes=axes, fraction_sigma=sigma, problems=problems, hidden=("INS_GYROFFS_X",))
+    verdict = EffectVerdict(axes=axes, fraction_sigma=sigma, problems=problems, hidden=("INS_GYROFFS_X",))
     assert why_look_longer({"fc": [verdict]}, looked_s) == words

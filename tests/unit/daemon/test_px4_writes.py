@@ -195,9 +195,9 @@ def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
             found = await stage.read(1)
             async with stage.writes.standing_by([(found, small_changes(found), (0.0, 0.0, 0.0))]) as probe:
                 assert probe is not None
-                probe.mark("CAL_GYRO0_ZOFF")
+                verify = probe("CAL_GYRO0_ZOFF")
                 stage.client.vehicle.boots += 1
-                assert await probe.verify("CAL_GYRO0_ZOFF") is None
+                assert await verify() is None
             assert stage.memory.known("gyro", ICM) is None
 
     run_virtual(main())
@@ -216,15 +216,11 @@ def test_old_values_that_are_back_are_in_use(tmp_path: Path) -> None:
             await stage.writer.undo(changes)
             assert not np.any(list(px4.used.values()))
 
-            class Refuses:
-                def mark(self, parameter: str) -> None:
-                    pass
-
-                async def verify(self, parameter: str) -> str:
-                    return "not as believed"
+            async def verify() -> str:
+                return "not as believed"
 
             with pytest.raises(WriteFailedError):
-                await stage.writer.apply(changes, Refuses())
+                await stage.writer.apply(changes, lambda _parameter: verify)
             assert not np.any(list(px4.used.values()))
 
     run_virtual(main())

@@ -1,0 +1,169 @@
+"""ArduPilot's own gyro calibration, by command, for what only it can do: reset the EKF's gyro bias (autopilots 1.7).
+
+It also (autopilots 1.5, 3, 9.3.1) measures the gyros of all instances to some 10 deg/h with the Earth's rotation in
+them, writes their offsets, calibration temperatures and device ids, and sets to zero what belongs to no gyro. It is
+answered at its end, after 0.5 to 30 s; while it runs the offsets read zero. A second command meanwhile is answered
+early, as if all were done: so the command leaves once, and its end shows in the offsets.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from typing import Final, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters, parameters_of
+from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
+
+logger = logging.getLogger(__name__)
+
+TIMEOUT_S: Final = 40.0
+"""Longest wait: ArduPilot gives up after some 30 s."""
+_LOST_AFTER_S: Final = 3.0
+"""Time after the command at which old offsets still in force mean that it was lost or refused."""
+_LOOK_S: Final = 0.25
+_AFTERWARDS_S: Final = 0.5
+"""Time from the last offset to the end of the command: the saving, and the EKF's reset."""
+
+GyroOutcome = Literal["reset", "not converged", "unanswered", "not run"]
+"""End of the calibration.
+
+"reset": converged, the EKF's gyro bias is reset. "not converged": the firmware stored its best guess, did not reset the
+EKF, and refuses to arm ("Gyros not calibrated") until a gyro calibration succeeds or it restarts. "unanswered": it ran,
+and the answer was lost. "not run": refused or lost, nothing has changed.
+"""
+
+
+async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
+    """Read every parameter that the calibration writes, of all instances.
+
+    Raises:
+        AutopilotError: one cannot be read, or the autopilot restarted meanwhile.
+    """
+    vehicle, every = parameters.vehicle, [parameters_of(instance) for instance in INSTANCES]
+    boots = vehicle.boots
+    found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
+    present = [names for names in every if names.gyro_offset[0] in found]
+    if not present:
+        raise AutopilotError("the autopilot has no gyro offsets")
+    found |= await parameters.read_many(name for names in present for name in names.gyro_offset[1:])
+    more = (name for names in present for name in (names.tcal.gyro_caltemp, names.gyro_id))
+    found |= await parameters.read_many(more, optional=True)
+    if vehicle.boots != boots:
+        raise AutopilotRebootedError(f"{vehicle.name} restarted while its gyro parameters were read")
+    return found
+
+
+async def read_active_tcal(parameters: ParameterClient, values: Mapping[str, float]) -> list[str]:
+    """Read which temperature calibrations are on: there the gyro calibration changes what an offset means."""
+    switches = [names.tcal.enable for names in _present(values)]
+    return [name for name, value in (await parameters.read_many(switches, optional=True)).items() if value]
+
+
+def changed(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Return old and new value of every parameter that differs, by name."""
+    both = {name: (old, after[name]) for name, old in before.items() if name in after}
+    return {name: pair for name, pair in both.items() if not same_float32(*pair)}
+
+
+async def calibrate(
+    parameters: ParameterClient, before: Mapping[str, float], go_on: Callable[[str], None]
+) -> tuple[GyroOutcome, str, dict[str, float]]:
+    """Let the firmware calibrate, once; return the outcome, a warning ("": none) and the values now in force.
+
+    `before` was read just now; `go_on` is called with the progress in words.
+
+    Raises:
+        NotDisarmedError: not disarmed when the command was about to leave: nothing was done.
+        AutopilotError: no answer any more, or a restart; any of its parameters may have changed.
+    """
+    vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
+    boots = vehicle.boots
+
+    def require_same_boot() -> None:
+        if vehicle.boots != boots:
+            raise AutopilotRebootedError(f"{vehicle.name} restarted during its gyro calibration")
+
+    go_on("the autopilot calibrates its gyros: keep the aircraft still")
+    try:
+        await vehicle.disarmed.ensure()
+    except NotDisarmedError as error:
+        raise NotDisarmedError(f"the firmware's gyro calibration was not started: {error}") from error
+    answer = vehicle.commands.send(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1.0, timeout_s=TIMEOUT_S)
+    sent_s = loop.time()
+    try:
+        while loop.time() < sent_s + TIMEOUT_S:
+            if answer.done():
+                await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
+            else:
+                await asyncio.wait([answer], timeout=_LOOK_S)
+            require_same_boot()
+            state = await _state(parameters, before)
+            if state == "ended":
+                # An acknowledgement that is still on its way says more than its absence.
+                await asyncio.wait([answer], timeout=_AFTERWARDS_S)
+                break
+            answered = answer.done() and answer.result() is not None
+            if state == "untouched" and (answered or loop.time() > sent_s + _LOST_AFTER_S):
+                break
+            if loop.time() > sent_s + 1.0:
+                go_on(f"the autopilot calibrates its gyros for {loop.time() - sent_s:.0f} s: keep the aircraft still")
+        await asyncio.sleep(_AFTERWARDS_S)
+        after = await read_overwritten(parameters)
+        require_same_boot()
+        outcome, words = _judge(answer.result() if answer.done() else None, ran=bool(changed(before, after)))
+        return outcome, words, after
+    finally:
+        answer.cancel()
+
+
+async def wait_until_over(parameters: ParameterClient, before: Mapping[str, float]) -> None:
+    """After an interruption, wait until a calibration that may have been started has ended, or never ran."""
+    # Old offsets, or zeros, tell nothing while it may run: it stores its result at its end.
+    vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
+    boots, since_s = vehicle.boots, loop.time()
+    while loop.time() < since_s + TIMEOUT_S and vehicle.boots == boots:
+        state = await _state(parameters, before)
+        if state == "ended" or (state == "untouched" and loop.time() > since_s + _LOST_AFTER_S):
+            break
+        await asyncio.sleep(_LOOK_S)
+    await asyncio.sleep(_AFTERWARDS_S)
+
+
+async def _state(parameters: ParameterClient, before: Mapping[str, float]) -> Literal["running", "ended", "untouched"]:
+    """Tell the state by the offsets of the instances with a gyro: zero while it runs, set together at its end."""
+    vectors = [names.gyro_offset for names in _present(before) if before.get(names.gyro_id, 1.0)]
+    offsets = [name for vector in vectors for name in vector]
+    now = dict.fromkeys(offsets, 0.0) | await parameters.read_many(offsets, optional=True)
+    if not all(any(now[name] for name in vector) for vector in vectors):
+        return "running"
+    return "untouched" if all(same_float32(now[name], before[name]) for name in offsets) else "ended"
+
+
+def _present(values: Mapping[str, float]) -> list[ArduPilotParameters]:
+    """Return the names of the instances whose gyro offsets were read."""
+    return [names for names in map(parameters_of, INSTANCES) if set(names.gyro_offset) <= values.keys()]
+
+
+def _judge(result: int | None, *, ran: bool) -> tuple[GyroOutcome, str]:
+    answer = "no answer" if result is None else f"result {result}"
+    outcome: GyroOutcome
+    if result == mavlink.MAV_RESULT_ACCEPTED:
+        return "reset", ""
+    if not ran:
+        outcome, words = "not run", f"the firmware's gyro calibration did not run ({answer})"
+    elif result is None:
+        outcome, words = "unanswered", "the firmware's gyro calibration ran, its answer did not arrive"
+    else:
+        outcome = "not converged"
+        words = (
+            f"the firmware's gyro calibration failed ({answer}): it will not arm (Gyros not calibrated) until a gyro"
+            " calibration succeeds or it restarts"
+        )
+    logger.warning("%s", words)
+    return outcome, words
