@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -34,19 +34,8 @@ LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 
 
-class ExchangeEnd(NamedTuple):
-    """End of an exchange."""
-
-    result: int | None
-    """MAV_RESULT_*; None: no final answer came."""
-    begun: bool
-    """True: the companion has answered at least once."""
-    detail: int = 0
-    """`result_param2` of the final answer."""
-
-
 class Exchange:
-    """A request under way; `run` it once.
+    """A request; `run` it once, then read its end.
 
     `busy`: whether the companion is at work, by a heartbeat later than a time; None: there was none. `on_progress` is
     told how far it is and for how long nothing has come, several times a second.
@@ -64,22 +53,24 @@ class Exchange:
         self._link, self._target, self._command = link, target, command
         self._busy, self._on_progress = busy, on_progress
         self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
-        self._result: int | None = None
-        self._detail = 0
+        self.result: int | None = None
+        """MAV_RESULT of the final answer; None: none came."""
+        self.detail = 0
+        """`result_param2` of the final answer."""
+        self.unanswered = False
+        """No answer came to any attempt."""
         self._answered = asyncio.Event()
         self._heard_s = 0.0
         self._confirmation = 0
         self.percent = 0
 
-    async def run(self) -> ExchangeEnd:
+    async def run(self) -> None:
         """Ask and wait for the end; without an answer or a heartbeat at most 20 s."""
         stop_watching = self._link.on_ack.add(self._on_ack)
         try:
-            if not await self._begin():
-                return ExchangeEnd(None, begun=False)
-            while self._result is None and await self._follow():
+            self.unanswered = not await self._begin()
+            while not self.unanswered and self.result is None and await self._follow():
                 pass
-            return ExchangeEnd(self._result, begun=True, detail=self._detail)
         finally:
             stop_watching()
 
@@ -117,12 +108,12 @@ class Exchange:
         return True
 
     def _on_ack(self, source: Address, ack: Fields) -> None:
-        if source != self._target or whole(ack, "command") != self._command or self._result is not None:
+        if source != self._target or whole(ack, "command") != self._command or self.result is not None:
             return
         self._heard_s = asyncio.get_running_loop().time()
         result, progress = whole(ack, "result"), whole(ack, "progress")
         if result != mavlink.MAV_RESULT_IN_PROGRESS:
-            self._result, self._detail = result, whole(ack, "result_param2")
+            self.result, self.detail = result, whole(ack, "result_param2")
         elif progress <= 100:
             self.percent = max(self.percent, progress)
         self._answered.set()

@@ -17,7 +17,7 @@ from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
 from companion.estimation.request import What
 from companion.ground import heard
-from companion.ground.exchange import Exchange, ExchangeEnd
+from companion.ground.exchange import Exchange
 from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListener, Text
 from companion.ground.link import GroundLink
 from companion.printable import printable
@@ -145,8 +145,8 @@ class Station:
             self._link, self._target, CALIBRATE, float(what.value), float(reboot),
             busy=self._is_busy, on_progress=self._show_progress,
         )  # fmt: skip
-        answer = await self._cancellable(exchange, timeout_s)
-        outcome = await self._judge(answer, begun_s)
+        await self._cancellable(exchange, timeout_s)
+        outcome = await self._judge(exchange, begun_s)
         more: dict[str, Any] = {"duration_s": round(loop.time() - begun_s, 1)}
         reason = outcome.reason
         if outcome.state == "done":
@@ -162,17 +162,18 @@ class Station:
 
     async def undo(self) -> RequestOutcome:
         """Put the old values back; raises as `calibrate`."""
-        begun_s = asyncio.get_running_loop().time()
-        return await self._judge(await self._cancellable(self._exchange(UNDO), None), begun_s)
+        begun_s, exchange = asyncio.get_running_loop().time(), self._exchange(UNDO)
+        await self._cancellable(exchange, None)
+        return await self._judge(exchange, begun_s)
 
     async def cancel(self) -> RequestOutcome:
         """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
         loop = asyncio.get_running_loop()
-        begun_s = loop.time()
-        answer = await self._exchange(CANCEL).run()
-        if answer.result != mavlink.MAV_RESULT_ACCEPTED:
-            return await self._judge(answer, begun_s)
-        if answer.detail == NOTHING_RAN:
+        begun_s, exchange = loop.time(), self._exchange(CANCEL)
+        await exchange.run()
+        if exchange.result != mavlink.MAV_RESULT_ACCEPTED:
+            return await self._judge(exchange, begun_s)
+        if exchange.detail == NOTHING_RAN:
             return self._ended("idle", "nothing was running", begun_s, good=True)
         answered_s = loop.time()
         while self._is_busy(answered_s) is not False and loop.time() - begun_s < CANCELLED_WITHIN_S:
@@ -212,7 +213,7 @@ class Station:
     def _exchange(self, command: int) -> Exchange:
         return Exchange(self._link, self._target, command, busy=self._is_busy)
 
-    async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> ExchangeEnd:
+    async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> None:
         """Run an exchange; Ctrl-C or the timeout cancel it, and its end is waited for all the same."""
         running = asyncio.create_task(exchange.run())
         try:
@@ -225,12 +226,13 @@ class Station:
                 finally:
                     cancelling.cancel()
                     await asyncio.gather(cancelling, return_exceptions=True)
-            return running.result() if running.done() else ExchangeEnd(None, begun=True)
+            if running.done():
+                await running  # raise its error
         finally:
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
 
-    async def _ends(self, running: asyncio.Task[ExchangeEnd], within_s: float | None) -> bool:
+    async def _ends(self, running: asyncio.Task[None], within_s: float | None) -> bool:
         """Wait for the end, the timeout or the next Ctrl-C; return whether it ended."""
         interrupted = asyncio.create_task(self._interrupted.wait())
         try:
@@ -240,22 +242,22 @@ class Station:
             self._interrupted.clear()
         return running.done()
 
-    async def _judge(self, answer: ExchangeEnd, begun_s: float) -> RequestOutcome:
-        """Translate an answer into an outcome, with the companion's reason."""
-        if not answer.begun:
+    async def _judge(self, exchange: Exchange, begun_s: float) -> RequestOutcome:
+        """Translate the end of an exchange into an outcome, with the companion's reason."""
+        if exchange.unanswered:
             raise NobodyHeardError(
                 f"{self._name()} beats, but does not answer: nothing that is sent from here arrives"
                 " (a one-way link, MAVLink signing, or a port of the autopilot that does not forward)"
             )
-        if answer.result is None:
+        if exchange.result is None:
             return await self._judge_unheard_end(begun_s)
-        if answer.result == mavlink.MAV_RESULT_UNSUPPORTED:
+        if exchange.result == mavlink.MAV_RESULT_UNSUPPORTED:
             reason = f"{self._name()} does not know this command: is it a companion?"
             return self._ended("refused", reason, begun_s)
-        state = _STATES.get(answer.result, "failed")
+        state = _STATES.get(exchange.result, "failed")
         await self._hear_out(begun_s)
         said = next((text for text in reversed(self._texts(begun_s)) if text.severity == _SAID_AS.get(state)), None)
-        reason = said.words if said is not None else f"{state} (MAV_RESULT {answer.result})"
+        reason = said.words if said is not None else f"{state} (MAV_RESULT {exchange.result})"
         if state == "cancelled" and self._why_cancelled:
             reason += f" ({self._why_cancelled})"
         return self._ended(state, reason, begun_s, said, good=state == "done")

@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.exchange import Exchange, ExchangeEnd
+from companion.ground.exchange import Exchange
 from companion.ground.link import GroundLink
 from tests.support.component import (
     ACCEPTED,
@@ -47,11 +47,12 @@ def test_on_a_lossy_radio_one_press_is_one_calibration_and_its_end_is_heard(bloc
         station = StationOnTheWire()
         async with bench(ground=station, seed=seed, loss=0.3) as b:
             b.service.takes_s = (0.0, 0.3, 2.0, 8.0)[seed % 4]
-            answer = await exchange(station, UNDO if seed % 5 == 0 else CALIBRATE).run()
+            asked = exchange(station, UNDO if seed % 5 == 0 else CALIBRATE)
+            await asked.run()
             assert len(b.service.started) <= 1, f"seed {seed}"
-            assert b.service.started or not answer.begun, f"seed {seed}"
-            assert answer.result in (ACCEPTED, None), f"seed {seed}"
-            return "heard" if answer.result == ACCEPTED else "said that it is not known"
+            assert b.service.started or asked.unanswered, f"seed {seed}"
+            assert asked.result in (ACCEPTED, None), f"seed {seed}"
+            return "heard" if asked.result == ACCEPTED else "said that it is not known"
 
     ends = [run_virtual(main(seed)) for seed in range(block * 50, block * 50 + 50)]
     assert ends.count("heard") >= 47
@@ -61,7 +62,8 @@ def test_answers_to_others_and_of_others_are_not_ours() -> None:
     async def main() -> None:
         station = StationOnTheWire()
         async with bench(ground=station) as b:
-            asking = asyncio.create_task(exchange(station).run())
+            asked = exchange(station)
+            asking = asyncio.create_task(asked.run())
             await asyncio.sleep(0.5)
             for source, command in (
                 (COMPANION._replace(component_id=1), CALIBRATE),
@@ -72,6 +74,7 @@ def test_answers_to_others_and_of_others_are_not_ours() -> None:
             await asyncio.sleep(0.5)
             assert not asking.done()
             b.service.jobs[0].finish("done")
-            assert await asking == ExchangeEnd(ACCEPTED, begun=True)
+            await asking
+            assert (asked.result, asked.unanswered) == (ACCEPTED, False)
 
     run_virtual(main())
