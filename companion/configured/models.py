@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from companion.autopilot.firmware.imu_messages import StreamKind
+from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config.sections import (
     UNKNOWN,
@@ -116,7 +116,7 @@ def doubtful(config: Config) -> list[str]:
     return found
 
 
-def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
+def imu_input(imu: Imu, kind: ImuMessage | None) -> ImuInput:
     """Describe an IMU to the collector; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already."""
     return ImuInput(
         name=imu.name,
@@ -124,7 +124,7 @@ def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
         profile=noise_profile(imu.profile),
         gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
         accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,
-        truncates=kind is not None and kind.truncates,
+        truncates=kind is not None and kind.integers,
         clock_from_start=imu.protocol is None or PROTOCOLS["imu"][imu.protocol].decoder.clock_from_start,
     )
 

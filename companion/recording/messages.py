@@ -59,7 +59,7 @@ class ImuState(msgspec.Struct, frozen=True, kw_only=True):
     firmware: FirmwareName | None
     instance: int
     message: str | None
-    """Name of the `StreamKind` that its samples come in; None: none come."""
+    """Name of the `ImuMessage` that its samples come in; None: none come."""
     input: ImuInput
     calibration: ImuCalibration | None
     """None: not known, so that its samples do not count."""

@@ -59,7 +59,7 @@ def test_from_4_5_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(t
             assert result.outcome == "done", result
             kind = rig.service.devices.imus["fc"].stream.kind
             assert kind is not None
-            assert kind.message == ("HIGHRES_IMU" if version == "4.7" else "floats of the script")
+            assert kind.name == ("HIGHRES_IMU" if version == "4.7" else "floats of the script")
             assert list(record.imus[0].written) == [*offset_names(1, "accel"), *offset_names(1, "gyro")]
             left = rig.double.residual(1, rig.now_s)
             assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H

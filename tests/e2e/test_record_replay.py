@@ -116,7 +116,7 @@ def test_a_replay_gives_the_recorded_biases(tmp_path: Path, options: dict[str, A
 def test_floats_of_px4_are_replayed_with_the_bias_that_its_console_told(tmp_path: Path) -> None:
     async def during(rig: Rig) -> None:
         imu = rig.service.devices.imus["fc"]
-        await rig.until(lambda: imu.stream.kind is not None and imu.stream.kind.message.startswith("HIGHRES"), 60.0)
+        await rig.until(lambda: imu.stream.kind is not None and imu.stream.kind.name.startswith("HIGHRES"), 60.0)
         result, _ = await calibrated(rig)
         assert result.outcome == "done", result
 

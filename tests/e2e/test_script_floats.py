@@ -52,7 +52,7 @@ def three_imus(folder: Path, *, script: bool, max_s: float = 60.0) -> Rig:
 
 def messages(rig: Rig) -> list[str | None]:
     imus = rig.service.devices.imus.values()
-    return [None if imu.stream.kind is None else imu.stream.kind.message for imu in imus]
+    return [None if imu.stream.kind is None else imu.stream.kind.name for imu in imus]
 
 
 def test_every_imu_is_calibrated_from_floats_without_a_write_before_the_result(tmp_path: Path) -> None:

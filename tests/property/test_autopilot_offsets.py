@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import (
+    FAR_GYRO_RAD_S,
     ImuCalibration,
     accel_offset_after,
     changes_for,
@@ -134,10 +135,9 @@ def test_after_the_write_the_output_is_the_truth(
 def test_by_way_of_one_far_value_no_vector_stays_mixed_whatever_the_firmware_reads_in_between(
     *, before: Vector, change: Vector, far_axis: int, looks: list[bool], in_use: Vector, back: bool
 ) -> None:
-    far = tuple(0.022 if axis == far_axis else 0.0 for axis in range(3))
     after = tuple(f32(b + c) for b, c in zip(before, change, strict=True))
     names = ("X", "Y", "Z")
-    changes = vector_changes(names, before, after, far)  # type: ignore[arg-type]
+    changes = vector_changes(names, before, after, far_axis, FAR_GYRO_RAD_S)  # type: ignore[arg-type]
     if all(c.before == c.after for c in changes):
         return
     goal = [c.before if back else c.after for c in changes]

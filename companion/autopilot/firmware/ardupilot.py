@@ -22,12 +22,7 @@ from companion.autopilot.firmware.ardupilot_calibration import (
     ArduPilotParameters,
     parameters_of,
 )
-from companion.autopilot.firmware.base import (
-    Firmware,
-    HeadingSetting,
-    Net,
-    RivalKind,
-)
+from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net
 from companion.autopilot.firmware.imu_calibration import (
     ACCEL_SCALE_RANGE,
     DEGC_RANGE,
@@ -35,9 +30,10 @@ from companion.autopilot.firmware.imu_calibration import (
     SWITCH_RANGE,
     ImuCalibration,
     Range,
+    Rival,
     offset_ranges,
 )
-from companion.autopilot.firmware.imu_messages import HIGHRES, RAW, SCALED, SCALED2, SCALED3, SCRIPT
+from companion.autopilot.firmware.imu_messages import HIGHRES, SCALED, SCALED2, SCALED3, SCRIPT
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import (
@@ -98,14 +94,14 @@ class ArduPilot(Firmware):
     write_s = 5.0
     """4 s with its own gyro calibration in between."""
     ekf_reset_s = 3.0
-    imu_messages = {1: (HIGHRES, SCRIPT[1], SCALED, RAW), 2: (SCRIPT[2], SCALED2), 3: (SCRIPT[3], SCALED3)}
+    imu_messages = {1: (HIGHRES, SCRIPT[1], SCALED), 2: (SCRIPT[2], SCALED2), 3: (SCRIPT[3], SCALED3)}
     gyro_calibration_resets_ekf = True
     estimator_message = mavlink.MAVLink_ekf_status_report_message
     faster_log = "LOG_BITMASK with IMU_FAST"
     ranges = _ranges()
-    rivals = {
-        AT_START: RivalKind("at a start", "the next boot measures the gyros itself and overwrites these gyro offsets")
-    }
+    rivals = (
+        Rival(AT_START, "the next boot measures the gyros itself and overwrites these gyro offsets", at_start=True),
+    )
     parts = {
         (0x2B, 0x2B): "bmi088",
         # ADIS16470, or the better ADIS16477 with the same driver.
@@ -182,7 +178,7 @@ class ArduPilot(Firmware):
         return found.get("EK3_SRC1_YAW") == _EXTNAV
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
-        """Whether EKF3 takes its yaw from its compass; one that waits for ours holds 0 deg and finds that good."""
+        """Check that EKF3 takes its yaw from its compass: one that waits for ours holds 0 deg and calls that good."""
         return await parameters.read_optional("EK3_SRC1_YAW") in (None, _COMPASS)
 
     # --- arming

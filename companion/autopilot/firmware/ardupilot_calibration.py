@@ -172,7 +172,7 @@ async def thermal_changes(
     wanted |= dict.fromkeys(caltemps, degc)
 
     def moved(of: Names, offset: Vector, by: Vector) -> list[Change]:
-        return vector_changes(of, offset, vector(np.add(offset, by)), None)
+        return vector_changes(of, offset, vector(np.add(offset, by)))
 
     taken_gyro, taken_accel = thermal.taken_off(degc)
     changes = [

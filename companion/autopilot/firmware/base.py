@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
-from companion.autopilot.firmware.imu_calibration import Acts, ImuCalibration, Range, Rival
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, Range, Rival
 from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
@@ -21,17 +21,6 @@ from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.estimation.temperature.curve import Polynomial
 from companion.links.mavlink.link import Message
 from companion.physics.frames import Matrix
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class RivalKind:
-    """Effect of a parameter that makes the firmware overwrite offsets, at any value but 0."""
-
-    acts: Acts
-    what: str
-    accelerometers: bool = False
-    from_boot: bool = False
-    """Only a boot reads the parameter, so switching it off stops nothing before the next one."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -80,11 +69,11 @@ class Firmware:
     heartbeat_rate_hz: float | None = None
     """Heartbeat rate to ask for on our own link; None: the firmware has a fixed one."""
     late_heartbeat_on_request = False
-    """Whether a heartbeat that is overdue is requested."""
+    """An overdue heartbeat is requested."""
     integers_bytewise: bool | None = None
-    """Whether integer parameters travel as bytes in the float field; None: see AUTOPILOT_VERSION."""
+    """Integer parameters travel as bytes in the float field; None: see AUTOPILOT_VERSION."""
     takes_nan_position = False
-    """Whether a position that is unknown goes out as NaN."""
+    """An unknown position is sent as NaN."""
 
     settle_s = 2.0
     """Time after a write in which the telemetry may still show the old offsets."""
@@ -98,7 +87,7 @@ class Firmware:
     imu_messages: Mapping[int, tuple[ImuMessage, ...]] = {}
     """Messages with the samples of each IMU, the best first; offsets just written show in the last."""
     tells_ekf_bias = False
-    """Whether HIGHRES_IMU lacks the EKF's bias, which the console tells."""
+    """HIGHRES_IMU lacks the EKF's bias, and the console prints it."""
     estimator_message: type[Message] | None = None
     """Message that says whether the estimator's yaw agrees with its magnetometer."""
 
@@ -113,12 +102,11 @@ class Firmware:
 
     ranges: Mapping[str, Range] = {}
     """Every parameter that the companion ever writes by a calibration or its undo, with what it may have held."""
-    rivals: Mapping[str, RivalKind] = {}
-    """Parameters that make the firmware overwrite our offsets."""
+    rivals: tuple[Rival, ...] = ()
     parts: Mapping[tuple[int, int], Profile] = {}
     """Catalogue's names by the device types of gyro and accelerometer; the numbers are each firmware's own."""
     ignores_small_steps = False
-    """Whether a small change of an offset may be stored and not used."""
+    """A small change of an offset may be stored and not used."""
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
         """Read what the autopilot corrects one of its IMUs (1 to 3) with.
@@ -146,15 +134,13 @@ class Firmware:
         found: list[Rival] = []
         seen = {} if seen is None else seen
         boots = parameters.vehicle.boots
-        for name, kind in self.rivals.items():
-            value = await read_integer(parameters, name)
+        for rival in self.rivals:
+            value = await read_integer(parameters, rival.parameter)
             if value:
-                words = f"{name} = {value}: {kind.what}; set it to 0 to keep them (push.stop_rivals = true does)"
-                found.append(Rival(name, value, kind.acts, kind.accelerometers, words))
-                seen[name] = boots
-            elif kind.from_boot and seen.get(name) == boots:
-                words = f"{name} is off from the next boot on: until then {kind.what}; reboot the autopilot"
-                found.append(Rival(name, 0, kind.acts, kind.accelerometers, words))
+                found.append(dataclasses.replace(rival, value=value))
+                seen[rival.parameter] = boots
+            elif rival.from_boot and seen.get(rival.parameter) == boots:
+                found.append(rival)
         return tuple(found)
 
     # --- around a write
@@ -164,7 +150,7 @@ class Firmware:
         return 0.0
 
     gyro_calibration_resets_ekf = False
-    """Its own gyro calibration resets the EKF's gyro bias, and AHRS shows that bias."""
+    """The firmware's own gyro calibration resets the EKF's gyro bias, and AHRS shows that bias."""
 
     why_no_thermal_write: str | None = None
     """Why no curve is written into the firmware's temperature calibration; None: it is."""
@@ -181,7 +167,7 @@ class Firmware:
         raise AutopilotError(self.why_no_thermal_write or "this autopilot is neither ArduPilot nor PX4: no curves")
 
     level_turns_imus = False
-    """Whether the level turns the IMUs' data, or only the attitude that is reported."""
+    """The level turns the IMUs' data, not only the attitude that is reported."""
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
@@ -232,7 +218,7 @@ class Firmware:
         return "none"
 
     def takes_only_our_heading(self, found: Mapping[str, float]) -> bool:
-        """Whether the firmware takes its heading from outside and from nowhere else."""
+        """Check that the firmware takes its heading from outside only."""
         return False
 
     def missing_compass(self, found: Mapping[str, float]) -> str | None:
@@ -240,14 +226,14 @@ class Firmware:
         return None
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
-        """Whether its yaw comes from its own sensors, as far as parameters tell."""
+        """Check by its parameters that its yaw comes from its own sensors."""
         return True
 
     # --- arming
 
     gate_parameters: tuple[str, ...] = ()
     gate_is_script = False
-    """Whether a script on the flight controller gates, which is told the verdict."""
+    """A script on the flight controller gates; it gets the verdict."""
 
     async def find_gate_problem(
         self, parameters: Parameters, system_id: int | None, script_starts_s: float

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -28,19 +28,30 @@ from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector
 
-Acts = Literal["at a start", "while still", "after a flight"]
-
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rival:
-    """A parameter that makes the autopilot overwrite our offsets."""
+    """A parameter that makes the autopilot overwrite our offsets, at any value but 0."""
 
     parameter: str
-    value: int
-    acts: Acts
-    accelerometers: bool
-    """Whether it overwrites accelerometer offsets as well as gyro offsets."""
-    words: str
+    what: str
+    """Effect, in words."""
+    at_start: bool = False
+    """It acts at a start of the autopilot, and then only."""
+    accelerometers: bool = False
+    """It overwrites accelerometer offsets as well as gyro offsets."""
+    from_boot: bool = False
+    """Only a boot reads the parameter, so switching it off stops nothing before the next one."""
+    value: int = 0
+    """Value read; 0: switched off, and active until the next boot."""
+
+    @property
+    def words(self) -> str:
+        """For people: the effect, and what helps."""
+        if self.until_boot:
+            return f"{self.parameter} is off from the next boot on: until then {self.what}; reboot the autopilot"
+        remedy = "set it to 0 to keep them (push.stop_rivals = true does)"
+        return f"{self.parameter} = {self.value}: {self.what}; {remedy}"
 
     @property
     def name(self) -> str:
@@ -49,7 +60,7 @@ class Rival:
 
     @property
     def until_boot(self) -> bool:
-        """Whether it is switched off and acts all the same until the next boot."""
+        """It is switched off, and acts until the next boot."""
         return self.value == 0
 
 
@@ -75,6 +86,18 @@ MAX_ACCEL_OFFSET_M_S2: Final = 3.5
 ACCEL_SCALE_RANGE: Final = (0.8, 1.2)
 """ArduPilot's documented range of INS_ACCSCAL, which nothing enforces; PX4 has none."""
 
+FAR_GYRO_RAD_S: Final = 0.022
+"""Step of a far value, 1.3 deg/s: more than twice what PX4 ignores, and 22 digits of SCALED_IMU.
+
+PX4 ignores a vector that differs by no more than 0.01 (rad/s, m/s^2) from the one in use (autopilots 4.2), and may read
+the parameters between any two writes. So the value in use may differ by 0.01 from the stored one, and one axis that
+steps by twice that brings the whole vector into use. It is the axis nearest to the vehicle's vertical: a wrong value
+there turns the heading, but tilts nothing.
+"""
+FAR_ACCEL_M_S2: Final = 0.09
+"""9 digits of SCALED_IMU (9.2 mg): the least that `parameters.verify` can tell from no step."""
+FAR_SCALE: Final = 0.022
+
 NOT_ZERO_M_S2: Final = 1e-6
 """Written where three offsets of exactly zero would mean "not calibrated": ArduPilot would refuse to arm."""
 
@@ -91,7 +114,7 @@ class Range:
     unit: str = ""
 
     def holds(self, value: float) -> bool:
-        """Whether a value is allowed; NaN is not."""
+        """Check that a value is allowed; NaN is not."""
         return self.low <= value <= self.high and not (self.whole and value != int(value))
 
     def __str__(self) -> str:
@@ -133,21 +156,6 @@ def offset_ranges(names: ImuParameters) -> dict[str, Range]:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FarStep:
-    """Detour of an offset where the firmware ignores a small change; zero on all axes but one.
-
-    PX4 ignores a vector that differs by no more than 0.01 (rad/s, m/s^2) from the one in use (autopilots 4.2), and it
-    may read the parameters between any two writes. So the value in use may differ by 0.01 from the stored one. One axis
-    that steps by twice that brings the whole vector into use. It is the axis nearest to the vehicle's vertical: a wrong
-    value there turns the heading, but tilts nothing.
-    """
-
-    gyro_rad_s: Vector
-    accel_m_s2: Vector
-    scale: Vector
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Thermal:
     """Temperature calibration of one IMU: what the firmware takes off its readings, in the IMU's axes."""
 
@@ -180,8 +188,8 @@ class ImuCalibration:
     thermal: Thermal = Thermal()
     zero_is_uncalibrated: bool = False
     """Three accelerometer offsets of exactly zero mean "not calibrated"."""
-    far_step: FarStep | None = None
-    """Detour by which small changes come into use; None where the firmware needs none."""
+    far_axis: int | None = None
+    """Axis (0 to 2) of the far value by which small changes come into use; None where the firmware needs none."""
     scale_unused_within: float = 0.0
     """Scales whose vector is no farther than this from 1 are not in use after a start."""
     accel_offset_may_be_unused: bool = False
@@ -222,7 +230,7 @@ class ImuCalibration:
         return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
 
     def corrects_like(self, other: ImuCalibration) -> bool:
-        """Whether both correct the same sensors alike."""
+        """Check that both correct the same sensors alike."""
         return (
             self.corrections == other.corrections
             and self.thermal == other.thermal
@@ -231,7 +239,7 @@ class ImuCalibration:
         )
 
     def contradicts(self, values: Mapping[str, float]) -> bool:
-        """Whether one of these parameters corrects this IMU and has another value there."""
+        """Check for a parameter that corrects this IMU and has another value here."""
         known = {**self.corrections, **self.thermal.values}
         return any(name in known and not same_float32(known[name], value) for name, value in values.items())
 
@@ -264,23 +272,24 @@ def changes_for(
     Raises:
         CalibrationRefusedError: a value that is not plausible, see the limits at the top.
     """
-    names, far = calibration.parameters, calibration.far_step
+    names, axis = calibration.parameters, calibration.far_axis
     changes: list[Change] = []
     if accel_residual_m_s2 is not None:
         after = accel_offset_after(calibration, accel_residual_m_s2)
-        step = far.accel_m_s2 if far else None
-        changes += vector_changes(names.accel_offset, calibration.accel_offset_m_s2, after, step)
+        changes += vector_changes(names.accel_offset, calibration.accel_offset_m_s2, after, axis, FAR_ACCEL_M_S2)
     if gyro_residual_rad_s is not None:
         after = gyro_offset_after(calibration, gyro_residual_rad_s)
-        step = far.gyro_rad_s if far else None
-        changes += vector_changes(names.gyro_offset, calibration.gyro_offset_rad_s, after, step)
+        changes += vector_changes(names.gyro_offset, calibration.gyro_offset_rad_s, after, axis, FAR_GYRO_RAD_S)
     return changes
 
 
-def vector_changes(names: tuple[str, str, str], before: Vector, after: Vector, far: Vector | None) -> list[Change]:
-    """Plan the changes of one vector; an axis on which `far` is not 0 goes by a value that far above old and new."""
-    steps = (0.0, 0.0, 0.0) if far is None else far
-    vias = [max(b, a) + step if step else None for b, a, step in zip(before, after, steps, strict=True)]
+def vector_changes(
+    names: tuple[str, str, str], before: Vector, after: Vector, far_axis: int | None = None, step: float = 0.0
+) -> list[Change]:
+    """Plan the changes of one vector; its `far_axis` goes by a value that is `step` above old and new."""
+    vias = [
+        max(b, a) + step if axis == far_axis else None for axis, (b, a) in enumerate(zip(before, after, strict=True))
+    ]
     return list(map(Change, names, before, after, vias))
 
 
@@ -306,11 +315,10 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
             raise CalibrationRefusedError(
                 f"IMU {calibration.instance}: accelerometer scale {axis} is {value:.3g}, allowed are {low} to {high}"
             )
-    far = calibration.far_step
-    by = (None, None) if far is None else (far.accel_m_s2, far.scale)
-    changes = vector_changes(names.accel_offset, calibration.accel_offset_m_s2, offset, by[0])
+    far_axis = calibration.far_axis
+    changes = vector_changes(names.accel_offset, calibration.accel_offset_m_s2, offset, far_axis, FAR_ACCEL_M_S2)
     if not calibration.scale_unused_within or after != calibration.accel_scale:
-        changes += vector_changes(names.accel_scale, calibration.accel_scale, after, by[1])
+        changes += vector_changes(names.accel_scale, calibration.accel_scale, after, far_axis, FAR_SCALE)
     return changes
 
 

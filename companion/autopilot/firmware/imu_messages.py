@@ -19,17 +19,6 @@ from companion.samples import ImuSample, Vector
 MRAD: Final = 1e-3
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class StreamKind:
-    """Message that carries samples, and its resolution; the steps are 0 for floats."""
-
-    message: str
-    gyro_step_rad_s: float
-    accel_step_m_s2: float
-    truncates: bool
-    """Whether values are cut toward zero rather than rounded."""
-
-
 class Reading(msgspec.Struct, frozen=True, gc=False):
     """One message in SI units."""
 
@@ -48,10 +37,22 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
 class ImuMessage:
     """A message that may carry an IMU's samples."""
 
-    kind: StreamKind
+    name: str
     message: type[Message]
     decode: Callable[[Message], Reading | str]
-    """The reading, or why there is none."""
+    """Returns the reading, or why there is none."""
+    integers: bool = False
+    """Values are cut toward zero to thousandths of rad/s and g."""
+
+    @property
+    def gyro_step_rad_s(self) -> float:
+        """Resolution; 0 for floats."""
+        return MRAD if self.integers else 0.0
+
+    @property
+    def accel_step_m_s2(self) -> float:
+        """Resolution; 0 for floats."""
+        return MG if self.integers else 0.0
 
 
 _ACCEL_AND_GYRO: Final = 0b111111
@@ -71,9 +72,9 @@ def _highres(message: Any) -> Reading | str:
     return Reading(message.time_usec * 1e-6, gyro, accel, None)
 
 
-def _integers(message: Any, t_device_s: float) -> Reading:
+def _scaled(message: Any) -> Reading:
     return Reading(
-        t_device_s,
+        message.time_boot_ms * 1e-3,
         (message.xgyro * MRAD, message.ygyro * MRAD, message.zgyro * MRAD),
         (message.xacc * MG, message.yacc * MG, message.zacc * MG),
         # Zero means that there is none: a sensor at 0 deg C says 0.01 (MAVLink common.xml).
@@ -81,30 +82,10 @@ def _integers(message: Any, t_device_s: float) -> Reading:
     )
 
 
-def _scaled(message: Any) -> Reading:
-    return _integers(message, message.time_boot_ms * 1e-3)
-
-
-def _raw(message: Any) -> Reading | str:
-    if message.id != 0:
-        return f"RAW_IMU shows IMU {message.id + 1}"
-    return _integers(message, message.time_usec * 1e-6)
-
-
-def _integer_kind(name: str) -> StreamKind:
-    return StreamKind(name, gyro_step_rad_s=MRAD, accel_step_m_s2=MG, truncates=True)
-
-
-HIGHRES: Final = ImuMessage(
-    StreamKind("HIGHRES_IMU", gyro_step_rad_s=0.0, accel_step_m_s2=0.0, truncates=False),
-    mavlink.MAVLink_highres_imu_message,
-    _highres,
-)
-SCALED: Final = ImuMessage(_integer_kind("SCALED_IMU"), mavlink.MAVLink_scaled_imu_message, _scaled)
-SCALED2: Final = ImuMessage(_integer_kind("SCALED_IMU2"), mavlink.MAVLink_scaled_imu2_message, _scaled)
-SCALED3: Final = ImuMessage(_integer_kind("SCALED_IMU3"), mavlink.MAVLink_scaled_imu3_message, _scaled)
-RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_message, _raw)
-"""Calibrated and filtered in spite of its name, the same as SCALED_IMU (ArduPilot)."""
+HIGHRES: Final = ImuMessage("HIGHRES_IMU", mavlink.MAVLink_highres_imu_message, _highres)
+SCALED: Final = ImuMessage("SCALED_IMU", mavlink.MAVLink_scaled_imu_message, _scaled, integers=True)
+SCALED2: Final = ImuMessage("SCALED_IMU2", mavlink.MAVLink_scaled_imu2_message, _scaled, integers=True)
+SCALED3: Final = ImuMessage("SCALED_IMU3", mavlink.MAVLink_scaled_imu3_message, _scaled, integers=True)
 
 SCRIPT_ASK: Final = b"CMPF\x01"
 """Payload that asks the script for floats; it sends them for 3 s."""
@@ -124,7 +105,7 @@ def _from_script(instance: int, message: Any) -> Reading | str:
 
 SCRIPT: Final = {
     instance: ImuMessage(
-        StreamKind("floats of the script", gyro_step_rad_s=0.0, accel_step_m_s2=0.0, truncates=False),
+        "floats of the script",
         mavlink.MAVLink_debug_float_array_message,
         functools.partial(_from_script, instance),
     )
@@ -132,9 +113,9 @@ SCRIPT: Final = {
 }
 """Means of four readings, calibrated and filtered, about eleven a second, only while disarmed and asked for."""
 
-PX4_FLOATS: Final = dataclasses.replace(HIGHRES, kind=dataclasses.replace(HIGHRES.kind, message="HIGHRES_IMU+bias"))
+PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias")
 """HIGHRES_IMU of the IMU that PX4 flies by. PX4 takes EKF2's own estimate of the bias off it, so at rest it tells
-nothing until that is known and added again (`telemetry.ekf_bias`)."""
+nothing until that is known and added again (`telemetry.px4_console`)."""
 
 TEMPERATURE_AGE_S: Final = 5.0
 """The longest that a temperature counts: HIGHRES_IMU has none of the IMU, so it comes with the integer messages."""

@@ -19,16 +19,16 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net, RivalKind
+from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net
 from companion.autopilot.firmware.imu_calibration import (
     ACCEL_SCALE_RANGE,
     DEGC_RANGE,
     DEVICE_ID_RANGE,
     SWITCH_RANGE,
-    FarStep,
     ImuCalibration,
     ImuParameters,
     Range,
+    Rival,
     offset_ranges,
 )
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
@@ -36,7 +36,7 @@ from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Slot, SlotMemo
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import SCALES, FirmwareName, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError
-from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix, vector
+from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Triad, Vector
@@ -52,11 +52,6 @@ IGNORED_STEP: Final = 0.01
 vector of scales: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. After a start scales of 1 are in use."""
 MARGIN: Final = 1.05
 """Both sides round to 32 bits."""
-FAR_GYRO_RAD_S: Final = 0.022
-"""1.3 deg/s: more than twice `IGNORED_STEP`, and 22 digits of SCALED_IMU."""
-FAR_ACCEL_M_S2: Final = 0.09
-"""9 digits of SCALED_IMU (9.2 mg): the least that `parameters.verify` can tell from no step."""
-FAR_SCALE: Final = 0.022
 GATED_TILT_DEG: Final = 0.3
 """Tilt kept from before a write above which a restart is owed; a smaller one is what EKF2 shows of the biases of an
 uncalibrated sensor (autopilots 9.3)."""
@@ -89,23 +84,25 @@ def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
     )
 
 
-_RIVALS: Final = {
-    "IMU_GYRO_CAL_EN": RivalKind(
-        "while still",
+_RIVALS: Final = (
+    Rival(
+        "IMU_GYRO_CAL_EN",
         "while disarmed and still PX4 overwrites gyro offsets that seem more than 0.57 deg/s (0.01 rad/s) off",
         from_boot=True,
     ),
-    "SENS_IMU_AUTOCAL": RivalKind(
-        "after a flight",
+    Rival(
+        "SENS_IMU_AUTOCAL",
         "after a flight PX4 overwrites gyro offsets that seem more than 0.57 deg/s (0.01 rad/s) off, and"
         " accelerometer offsets more than 5 mg (0.05 m/s^2)",
         accelerometers=True,
     ),
-}
+)
 
 
 def _ranges() -> dict[str, Range]:
-    found = dict.fromkeys((*_RIVALS, "TC_G_ENABLE"), SWITCH_RANGE) | dict.fromkeys(LEVEL[:2], _LEVEL_RANGE)
+    found = dict.fromkeys((*(rival.parameter for rival in _RIVALS), "TC_G_ENABLE"), SWITCH_RANGE) | dict.fromkeys(
+        LEVEL[:2], _LEVEL_RANGE
+    )
     for slot in range(SLOTS):
         # Former versions wrote TC_G*: their undo still restores the old values.
         own = f"TC_G{slot}_"
@@ -162,7 +159,7 @@ class PX4(Firmware):
             gyro_id=gyro.device_id,
             accel_id=accel.device_id,
             orientation=orientation,
-            far_step=_far_step(orientation),
+            far_axis=int(np.abs(orientation[2]).argmax()),
             scale_unused_within=MARGIN * IGNORED_STEP,
             accel_offset_may_be_unused=_too_small_to_apply_at_boot(offset)
             and not memory.in_use(names.accel_offset, offset, boots),
@@ -278,14 +275,14 @@ def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) ->
 def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
     """Warn of changes that PX4 will not use after a restart."""
     after = accel_offset_with(calibration, changes)
-    if calibration.far_step is None or not _too_small_to_apply_at_boot(after):  # None: not PX4
+    if calibration.far_axis is None or not _too_small_to_apply_at_boot(after):  # None: not PX4
         return ()
     size = f"{calibration.parameters.accel_offset[0]}, Y and Z are {math.hypot(*after) / MG:.2f} mg in all"
     return (f"{size}: below 1 mg (0.01 m/s^2) PX4 starts without them; calibrate again after a restart",)
 
 
 def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
-    """Whether PX4 will start without this vector: it compares with zero then, and small differences are ignored."""
+    """Check whether PX4 will start without this vector: it compares with zero then, and ignores small differences."""
     return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
 
 
@@ -320,13 +317,3 @@ async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> M
     if number is None or not 0 <= number < len(ROTATION_NAMES):
         number = 0
     return rotation_matrix(_PX4_ONLY_DEG.get(number) or ROTATION_NAMES[number])
-
-
-def _far_step(orientation: Matrix) -> FarStep:
-    vertical = np.zeros(3)
-    vertical[np.abs(orientation[2]).argmax()] = 1.0
-    return FarStep(
-        gyro_rad_s=vector(FAR_GYRO_RAD_S * vertical),
-        accel_m_s2=vector(FAR_ACCEL_M_S2 * vertical),
-        scale=vector(FAR_SCALE * vertical),
-    )

@@ -72,7 +72,7 @@ class SlotMemory:
         return self._instance_of.get((sensor, device_id))
 
     def holds_strangers(self, sensor: Triad, imus: int) -> bool:
-        """Whether more slots are in use than there may be IMUs: then one may be of a sensor that is not there."""
+        """Check for more slots in use than IMUs: one of them may be of a sensor that is not there."""
         return self._enabled.get(sensor, 0) > imus
 
     def forget(self) -> None:
@@ -84,7 +84,7 @@ class SlotMemory:
         self._in_use[names] = (boots, vector)
 
     def in_use(self, names: tuple[str, str, str], vector: Vector, boots: int) -> bool:
-        """Whether this very vector is known to be used."""
+        """Check that the firmware is known to use this vector."""
         return self._in_use.get(names) == (boots, vector)
 
     def choose(self, sensor: Triad, instance: int, slots: tuple[Slot, ...], like: int | None = None) -> Slot:

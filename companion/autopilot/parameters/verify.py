@@ -61,14 +61,12 @@ class Observation:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class AxisVerdict:
-    """One parameter: the step in its axis, expected and made, and how well the latter is known."""
+    """One parameter, by the step in its axis."""
 
     parameter: str
     word: AxisWord
-    expected: float
-    made: float
-    sigma: float
     words: str
+    """The figures, and what is wrong."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -123,7 +121,9 @@ def judge(seen: Observation) -> EffectVerdict:
                 f"after the write {axis_name} is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g}"
                 f" ({_family(seen.parameters)})"
             )
-    hidden = [axis.parameter for axis in axes if axis.word == "too small to see" and axis.expected != 0.0]
+    hidden = [
+        axis.parameter for axis, step in zip(axes, expected, strict=True) if axis.word == "too small to see" and step
+    ]
     return EffectVerdict(
         axes=axes,
         fraction_sigma=fraction_sigma,
@@ -147,7 +147,7 @@ def _judge_axis(parameter: str, expected: float, made: float, sigma: float, slac
     else:
         why = "not the step that was written (sign, orientation, scale, or it moved)"
     figures = f"the output moved by {made:.3g} {unit}, expected {expected:.3g}, noise {sigma:.2g}"
-    return AxisVerdict(parameter, word, expected, made, sigma, f"{parameter}: {figures}: {why}")
+    return AxisVerdict(parameter, word, f"{parameter}: {figures}: {why}")
 
 
 def _matched_filter(made: Array, expected: Array, sigma: Array, resolution: float) -> tuple[float | None, float | None]:

@@ -22,7 +22,7 @@ def float32(value: float) -> float:
 
 
 def same_float32(one: float, other: float) -> bool:
-    """Whether two numbers are the same 32 bit float to within 1 ulp; NaN is never the same."""
+    """Compare two numbers as 32 bit floats, to within 1 ulp; NaN equals nothing."""
     if not (math.isfinite(one) and math.isfinite(other)):
         return False
     return abs(_rank(one) - _rank(other)) <= 1

@@ -18,8 +18,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware import imu_messages
 from companion.autopilot.firmware.firmwares import FIRMWARES
-from companion.autopilot.firmware.imu_messages import TEMPERATURE_AGE_S, ImuMessage, ImuSamples, StreamKind
-from companion.autopilot.telemetry.ekf_bias import EkfBias
+from companion.autopilot.firmware.imu_messages import TEMPERATURE_AGE_S, ImuMessage, ImuSamples
+from companion.autopilot.telemetry.px4_console import EkfBias
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
@@ -70,18 +70,13 @@ class _Source:
     reason: str = ""
 
     @property
-    def name(self) -> str:
-        """Name of the message."""
-        return self.message.kind.message
-
-    @property
     def from_script(self) -> bool:
-        """Whether ArduPilot's script sends it; `ask_script` asks for it."""
+        """ArduPilot's script sends it; `ask_script` asks for it."""
         return self.message in imu_messages.SCRIPT.values()
 
     @property
     def absent(self) -> bool:
-        """Whether there is no such IMU."""
+        """There is no such IMU: it read zeros for long enough."""
         return self.zeros >= _ABSENT_AFTER
 
 
@@ -105,11 +100,11 @@ class ImuStream:
         *,
         rate_hz: float,
         ekf_bias: EkfBias,
-        on_kind_change: Callable[[StreamKind | None], None],
+        on_kind_change: Callable[[ImuMessage | None], None],
         may_be_slow: Callable[[], bool] = lambda: True,
     ) -> None:
         """`may_be_slow`: whether the eleven samples a second of ArduPilot's script will do."""
-        self.kind: StreamKind | None = None
+        self.kind: ImuMessage | None = None
         """Kind of message that brings the samples; None while there are none."""
         self.samples = 0
         self._starting = f"waiting for the autopilot to start IMU {instance}"
@@ -129,23 +124,15 @@ class ImuStream:
         self._arrived = asyncio.Event()
 
     @property
-    def own_kind(self) -> StreamKind | None:
-        """Kind of the message in which offsets just written show: never floats that lack the EKF's bias."""
-        if self._current is None:
-            return None
-        seen_by = self._sources[-1] if self._current.message is imu_messages.PX4_FLOATS else self._current
-        return seen_by.message.kind
-
-    @property
     def wants_script(self) -> bool:
-        """Whether the floats of ArduPilot's script are better than what comes, or are what comes."""
+        """The script's floats are better than the current source, or are the current source."""
         sources = itertools.takewhile(lambda source: source is not self._current, self._sources)
         here = [] if self._current is None else [self._current]
         return any(source.from_script and self._usable(source) for source in (*sources, *here))
 
     @property
     def decided(self) -> bool:
-        """Whether samples come, or every message that could carry them was asked for in vain."""
+        """Samples come, or every message that could carry them was requested in vain."""
         return self.problem not in (self._starting, _NO_HEARTBEAT, _RESTARTED)
 
     @property
@@ -236,7 +223,7 @@ class ImuStream:
             return _REFUSED if source.refused else result
 
     async def _sends(self, source: _Source) -> bool:
-        """Whether the source brings a sample within the time of a silence."""
+        """Wait for a sample of the source, `SILENCE_S` at most."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + SILENCE_S
         asked_s = loop.time()
@@ -279,7 +266,9 @@ class ImuStream:
             elif source.absent:
                 return
             elif now_s - asked_s >= SILENCE_S:
-                self.problem = f"{source.name} has been silent for {now_s - source.last_s:.0f} s; asked for it again"
+                self.problem = (
+                    f"{source.message.name} has been silent for {now_s - source.last_s:.0f} s; asked for it again"
+                )
                 if silent_asks >= _ASKS:
                     return
                 silent_asks += 1
@@ -358,7 +347,7 @@ class ImuStream:
             source.zeros = min(source.zeros + 1, _ABSENT_AFTER)
             self._arrived.set()
             return
-        if not self._reader.accept(source.name, reading, t_s):
+        if not self._reader.accept(source.message.name, reading, t_s):
             return
         source.last_s, source.zeros, source.reason = t_s, 0, ""
         source.recent += 1
@@ -382,21 +371,21 @@ class ImuStream:
         self._current = source
         kind = None
         if source is not None:
-            self.problem, kind = "", source.message.kind
+            self.problem, kind = "", source.message
         if kind != self.kind:
             self.kind = kind
             if kind is not None:
-                logger.info("IMU %d: %s at up to %g Hz", self._instance, kind.message, self.rate_hz)
+                logger.info("IMU %d: %s at up to %g Hz", self._instance, kind.name, self.rate_hz)
             self._on_kind_change(kind)
 
     def _why_none(self) -> str:
         ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]
         sources = [source for source in self._sources if self._usable(source) and not source.from_script]
         if all(source.absent for source in sources if not source.refused and not source.reason):
-            zero = [source.name for source in sources if source.absent]
+            zero = [source.message.name for source in sources if source.absent]
             if zero:
                 return f"{zero[0]} is all zero: there is no {ordinal} IMU"
-        words = [f"{source.name} {source.reason or 'does not come'}" for source in sources]
+        words = [f"{source.message.name} {source.reason or 'does not come'}" for source in sources]
         return f"no samples of IMU {self._instance}: {', '.join(words)}"
 
 

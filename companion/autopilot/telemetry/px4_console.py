@@ -1,4 +1,11 @@
-"""PX4's console over MAVLink (SERIAL_CONTROL), as a ground station's "MAVLink console": one `listener` at a time.
+"""Floats of PX4's IMUs, read at its console over MAVLink (SERIAL_CONTROL), as by a ground station's "MAVLink console".
+
+HIGHRES_IMU is the reading of the IMU that flies in floats, less the bias of its EKF, which no message tells: `EkfBias`
+reads it. It is published once a second, or as soon as it has moved by 0.001 rad/s or m/s^2, and wanders slowly between.
+
+`ImuStatus` has `vehicle_imu_status` of the other IMUs printed: means of 0.1 s of an IMU's raw readings, in the
+vehicle's axes, nothing taken off (`VehicleIMU.cpp`). A few of them a second tell the bias that the integers of
+SCALED_IMU hide; whether the aircraft was still in between, the integers tell.
 
 `listener` prints what is published, in five decimals: 2 deg/h, 1 micro-g. Nothing else is typed there, and nothing
 while the autopilot is not known to be disarmed. Each of PX4's MAVLink ports has its own console (autopilots 10.3).
@@ -7,18 +14,29 @@ while the autopilot is not known to be disarmed. Each of PX4's MAVLink ports has
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
+import math
 import re
+from collections.abc import Callable, Collection, Iterator
 from typing import Final
 
+import msgspec
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.autopilot.firmware.imu_messages import EkfBiasReading
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
+from companion.samples import Vector
 
-ID: Final = r"(\d+)[^\n]*\n\s*"
+logger = logging.getLogger(__name__)
+
+_ID: Final = r"(\d+)[^\n]*\n\s*"
 """Pattern of a device id, to the start of the next line."""
-VECTOR: Final = r"\[(-?\d+\.\d+), (-?\d+\.\d+), (-?\d+\.\d+)\]\s*"
+_VECTOR: Final = r"\[(-?\d+\.\d+), (-?\d+\.\d+), (-?\d+\.\d+)\]\s*"
 _ANSWER_S: Final = 4.0
 _BYTES: Final = 70
 _SHELL: Final = mavlink.SERIAL_CONTROL_DEV_SHELL
@@ -59,3 +77,246 @@ class Px4Console:
             self.text = (self.text + text)[-_LONGEST:]
             if _PROMPT.search(self.text, max(self.text.find(self._asked), 0)) and self._asked in self.text:
                 self._answered.set()
+
+
+LOOK_EVERY_S: Final = 5.0
+"""In turn at the bias and at which EKF flies: 1300 bytes each, 4.5 % of a line of 57600 baud."""
+_AT_FIRST_S: Final = 1.0
+MISSES: Final = 10
+_AGAIN_S: Final = 60.0
+"""After so many answers that did not come or were not understood."""
+_TURN_S: Final = 0.5
+_OLD_S: Final = 45.0
+_CALM_S: Final = 60.0
+"""New offsets set the estimate to nothing, and it is some seconds until it is back. On a deck they are watched for 40 s
+by the integers, and floats that came back earlier would begin that anew."""
+_UNITS: Final = np.repeat([1e-3, 1e-2], 3)
+_JUMP: Final = 0.5 * _UNITS
+"""Largest step from one look to the next: 100 deg/h, 0.5 mg."""
+_STEADY: Final = 0.02 * _UNITS
+"""Within a second, before it is used: 4 deg/h, 0.02 mg."""
+
+# Seventy bytes that are lost leave no other match: each value has its neighbours beside it.
+_PRIMARY: Final = re.compile(r"primary_instance: (\d+)\s|estimator_selector_status[^>]*never published")
+_BIAS: Final = re.compile(
+    rf"gyro_device_id: {_ID}gyro_bias: {_VECTOR}gyro_bias_limit.*"
+    rf"accel_device_id: {_ID}accel_bias: {_VECTOR}accel_bias_limit",
+    re.DOTALL,
+)
+_IMU: Final = re.compile(
+    r"(?:Instance (\d+):|TOPIC: vehicle_imu)\s+vehicle_imu\s+timestamp: [^\n]*\n\s*timestamp_sample: [^\n]*\n\s*"
+    rf"accel_device_id: {_ID}gyro_device_id: {_ID}"
+)
+
+
+class EkfBias:
+    """Reads the bias again and again; `run` it."""
+
+    def __init__(self, console: Px4Console, vehicle: Vehicle) -> None:
+        self.instance: int | None = None
+        """The IMU (1..) that HIGHRES_IMU shows; None while its bias is not known."""
+        self.settled = asyncio.Event()
+        """Set once the bias is known, or the first answer did not tell it."""
+        self.reading: EkfBiasReading | None = None
+        """Latest reading; `known_of` says whether it may be used."""
+        self.on_read: Listeners[EkfBiasReading] = Listeners()
+        """Notified of every reading."""
+        self._console, self._vehicle = console, vehicle
+        self._held, self._misses = 0, 0
+        self._woken = asyncio.Event()
+        self._from_s = -math.inf
+        self._imus: dict[tuple[int, int], int] = {}
+        """IMUs (1..) by the device ids of accelerometer and gyro."""
+        self._primary: int | None = None
+        self._at_bias = False
+
+    def known_of(self, instance: int) -> bool:
+        """Check that HIGHRES_IMU shows this IMU (1..) and that `reading` restores its readings."""
+        return self.instance == instance and not self._age_s > _OLD_S
+
+    def forget(self) -> None:
+        """Start anew."""
+        self.instance = self._primary = self.reading = None
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """While offsets are written the bias does nothing but step, and for some time after."""
+        self._held += 1
+        self.forget()
+        try:
+            yield
+        finally:
+            self._held -= 1
+            self.step()
+
+    def step(self) -> None:
+        """Other offsets have come into force."""
+        self.forget()
+        self._from_s = asyncio.get_running_loop().time() + _CALM_S
+
+    async def run(self) -> None:
+        """Read until cancelled."""
+        ignore = self._vehicle.on_event.add(self._on_event)
+        try:
+            while True:
+                self._woken.clear()
+                await comes(self._woken, await self._look() if self.may_look else _TURN_S)
+        finally:
+            ignore()
+
+    @property
+    def may_look(self) -> bool:
+        """The console may be used now."""
+        disarmed = self._vehicle.kind.tells_ekf_bias and self._vehicle.arm_state is ArmState.DISARMED
+        return disarmed and not self._held and asyncio.get_running_loop().time() >= self._from_s
+
+    @property
+    def _age_s(self) -> float:
+        return math.inf if self.reading is None else asyncio.get_running_loop().time() - self.reading.read_s
+
+    async def _look(self) -> float:
+        """Read once; seconds to the next look."""
+        if not await self._read():
+            self._misses += 1
+            self.settled.set()
+            if self._misses < MISSES:
+                return _AT_FIRST_S
+            if self._misses == MISSES:
+                logger.info("PX4's console does not tell the EKF's bias; its IMUs are read in whole thousandths")
+            return _AGAIN_S
+        self._misses = 0
+        if self.instance is not None:
+            self.settled.set()
+            return LOOK_EVERY_S
+        return _AT_FIRST_S if self._at_bias else 0.0
+
+    async def _read(self) -> bool:
+        """Read which EKF flies, or the bias of that one; False: the console did not print it."""
+        self._at_bias = self._primary is not None and (self.instance is None or not self._at_bias)
+        if not self._at_bias:
+            found = await self._console.listener("estimator_selector_status", _PRIMARY)
+            if found is None:
+                return False
+            primary = int(found[1] or 0)  # a single EKF has no selector
+            if primary != self._primary:
+                self.forget()
+                self._primary = primary
+            return True
+        found = await self._console.listener("estimator_sensor_bias", _BIAS, "-i", str(self._primary))
+        if found is None:
+            return False
+        key = int(found[5]), int(found[1])
+        if key not in self._imus:
+            if await self._console.listener("vehicle_imu", _IMU) is None:
+                return False
+            imus = _IMU.findall(self._console.text)
+            self._imus = {(int(accel), int(gyro)): int(number or 0) + 1 for number, accel, gyro in imus}
+            return key in self._imus
+        self._take(found, self._imus[key])
+        return True
+
+    def _take(self, found: re.Match[str], instance: int) -> None:
+        texts = found.groups()[1:4] + found.groups()[5:8]
+        steps = np.array([10.0 ** -len(text.partition(".")[2]) for text in texts])
+        bias = np.array([float(text) for text in texts])
+        moved = np.abs(bias - (np.full(6, np.nan) if self.reading is None else self.reading.bias))
+        most = _STEADY if self.instance is None else _JUMP
+        steady = bool((moved <= np.maximum(most, 1.5 * steps)).all())
+        variance = np.square(steps) / 12.0 + np.square(moved) / 4.0
+        now_s = asyncio.get_running_loop().time()
+        self.reading = EkfBiasReading(tuple(bias.tolist()), tuple(variance.tolist()), now_s)
+        self.instance = instance if steady and not self._held else None
+        self.on_read.tell(self.reading)
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("rebooted", "found"):
+            self._misses = 0
+            self._woken.set()
+        if event == "rebooted":
+            self.forget()
+            self._imus.clear()
+            self.settled.clear()
+
+
+PAUSE_S: Final = 0.2
+"""Each answer costs the autopilot a task, and a console on the same port its calm."""
+SLOW_PAUSE_S: Final = 0.9
+"""On a line of 57600 baud, of which 1100 bytes an answer are then a fifth."""
+_STATUS_IDLE_S: Final = 0.5
+_STATUS_MISSES: Final = 5
+_STATUS_AGAIN_S: Final = 30.0
+"""After so many answers in a row that did not come or were not understood."""
+_STATUS: Final = re.compile(
+    rf"timestamp: (\d+) [^\n]*\n\s*accel_device_id: {_ID}gyro_device_id: {_ID}.*"
+    rf"mean_accel: {_VECTOR}mean_gyro: {_VECTOR}var_accel: {_VECTOR}.*temperature_accel: (\S+)\s",
+    re.DOTALL,
+)
+
+
+class RawMean(msgspec.Struct, frozen=True):
+    """Mean of 0.1 s of one IMU's readings, nothing taken off, vehicle FRD."""
+
+    instance: int
+    """1 to 3."""
+    t_s: float
+    boot_us: int
+    """Time of its publication since the autopilot's boot."""
+    gyro_id: int
+    accel_id: int
+    gyro_rad_s: Vector
+    accel_m_s2: Vector
+    temperature_degc: float | None
+
+
+class ImuStatus:
+    """Has the console print the status of the IMUs that want it, in turn; `run` it."""
+
+    def __init__(
+        self,
+        console: Px4Console,
+        ekf_bias: EkfBias,
+        wanted: Callable[[], Collection[int]],
+        tell: Callable[[RawMean], None],
+        *,
+        slow: bool,
+    ) -> None:
+        """`wanted`: instances (1 to 3) whose telemetry is integers; `tell` is given every reading."""
+        self._console, self._ekf_bias, self._wanted, self._tell = console, ekf_bias, wanted, tell
+        self._pause_s = SLOW_PAUSE_S if slow else PAUSE_S
+        self._seen: dict[int, int] = {}
+        """Publication printed last, by instance."""
+
+    async def run(self) -> None:
+        """Ask until cancelled."""
+        misses = 0
+        while True:
+            wanted = list(self._wanted()) if self._ekf_bias.may_look else []
+            for instance in wanted:
+                misses = 0 if await self._ask(instance) else misses + 1
+                await asyncio.sleep(self._pause_s if misses < _STATUS_MISSES else _STATUS_AGAIN_S)
+            if not wanted:
+                await asyncio.sleep(_STATUS_IDLE_S)
+
+    async def _ask(self, instance: int) -> bool:
+        found = await self._console.listener("vehicle_imu_status", _STATUS, "-i", str(instance - 1))
+        if found is None:
+            return False
+        boot_us = int(found[1])
+        if not self._ekf_bias.may_look or self._seen.get(instance) == boot_us:
+            return True  # offsets are being written meanwhile, or it is the same again
+        self._seen[instance] = boot_us
+        ax, ay, az, gx, gy, gz = map(float, found.group(4, 5, 6, 7, 8, 9))
+        degc = float(found[13])  # it may print "nan"
+        self._tell(
+            RawMean(
+                instance,
+                asyncio.get_running_loop().time(),
+                boot_us,
+                gyro_id=int(found[3]),
+                accel_id=int(found[2]),
+                gyro_rad_s=(gx, gy, gz),
+                accel_m_s2=(ax, ay, az),
+                temperature_degc=degc if math.isfinite(degc) else None,
+            )
+        )
+        return True

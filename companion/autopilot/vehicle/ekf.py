@@ -157,7 +157,7 @@ class Angles(NamedTuple):
 
 
 class OwnCompass:
-    """Whether its magnetometer is well and agrees with its yaw; `wanted`: asks for what tells it, all the time."""
+    """Health of the magnetometer and its agreement with the yaw; `wanted`: request the messages all the time."""
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._has_compass_s = self._agrees_s = -math.inf
@@ -169,7 +169,7 @@ class OwnCompass:
                 vehicle.hear(firmware.estimator_message, self._on_estimator, rate_hz, firmware.name)
 
     def agrees(self, now_s: float) -> bool:
-        """Whether both have been said lately."""
+        """Check that the magnetometer was lately healthy and in agreement."""
         return min(self._has_compass_s, self._agrees_s) >= now_s - OLD_S
 
     def _on_status(self, message: mavlink.MAVLink_sys_status_message, t_s: float) -> None:

@@ -30,7 +30,7 @@ _TWO_HOLDS_S: Final = 5.0
 
 
 class ArmState(enum.Enum):
-    """Whether the motors may turn. Only DISARMED permits a write."""
+    """Arm state of the aircraft; only DISARMED permits a write."""
 
     DISARMED = "disarmed"
     ARMED = "armed"
@@ -78,7 +78,7 @@ class ArmingWatch:
         self._restarted_s = -math.inf
 
     def armed(self, t_s: float) -> bool | None:
-        """Whether it is armed; None before the first heartbeat."""
+        """Return whether the aircraft is armed; None before the first heartbeat."""
         if t_s - self._armed_s < ARMED_HOLDS_S:
             return True
         return self._armed
@@ -94,7 +94,7 @@ class ArmingWatch:
         return f"two autopilots have system id {system_id}" if t_s - self._two_s < _TWO_HOLDS_S else None
 
     def contradicts_itself(self, t_s: float) -> bool:
-        """Whether armed and disarmed heartbeats come by turns, as of two autopilots, or of one and a forger."""
+        """Check for armed and disarmed heartbeats by turns, from two autopilots, or from one and a forger."""
         only_armed = self._armed is True and t_s - self._disarmed_s >= _ONLY_ARMED_S
         return self._contradicted and not only_armed and t_s - self._armed_s < _ONLY_DISARMED_S
 
@@ -112,7 +112,7 @@ _NOT_AIRCRAFT: Final = frozenset(
 
 
 def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
-    """Whether it claims to be a vehicle with an autopilot: ground stations, gimbals and the like are not."""
+    """Check that a heartbeat claims to be of a vehicle with an autopilot, not of a ground station or a gimbal."""
     return message.type not in _NOT_AIRCRAFT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
 
 
@@ -138,7 +138,7 @@ class Latch:
         self._candidates: dict[tuple[int, int], float] = {}
 
     def takes(self, message: mavlink.MAVLink_heartbeat_message, t_s: float, *, is_known: bool) -> bool:
-        """Whether this heartbeat of an aircraft, heard at `t_s`, is the one to go by from now on."""
+        """Check whether to latch the sender of this heartbeat of an aircraft, received at `t_s`."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         if self._system_id not in (None, system) or system == 0:
             return False

@@ -13,7 +13,7 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -61,37 +61,29 @@ _ERROR_WORDS: Final = {
 }
 """MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
 
+_Answer = float | str
+"""Value of a PARAM_VALUE, or PARAM_ERROR in words."""
+
 
 class _Inbox:
     """Answers about one name during one exchange; when full the oldest is dropped."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._items: deque[float | _Refusal | AutopilotRebootedError] = deque(maxlen=64)
+        self._items: deque[_Answer | AutopilotRebootedError] = deque(maxlen=64)
         self._arrived = asyncio.Event()
 
-    def put(self, item: float | _Refusal | AutopilotRebootedError) -> None:
+    def put(self, item: _Answer | AutopilotRebootedError) -> None:
         """Add an answer."""
         self._items.append(item)
         self._arrived.set()
 
-    async def get(self, deadline_s: float) -> float | _Refusal | AutopilotRebootedError | None:
+    async def get(self, deadline_s: float) -> _Answer | AutopilotRebootedError | None:
         """Return the next answer, or None at the deadline (loop's clock); cancelled tasks may wait here too."""
         if not self._items:
             self._arrived.clear()
             await comes(self._arrived, deadline_s - asyncio.get_running_loop().time())
         return self._items.popleft() if self._items else None
-
-
-class _Refusal(NamedTuple):
-    """A PARAM_ERROR."""
-
-    code: int
-
-    @property
-    def text(self) -> str:
-        """Why, for people."""
-        return _ERROR_WORDS.get(self.code, f"error {self.code}")
 
 
 class ParameterClient:
@@ -128,7 +120,7 @@ class ParameterClient:
         if isinstance(answer, float):
             return answer
         if answer is not None:
-            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.text}")
+            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer}")
         raise ParameterTimeoutError(
             f"{self.vehicle.name} does not answer for {name} ({tries} requests, {_TIMEOUT_S:g} s each)"
             f"{self.vehicle.why_silent}"
@@ -150,10 +142,10 @@ class ParameterClient:
         if isinstance(answer, float):
             return answer
         if answer is not None:
-            if answer.code == _DOES_NOT_EXIST:
+            if answer == _ERROR_WORDS[_DOES_NOT_EXIST]:
                 self._absent.add(name)
                 return None
-            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.text}")
+            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer}")
         if not self.vehicle.alive or not await self._answers_at_all():
             raise ParameterTimeoutError(
                 f"{self.vehicle.name} answers neither for {name} nor for anything else{self.vehicle.why_silent}"
@@ -219,8 +211,8 @@ class ParameterClient:
                 self.writes += self._link.send(message, self.vehicle.disarmed.proven)
                 deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
                 while (answer := await self._next(inbox, deadline_s)) is not None:
-                    if isinstance(answer, _Refusal):
-                        raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.text}")
+                    if isinstance(answer, str):
+                        raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer}")
                     if answer == wanted if whole else same_float32(answer, wanted):
                         self._learn_loss(tries)
                         return answer
@@ -235,12 +227,12 @@ class ParameterClient:
 
     @property
     def answering(self) -> bool:
-        """Whether the autopilot has answered a request since it started."""
+        """The autopilot has answered a request since it started."""
         return self._answering is not None
 
     @property
     def integers_bytewise(self) -> bool:
-        """Whether integers travel as bytes; a known firmware says so, whatever a forged AUTOPILOT_VERSION does."""
+        """Integers travel as bytes; a known firmware decides, not an AUTOPILOT_VERSION that may be forged."""
         if (known := self.vehicle.kind.integers_bytewise) is not None:
             return known
         return bool((self.vehicle.capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
@@ -270,13 +262,13 @@ class ParameterClient:
     def _learn_loss(self, tries: int) -> None:
         self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
 
-    async def _next(self, inbox: _Inbox, deadline_s: float) -> float | _Refusal | None:
+    async def _next(self, inbox: _Inbox, deadline_s: float) -> _Answer | None:
         answer = await inbox.get(deadline_s)
         if isinstance(answer, AutopilotRebootedError):
             raise answer
         return answer
 
-    async def _ask(self, inbox: _Inbox, name: str, index: int) -> float | _Refusal | None:
+    async def _ask(self, inbox: _Inbox, name: str, index: int) -> _Answer | None:
         """One PARAM_REQUEST_READ and the first answer to it."""
         message = mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
         self._link.send(message)
@@ -285,7 +277,7 @@ class ParameterClient:
             self._answering = inbox.name if index < 0 else self._answering
         return answer
 
-    async def _ask_repeatedly(self, name: str, tries: Iterable[int]) -> tuple[float | _Refusal | None, int]:
+    async def _ask_repeatedly(self, name: str, tries: Iterable[int]) -> tuple[_Answer | None, int]:
         """The first answer, and how many requests there were."""
         count = 0
         with self._exchange(name) as inbox:
@@ -296,7 +288,7 @@ class ParameterClient:
         return None, count
 
     async def _answers_at_all(self) -> bool:
-        """Whether a parameter that must exist is answered for: the last one that was, else the first of the list."""
+        """Ask for a parameter that must exist: the last one that was answered, else the first of the list."""
         name, index = (self._answering, -1) if self._answering is not None else ("", 0)
         with self._exchange(name) as inbox:
             for _ in self._required_tries():
@@ -335,7 +327,7 @@ class ParameterClient:
             return
         for inbox in self._inboxes:
             if inbox.name == message.param_id:
-                inbox.put(_Refusal(message.error))
+                inbox.put(_ERROR_WORDS.get(message.error, f"error {message.error}"))
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":

@@ -80,7 +80,7 @@ class Vehicle:
         self.system_status: int | None = None
         """MAV_STATE of the last heartbeat."""
         self.signs = False
-        """Whether its last heartbeat was signed (MAVLink 2)."""
+        """Its last heartbeat was signed (MAVLink 2)."""
         self.boots = 0
         self.place = TimeAndPlace(is_carried)
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
@@ -138,7 +138,7 @@ class Vehicle:
 
     @property
     def alive(self) -> bool:
-        """Whether the latched autopilot's heartbeat came within the last 2 s."""
+        """The latched autopilot's heartbeat came within the last 2 s."""
         age_s = self.heartbeat_age_s
         return not self._lost and age_s is not None and age_s < HEARTBEAT_TIMEOUT_S
 
@@ -162,7 +162,7 @@ class Vehicle:
         return "; it signs what it sends: does it refuse what is not signed?" if self.signs else ""
 
     def sent(self, message: Message) -> bool:
-        """Whether a message came from the latched autopilot."""
+        """Check that a message came from the latched autopilot."""
         header = message.get_header()
         return header.srcComponent == self.component_id and header.srcSystem == self.system_id
 
@@ -239,7 +239,7 @@ class Vehicle:
             self._tell("armed" if armed else "disarmed")
 
     def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
-        """Whether a heartbeat under our ids is our vehicle's; ArduPilot and PX4 both are system 1 out of the box."""
+        """Check that a heartbeat under our ids is our vehicle's: ArduPilot and PX4 both are system 1 by default."""
         kind = firmware_with(message.autopilot)
         if kind is self.kind:
             return True
@@ -257,7 +257,7 @@ class Vehicle:
         return True
 
     def _is_on_our_link(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
-        """Whether a heartbeat was signed on the link on which we hear the autopilot.
+        """Check that a heartbeat was signed on the link on which we hear the autopilot.
 
         It signs each of its links apart: what was held back on another one is not news here. Unsigned heartbeats
         (None) count until the first signed one.
@@ -304,7 +304,7 @@ class Vehicle:
             self._wanted.ask_for_missing(now_s, self.firmware)
 
     def _stalled(self, now_s: float) -> bool:
-        """Whether our own loop stood still and what has waited meanwhile is not all read yet."""
+        """Check whether our own loop stood still, and messages that waited meanwhile are not read yet."""
         return now_s - self._tick_due_s > _STALL_S
 
     def _ask_soon(self) -> None:
@@ -359,7 +359,7 @@ class VehicleTimer:
         self._boot_s, self._boots = vehicle.boot.clock.latest_s, vehicle.boots
 
     def has_passed(self, seconds: float) -> bool:
-        """Whether so much time has gone by on both clocks; or on ours alone, where the other tells nothing."""
+        """Check that so much time has passed on both clocks; on ours alone while the other is unknown."""
         gone_s = asyncio.get_running_loop().time() - self._t_s
         if gone_s < seconds:
             return False

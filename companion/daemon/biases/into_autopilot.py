@@ -16,7 +16,7 @@ from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import CurvesWritten, Job
-from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog, left_in
+from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
@@ -82,8 +82,8 @@ class IntoAutopilot:
         words: list[str] = []
         left: list[str] = []
         for means in (means for means in window.imus if means.name in self._imus):
-            name, degc, imu = means.name, means.temperature_degc, self._imus[means.name]
-            curve, calibration = self._memory.curves.of(name, "gyro"), imu.in_force
+            name, degc = means.name, means.temperature_degc
+            curve, calibration = self._memory.curves.of(name, "gyro"), self._imus[name].in_force
             enabled_by = calibration.thermal.enabled_by
             if curve is None:
                 left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
@@ -100,10 +100,7 @@ class IntoAutopilot:
                 changes = await kind.thermal_changes(parameters, calibration, gyro, accel, degc)
                 named = {change.parameter for target in targets for change in target.unseen}
                 unseen = tuple(change for change in changes if change.parameter not in named)
-                nothing = left_in(means, np.zeros(3), np.zeros(3))
-                targets.append(
-                    ImuPlan(name, calibration, (), nothing, imu.stream.own_kind, watched=True, unseen=unseen)
-                )
+                targets.append(ImuPlan(name, calibration, (), (np.zeros(3), np.zeros(3)), watched=True, unseen=unseen))
                 low, high = curve.span_degc
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
         return targets, words, left

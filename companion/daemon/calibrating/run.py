@@ -31,9 +31,9 @@ from companion.daemon.offsets.plan import (
     Plan,
     WriteLog,
     as_good,
+    plan_for,
     refuse_shared,
     residual_of_consumer,
-    target_of,
     warnings_of,
     without,
 )
@@ -249,8 +249,8 @@ class CalibrationRun(Job):
                 continue
             self.log.warn(estimate.name, *rivalry.left_of(calibration))
             if push:
-                target = target_of(calibration, found, residual, imu)
-                self.log.warn(target.name, *warnings_of(target))
+                target = plan_for(found.name, calibration, residual, watched=imu is not None)
+                self.log.warn(target.name, *warnings_of(target, found))
                 targets.append(target)
         refuse_shared(targets, slots)
         if targets:

@@ -13,11 +13,10 @@ from typing import Final
 
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.imu_messages import Six, StreamKind
+from companion.autopilot.firmware.imu_messages import ImuMessage, Six
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_status import RawMean
 from companion.autopilot.telemetry.imu_stream import ImuStream
+from companion.autopilot.telemetry.px4_console import EkfBias, RawMean
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.config.sections import Imu
 from companion.configured import models
@@ -154,7 +153,7 @@ class AutopilotImu:
     def wants_raw(self) -> bool:
         """True: its telemetry is integers, and means of raw readings are finer."""
         kind = self.stream.kind
-        return self.calibration is not None and kind is not None and kind.gyro_step_rad_s > 0.0
+        return self.calibration is not None and kind is not None and kind.integers
 
     def take_raw(self, raw: RawMean) -> None:
         """Hand on a mean of raw readings, less the offsets in force."""
@@ -180,7 +179,7 @@ class AutopilotImu:
                 self.on_counting.tell(sample)
             self._collector.add_imu(self.name, sample)
 
-    def _kind_changed(self, kind: StreamKind | None) -> None:
+    def _kind_changed(self, kind: ImuMessage | None) -> None:
         self.input = models.imu_input(self._profiles.imu(self.name), kind)
         self._collector.set_imu(self.input)
         self.on_change.tell()
@@ -204,8 +203,9 @@ class AutopilotImu:
             # Anybody can say so; `refresh` asks the autopilot, and voids what was collected if it is true.
             self._announced = self._announced or (name, value, asyncio.get_running_loop().time())
         else:
-            rivals = {rival.parameter: rival.value for rival in known.rivals}
-            if name not in self._vehicle.kind.rivals or rivals.get(name, 0) == value:
+            active = {rival.parameter: rival.value for rival in known.rivals}
+            watched = {rival.parameter for rival in self._vehicle.kind.rivals}
+            if name not in watched or active.get(name, 0) == value:
                 return  # else what is in force is the same, but not what will become of it
         self._pause_s = REREAD_EVERY_S
         self._stale.set()
@@ -243,7 +243,7 @@ class AutopilotImu:
             "name": self.name,
             "kind": "autopilot imu",
             "good": not problem,
-            "summary": problem or f"autopilot IMU {self.instance}, {kind.message if kind else 'no message'}",
+            "summary": problem or f"autopilot IMU {self.instance}, {kind.name if kind else 'no message'}",
             "frames": self.stream.samples,
         }
 

@@ -16,10 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_status import ImuStatus, RawMean
 from companion.autopilot.telemetry.imu_stream import ask_script
-from companion.autopilot.telemetry.px4_console import Px4Console
+from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console, RawMean
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.configured import models

@@ -274,7 +274,7 @@ class AttitudeService:
             self.carrier.airspeed_m_s = None
         if self._autopilot_imu is not None:
             kind = self._autopilot_imu.stream.kind
-            self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0
+            self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None else 0.0
         await self.resume.step(now_s)
         self.health.judge(now_s)
         self.fallback.step(now_s, pushing=self.health.pushing)

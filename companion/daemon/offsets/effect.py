@@ -14,14 +14,14 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.imu_messages import StreamKind
+from companion.autopilot.firmware.imu_messages import MRAD
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import EffectVerdict, Observation, judge
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleTimer
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.offsets.plan import ImuPlan, Plan
-from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
+from companion.daemon.offsets.px4_writes import OnTheWay, Px4Writes
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import MIN_BATCHES
 from companion.estimation.means.windows import ImuWindow, Window
@@ -116,15 +116,12 @@ def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: W
     sides = BeforeAfter(
         before=next(imu for imu in before.imus if imu.name == target.name),
         after=next(imu for imu in after.imus if imu.name == target.name),
-        gyro_residual=target.solution.gyro_rad_s,
-        accel_residual=target.solution.accel_m_s2,
+        gyro_residual=target.residual[0],
+        accel_residual=target.residual[1],
         apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
     )
-    steps = step_from_far(target.calibration, target.all, sides.before.accel_m_s2)
-    seen = px4.seen_far(target.calibration)
-    on_the_way = {triad: (seen[triad], vector(step)) for triad, step in steps.items() if triad in seen}
-    profile = core.profiles.of(target.name)
-    return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
+    profile, on_the_way = core.profiles.of(target.name), px4.on_the_way(target.calibration.instance)
+    return judge_vectors(sides, target.calibration, list(target.changes), profile, on_the_way)
 
 
 def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
@@ -154,15 +151,10 @@ class BeforeAfter:
     """Time between the middles of both windows."""
 
 
-OnTheWay = Mapping[Triad, tuple[FarMean, Vector]]
-"""Output while far values were in force, and the step from there to the new ones."""
-
-
 def judge_vectors(
     sides: BeforeAfter,
     calibration: ImuCalibration,
     changes: list[Change],
-    kind: StreamKind | None,
     profile: str | NoiseProfile | None,
     on_the_way: OnTheWay,
 ) -> list[EffectVerdict]:
@@ -203,14 +195,14 @@ def judge_vectors(
         )
         verdict = judge(observation)
         if verdict.ok and triad in on_the_way:
-            far, step_from_there = on_the_way[triad]
+            (far, far_sigma), step_from_there = on_the_way[triad]
             verdict = judge(
                 dataclasses.replace(
                     observation,
-                    before=vector(far.mean),
-                    before_sigma=vector(far.sigma),
-                    expected_step=step_from_there,
-                    resolution=_resolution(kind, triad),
+                    before=vector(far),
+                    before_sigma=vector(far_sigma),
+                    expected_step=vector(step_from_there),
+                    resolution=MRAD if triad == "gyro" else MG,
                 )
             )
         verdicts.append(verdict)
@@ -222,12 +214,6 @@ def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
     if triad == "gyro":
         return window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s
     return window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2
-
-
-def _resolution(kind: StreamKind | None, triad: Triad) -> float:
-    if kind is None:
-        return 0.0
-    return kind.gyro_step_rad_s if triad == "gyro" else kind.accel_step_m_s2
 
 
 def _as_at_end(triad: Triad, sides: BeforeAfter, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:

@@ -48,11 +48,11 @@ class Ledger:
         self.unusable: tuple[str, ...] = ()
         """Damaged files that were set aside, each in a line."""
         self.lost_write = False
-        """Whether the journal was damaged, so that an interrupted write stays as it is."""
+        """The journal was damaged, so an interrupted write stays as it is."""
 
     @property
     def pending(self) -> bool:
-        """Whether the restore of an interrupted write is pending."""
+        """The restore of an interrupted write is pending."""
         return self._orphaned.is_set()
 
     def load(self) -> None:
@@ -195,7 +195,7 @@ class Recovery:
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self._offload, self._interruptions = core.offload, Interruptions(core.config.storage.path)
         self.on_recovered: Callable[..., Awaitable[object]] = _nobody_notes
-        """Told of a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
+        """Called with a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
         """List interrupted writes, the latest first; blocking."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
@@ -20,9 +19,8 @@ from typing import Final
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, Rival, stop
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, stop
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -45,8 +43,6 @@ EXPIRE_S: Final = 12.0
 MOST: Final = 8
 """Companions remembered; instance numbers can be made up."""
 INSTANCE_BITS: Final = 30
-JUST_NOW_S: Final = 20.0
-"""Time after a landing or a start in which a rewritten offset counts as the work of a rival that acts then."""
 
 
 class _Other(msgspec.Struct):
@@ -66,7 +62,7 @@ class _Other(msgspec.Struct):
         return self.is_new, self.instance
 
     def counts(self, now_s: float) -> bool:
-        """Whether it has been heard twice, and of late."""
+        """Check that it was heard twice, and lately."""
         return self.latest_s - self.first_s >= CONFIRM_S and now_s - self.latest_s < EXPIRE_S
 
 
@@ -152,12 +148,9 @@ class Rivalry:
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._imus, self._say = imus, core.say
         self.stop_rivals = core.config.push.stop_rivals
-        """Whether the next write switches rivals off."""
+        """The next write switches rivals off."""
         self._told: set[str] = set()
         """Rivals that the ground stations were told of since they were switched on; status shows them always."""
-        self._disarmed_s = self._rebooted_s = -math.inf
-        self._was_armed = False
-        core.vehicle.on_event.add(self._on_event)
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 
@@ -179,16 +172,6 @@ class Rivalry:
         stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
         return [warning for warning in calibration.warnings if warning not in stopped]
 
-    def _on_event(self, event: VehicleEvent) -> None:
-        now_s = asyncio.get_running_loop().time()
-        if event == "armed":
-            self._was_armed = True
-        elif event == "disarmed":
-            self._disarmed_s = now_s if self._was_armed else self._disarmed_s
-            self._was_armed = False
-        elif event == "rebooted":
-            self._rebooted_s, self._was_armed = now_s, False
-
     def _on_read(self, name: str, before: ImuCalibration | None, after: ImuCalibration) -> None:
         self._told &= {rival.name for rival in after.rivals}
         for rival in after.rivals:
@@ -208,22 +191,7 @@ class Rivalry:
         if not (gyros or accelerometers):
             return
         what = "all" if gyros and accelerometers else "gyro" if gyros else "accelerometer"
-        rival = self._culprit(after.rivals, accelerometers=accelerometers)
-        if rival is not None:
-            logger.warning("imu %s: %s offsets rewritten by the autopilot itself (%s)", name, what, rival.words)
-            words = f"The autopilot rewrote {what} offsets of {name}: {rival.name}"
-        else:
-            logger.warning("imu %s: %s offsets rewritten by somebody else", name, what)
-            words = f"Somebody rewrote {what} offsets of {name}"
+        able = [rival.name for rival in after.rivals if rival.accelerometers or not accelerometers]
+        words = f"Somebody rewrote {what} offsets of {name}{f', perhaps {able[0]}' if able else ''}"
+        logger.warning("%s", words)
         self._say(Severity.WARNING, words, Weight.NEWS)
-
-    def _culprit(self, rivals: Sequence[Rival], *, accelerometers: bool) -> Rival | None:
-        """Return the rival that rewrote offsets, by the time at which each acts."""
-        now_s = asyncio.get_running_loop().time()
-        acting = {
-            "at a start": now_s - self._rebooted_s < JUST_NOW_S,
-            "after a flight": now_s - self._disarmed_s < JUST_NOW_S,
-            "while still": not accelerometers,
-        }
-        able = [rival for rival in rivals if acting[rival.acts] and (rival.accelerometers or not accelerometers)]
-        return min(able, key=lambda rival: rival.acts == "while still", default=None)

@@ -12,14 +12,11 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.gyro_calibration import GyroOutcome
-from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.errors import AutopilotError
-from companion.estimation.means.windows import ImuWindow
 from companion.estimation.records.record import ImuRecord, Outcome, WrittenParameter
 from companion.estimation.records.validity import RESIDUAL_SIGMAS
 from companion.estimation.solution.solve import ImuSolution, Shared
@@ -57,6 +54,10 @@ class WriteLog:
         warnings += [words for words in dict.fromkeys(lines) if words not in warnings]
 
 
+Residual = tuple[Array | None, Array | None]
+"""Output less truth, which a write takes out: gyro and accelerometer, rad/s and m/s^2, vehicle FRD; None: it stays."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuPlan:
     """New offsets of one autopilot IMU."""
@@ -64,10 +65,9 @@ class ImuPlan:
     name: str
     calibration: ImuCalibration
     changes: tuple[Change, ...]
-    solution: ImuSolution
-    kind: StreamKind | None
+    residual: Residual
     watched: bool
-    """Whether the collector receives this IMU's output in the telemetry."""
+    """The collector receives this IMU's output in the telemetry."""
     read_m_s2: Vector = (0.0, 0.0, 0.0)
     """Accelerometer output before the write; needed where scales change."""
     unseen: tuple[Change, ...] = ()
@@ -125,22 +125,16 @@ class Plan:
                 kept[name] = msgspec.structs.replace(kept[name], outcome=outcome)
 
 
-def target_of(
-    calibration: ImuCalibration,
-    estimate: ImuSolution,
-    residual: tuple[Array | None, Array | None],
-    imu: AutopilotImu | None,
-) -> ImuPlan:
-    """Plan the changes that take a residual (gyro, accelerometer) out of the output of one IMU."""
+def plan_for(name: str, calibration: ImuCalibration, residual: Residual, *, watched: bool) -> ImuPlan:
+    """Plan the changes that take a residual out of the output of one IMU."""
     gyro, accel = residual
     changes = changes_for(calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel))
-    kind = imu.stream.own_kind if imu is not None else None
-    return ImuPlan(estimate.name, calibration, tuple(changes), estimate, kind, watched=imu is not None)
+    return ImuPlan(name, calibration, tuple(changes), residual, watched=watched)
 
 
-def warnings_of(target: ImuPlan) -> list[str]:
-    """Warnings about planned changes."""
-    name, estimate, found = target.name, target.solution, list[str]()
+def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
+    """Warn of planned changes that are known badly, or that the autopilot will not use."""
+    name, found = target.name, list[str]()
     coarse_mg = math.sqrt(np.diag(estimate.covariance)[3:].max()) / MG if estimate.accel_m_s2 is not None else 0.0
     if coarse_mg > COARSE_ACCEL_MG:
         found.append(
@@ -212,22 +206,7 @@ def without(found: ImuSolution, triads: Collection[Triad]) -> ImuSolution:
     )
 
 
-def left_in(imu: ImuWindow, gyro_rad_s: Array | None, accel_m_s2: Array | None) -> ImuSolution:
-    """Make an estimate of one IMU from residuals that no calibration worked out, with the window's sigmas."""
-    sigma = np.concatenate([imu.gyro_sigma_use_rad_s, imu.accel_sigma_use_m_s2])
-    return ImuSolution(
-        name=imu.name,
-        samples=imu.samples,
-        temperature_degc=imu.temperature_degc,
-        gyro_rad_s=gyro_rad_s,
-        accel_m_s2=accel_m_s2,
-        sigma_stat=np.array([*imu.gyro_sigma_stat_rad_s, *imu.accel_sigma_stat_m_s2]),
-        covariance=np.diag(sigma**2),
-        warnings=(),
-    )
-
-
-def residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
+def residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> Residual:
     """Compute the residual of an autopilot that consumes our own IMU, from the IMU's whole bias."""
     rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
     gyro = accel = None

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
+from companion.autopilot.firmware.imu_calibration import FAR_ACCEL_M_S2, ImuCalibration, output_step, vector_changes
 from companion.autopilot.firmware.imu_messages import Reading
 from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, accel_offset_with
 from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, SlotMemory
@@ -65,24 +65,24 @@ class ExpectedStep:
     """For people: CAL_GYRO0."""
     step: Array
     """(3,), rad/s or m/s^2, vehicle FRD."""
+    rest: Array
+    """Step from there to all new values, likewise."""
     unknown: float
     """Share of the step by which the offsets in use may have differed from the parameters."""
 
     def moved(self, made: Array) -> bool:
-        """Whether an output that made this step followed the far value."""
+        """Check that an output that made this step followed the far value."""
         return bool(np.linalg.norm(made - self.step) < (self.unknown + MATCH) * np.linalg.norm(self.step))
 
     def stayed(self, made: Array) -> bool:
-        """Whether an output that made this step did not follow the far value."""
+        """Check that an output that made this step did not follow the far value."""
         return bool(np.linalg.norm(made) < (1.0 - self.unknown - MATCH) * np.linalg.norm(self.step))
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class FarMean:
-    """Mean output while a far value was in force, and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
-
-    mean: Array
-    sigma: Array
+Mean = tuple[Array, Array]
+"""Mean of an output and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
+OnTheWay = Mapping[Triad, tuple[Mean, Array]]
+"""Output under far values, as integer messages showed it, and the step from there to the new values."""
 
 
 class Px4Writes:
@@ -95,13 +95,13 @@ class Px4Writes:
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
         """Steps of the write under way, by parameter."""
-        self._means: dict[tuple[int, Triad], FarMean] = {}
-        """Means under the latest far value, by instance; only of outputs that moved as expected."""
+        self._seen: dict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
+        """`OnTheWay` of the latest write by instance; only of outputs that moved as expected."""
         self._learned = False
-        """Whether the last look told anything new of the slots."""
+        """The last verification learned something new of the slots."""
         self._boots = 0
         self._samples: defaultdict[int, deque[tuple[float, Reading]]] = defaultdict(deque)
-        self._before: dict[int, FarMean | None] = {}
+        self._before: dict[int, Mean | None] = {}
         self._unknown: set[int] = set()
         """IMUs that may exist and were not heard."""
 
@@ -113,7 +113,8 @@ class Px4Writes:
 
         The third of each target is its accelerometers' output before.
         """
-        self._means, self._learned, self._steps = {}, False, {}
+        self._learned, self._steps = False, {}
+        self._seen.clear()
         for calibration, changes, read in targets:
             self._steps |= far_steps(calibration, changes, read)
         try:
@@ -131,12 +132,12 @@ class Px4Writes:
         # Only a write that succeeded comes here.
         for calibration, changes, _ in targets:
             names, written = calibration.parameters.accel_offset, {change.parameter for change in changes}
-            if calibration.far_step is not None and written.intersection(names):
+            if calibration.far_axis is not None and written.intersection(names):
                 self._memory.brought_into_use(names, accel_offset_with(calibration, changes), self._vehicle.boots)
 
-    def seen_far(self, calibration: ImuCalibration) -> Mapping[Triad, FarMean]:
-        """Return the means of an IMU's output under the far values of the last write, where they were seen."""
-        return {of: mean for (number, of), mean in self._means.items() if number == calibration.instance}
+    def on_the_way(self, instance: int) -> OnTheWay:
+        """Return an IMU's output under the far values of the last write, where they were seen."""
+        return self._seen[instance]
 
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
         """Bring offsets that may not be in use into use, unchanged; True when there were any.
@@ -194,7 +195,7 @@ class Px4Writes:
             return None
         moved, still = self._moves(step, from_s, loop.time())
         if step.instance in moved and (now := self._mean(step.instance, step.sensor, from_s, loop.time())):
-            self._means[step.instance, step.sensor] = now
+            self._seen[step.instance][step.sensor] = now, step.rest
         return self._conclude(step, moved, still)
 
     def _conclude(self, step: ExpectedStep, moved: list[int], still: list[int]) -> str | None:
@@ -229,7 +230,7 @@ class Px4Writes:
             was, now = self._before.get(instance), self._mean(instance, step.sensor, from_s, to_s)
             if was is None or now is None:
                 continue
-            made = now.mean - was.mean
+            made = now[0] - was[0]
             if step.moved(made):
                 moved.append(instance)
             elif step.stayed(made):
@@ -280,7 +281,7 @@ class Px4Writes:
 
         return self._link.subscribe(kind.message, take)
 
-    def _mean(self, instance: int, sensor: Triad, from_s: float, to_s: float) -> FarMean | None:
+    def _mean(self, instance: int, sensor: Triad, from_s: float, to_s: float) -> Mean | None:
         found = [
             reading.gyro_rad_s if sensor == "gyro" else reading.accel_m_s2
             for t_s, reading in self._samples.get(instance, ())
@@ -289,7 +290,7 @@ class Px4Writes:
         if len(found) < LEAST_SAMPLES:
             return None
         values = np.array(found)
-        return FarMean(values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(found)))
+        return values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(found))
 
 
 def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> dict[str, ExpectedStep]:
@@ -298,24 +299,16 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
     for change in changes:
         if change.via is None:
             continue
-        triad, old, far, _ = _outputs(calibration, changes, change, accel_m_s2)
+        triad, old, far, new = _outputs(calibration, changes, change, accel_m_s2)
         device_id, name = calibration.accel_id, names.accel_id
         if triad == "gyro":
             device_id, name = calibration.gyro_id, names.gyro_id
         if (step := far - old).any() and device_id is not None:
             unknown = MARGIN * IGNORED_STEP / abs(change.via - change.before)
             slot = name.removesuffix("_ID")
-            found[change.parameter] = ExpectedStep(calibration.instance, triad, device_id, slot, step, unknown)
-    return found
-
-
-def step_from_far(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> Mapping[Triad, Array]:
-    """Return the step of the output from the last far value of each triad to all new ones, rad/s and m/s^2."""
-    found: dict[Triad, Array] = {}
-    for change in changes:
-        if change.via is not None:
-            triad, _, far, new = _outputs(calibration, changes, change, accel_m_s2)
-            found[triad] = new - far
+            found[change.parameter] = ExpectedStep(
+                calibration.instance, triad, device_id, slot, step, new - far, unknown
+            )
     return found
 
 
@@ -348,7 +341,7 @@ def _danger(step: ExpectedStep) -> str:
 
 
 def _same_again(calibration: ImuCalibration) -> list[Change]:
-    offset, far = calibration.accel_offset_m_s2, calibration.far_step
-    if far is None:
+    offset, axis = calibration.accel_offset_m_s2, calibration.far_axis
+    if axis is None:
         return []
-    return vector_changes(calibration.parameters.accel_offset, offset, offset, far.accel_m_s2)
+    return vector_changes(calibration.parameters.accel_offset, offset, offset, axis, FAR_ACCEL_M_S2)

@@ -49,7 +49,7 @@ def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Cha
     after = {change.parameter: change.after for change in changes}
     gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
     for rival in (rival for calibration in calibrations for rival in calibration.rivals):
-        if rival.acts == "at a start" and after.get(rival.parameter) != 0.0 and gyros & set(after):
+        if rival.at_start and after.get(rival.parameter) != 0.0 and gyros & set(after):
             return (
                 f"not rebooted: {rival.parameter} = {rival.value} would measure the gyros anew at the start and"
                 f" throw these gyro offsets away; set {rival.parameter} to 0 first (push.stop_rivals = true does)"
@@ -117,7 +117,7 @@ class RebootOwed:
         self._boots = 0
         """Restarts seen when the restart became owed, or was loaded."""
         self._earlier = False
-        """Whether it was loaded from an earlier run of the companion."""
+        """It was loaded from an earlier run of the companion."""
 
     def load(self) -> None:
         """Load the file; blocking."""

@@ -53,7 +53,7 @@ class Offsets(Subsystem):
         }
 
     def undoable(self) -> list[Object]:
-        """What can be undone on this aircraft, the latest first."""
+        """List the steps that can be undone on this aircraft, the latest first."""
         return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102

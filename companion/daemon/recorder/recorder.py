@@ -136,7 +136,7 @@ class Recorder(Subsystem):
             sender=(vehicle.system_id or 0, vehicle.component_id),
             firmware=vehicle.firmware,
             instance=imu.instance,
-            message=None if kind is None else kind.message,
+            message=None if kind is None else kind.name,
             input=imu.input,
             calibration=imu.calibration,
         )

@@ -24,7 +24,7 @@ from companion.component.statustext import Severity
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog, left_in
+from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.alignment.faces import Mounting
@@ -66,10 +66,10 @@ class AlignmentWrites:
         means = {imu.name: imu for imu in last.imus}
         targets: list[ImuPlan] = []
         for name, each in changes.items():
-            imu, calibration, read = self._imus[name], self._imus[name].in_force, means[name].accel_m_s2
+            calibration, read = self._imus[name].in_force, means[name].accel_m_s2
             _, step = output_step(calibration, each, read)
-            left = left_in(means[name], None, -np.array(step))
-            targets.append(ImuPlan(name, calibration, tuple(each), left, imu.stream.kind, watched=True, read_m_s2=read))
+            residual = None, -np.array(step)
+            targets.append(ImuPlan(name, calibration, tuple(each), residual, watched=True, read_m_s2=read))
             log.warn(name, *warnings_about(calibration, each))
         plan = await self.path.write(job, Plan(tuple(targets), self._vehicle.boots), last, log)
         for target in targets:

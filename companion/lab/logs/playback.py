@@ -60,7 +60,7 @@ class _AutopilotImu:
         reading = source.decode(message)
         if not isinstance(reading, Reading) or reading.all_zero:
             return None
-        name, floats = source.kind.message, source is PX4_FLOATS
+        name, floats = source.name, source is PX4_FLOATS
         if not self.samples.accept(name, reading, t_s) or name != state.message or state.calibration is None:
             return None
         if floats and bias is None:

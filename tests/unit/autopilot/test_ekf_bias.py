@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from companion.autopilot.telemetry.ekf_bias import LOOK_EVERY_S, MISSES, EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream
-from companion.autopilot.telemetry.px4_console import Px4Console
+from companion.autopilot.telemetry.px4_console import LOOK_EVERY_S, MISSES, EkfBias, Px4Console
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample
@@ -72,7 +71,7 @@ async def aboard(
     found = Aboard(double, ekf_bias, None)  # type: ignore[arg-type]
     found.stream = ImuStream(
         link, vehicle, instance, found.samples.append, rate_hz=rate_hz, ekf_bias=ekf_bias,
-        on_kind_change=lambda kind: found.kinds.append(None if kind is None else kind.message),
+        on_kind_change=lambda kind: found.kinds.append(None if kind is None else kind.name),
     )  # fmt: skip
     tasks = [
         asyncio.create_task(double.run()),
@@ -93,7 +92,7 @@ async def test_the_first_imu_comes_in_floats_and_is_right_to_two_deg_h() -> None
     async with aboard() as found:
         assert found.kinds[-1] == "HIGHRES_IMU+bias"
         assert found.stream.kind is not None
-        assert not found.stream.kind.truncates
+        assert not found.stream.kind.integers
         found.samples.clear()
         await asyncio.sleep(40.0)
         assert 3900 < len(found.samples) < 4100

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_status import ImuStatus, RawMean
-from companion.autopilot.telemetry.px4_console import Px4Console
+from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console, RawMean
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from sim.aircraft import Pose, VirtualAircraft

@@ -9,17 +9,17 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.imu_messages import StreamKind
-from companion.autopilot.telemetry.ekf_bias import EkfBias
+from companion.autopilot.firmware import imu_messages
+from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.telemetry.imu_stream import ImuStream
-from companion.autopilot.telemetry.px4_console import Px4Console
+from companion.autopilot.telemetry.px4_console import EkfBias, Px4Console
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.wire import Wire
 
-HIGHRES, RAW, SCALED, SCALED2, SCALED3 = 105, 27, 26, 116, 129
+HIGHRES, SCALED, SCALED2, SCALED3 = 105, 26, 116, 129
 DENIED, UNSUPPORTED = mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED
 
 
@@ -28,12 +28,12 @@ class Heard:
         self.samples: list[ImuSample] = []
         self.kinds: list[str | None] = []
 
-    def kind(self, kind: StreamKind | None) -> None:
-        self.kinds.append(None if kind is None else kind.message)
+    def kind(self, kind: ImuMessage | None) -> None:
+        self.kinds.append(None if kind is None else kind.name)
 
 
 def kind_of(stream: ImuStream) -> str | None:
-    return None if stream.kind is None else stream.kind.message
+    return None if stream.kind is None else stream.kind.name
 
 
 @contextlib.asynccontextmanager
@@ -72,7 +72,7 @@ async def test_instance_1_is_highres_with_the_imus_own_temperature() -> None:
     autopilot = ScriptedAutopilot()
     async with aboard(autopilot) as (stream, heard, _):
         await asyncio.sleep(5.0)
-        assert stream.kind == StreamKind("HIGHRES_IMU", 0.0, 0.0, truncates=False)
+        assert kind_of(stream) == "HIGHRES_IMU"
         assert stream.problem == ""
         assert stream.samples == len(heard.samples) > 400
         last = heard.samples[-1]
@@ -90,20 +90,12 @@ async def test_without_highres_it_falls_back_to_scaled_imu(answer: int) -> None:
     autopilot.result_of = answering({HIGHRES: answer})
     async with aboard(autopilot) as (stream, heard, _):
         await asyncio.sleep(5.0)
-        assert stream.kind == StreamKind("SCALED_IMU", 1e-3, 9.80665e-3, truncates=True)
+        assert stream.kind is imu_messages.SCALED
         assert heard.samples[-1].gyro_rad_s == pytest.approx((0.001, -0.002, 0.003))
         # 0.1 m/s^2 is 10.197 mG, cut to 10.
         assert heard.samples[-1].accel_m_s2 == pytest.approx((0.0980665, -0.196133, -9.79684), rel=1e-4)
         assert heard.samples[-1].temperature_degc == pytest.approx(27.15)
         assert autopilot.intervals[SCALED] == pytest.approx(0.01)
-
-
-async def test_raw_imu_is_the_last_resort() -> None:
-    autopilot = ScriptedAutopilot()
-    autopilot.result_of = answering({HIGHRES: UNSUPPORTED, SCALED: UNSUPPORTED})
-    async with aboard(autopilot) as (stream, _, _):
-        await asyncio.sleep(5.0)
-        assert kind_of(stream) == "RAW_IMU"
 
 
 async def test_highres_that_is_accepted_but_never_comes() -> None:
@@ -250,12 +242,10 @@ async def test_values_that_are_no_numbers_are_rejected() -> None:
 
 async def test_nothing_at_all_is_said_in_one_line() -> None:
     autopilot = ScriptedAutopilot()
-    autopilot.result_of = answering({HIGHRES: UNSUPPORTED, SCALED: UNSUPPORTED, RAW: UNSUPPORTED})
+    autopilot.result_of = answering({HIGHRES: UNSUPPORTED, SCALED: UNSUPPORTED})
     async with aboard(autopilot) as (stream, _, _):
         await asyncio.sleep(5.0)
-        assert stream.problem == (
-            "no samples of IMU 1: HIGHRES_IMU not supported, SCALED_IMU not supported, RAW_IMU not supported"
-        )
+        assert stream.problem == "no samples of IMU 1: HIGHRES_IMU not supported, SCALED_IMU not supported"
         assert sum(m.get_type() == "COMMAND_LONG" for m in autopilot.requests) < 20
 
 

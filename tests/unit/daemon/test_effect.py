@@ -60,7 +60,7 @@ def verdict_of(
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if made is None else made)
     changes = [Change(name, 0.0, float(each)) for name, each in zip(parameters_of(1).gyro_offset, step, strict=True)]
     (verdict,) = judge_vectors(
-        BeforeAfter(before, after, np.asarray(step), None), calibration(), changes, None, "icm42688p", {}
+        BeforeAfter(before, after, np.asarray(step), None), calibration(), changes, "icm42688p", {}
     )
     return verdict
 

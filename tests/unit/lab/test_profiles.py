@@ -217,10 +217,7 @@ def recording(
     """A recording of noise; at `written_s` the daemon wrote offsets, which moved the gyros by 100 deg/h."""
     config = parse(SMALLEST.format("bmi088"), "x.toml")
     (instance, kind) = next(
-        (instance, each.kind)
-        for instance, all_ in ArduPilot.imu_messages.items()
-        for each in all_
-        if each.kind.message == message
+        (instance, each) for instance, all_ in ArduPilot.imu_messages.items() for each in all_ if each.name == message
     )
     state = ImuState(
         sender=(1, 1),
