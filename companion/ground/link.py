@@ -17,7 +17,7 @@ import asyncio
 import contextlib
 import json
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any, ClassVar, Final
 
@@ -33,54 +33,40 @@ from companion.links.system.listeners import Listeners
 logger = logging.getLogger(__name__)
 
 
-class SignedLink:
-    """Between MAVSDK, with a raw connection, and the link; `own`: system and component that MAVSDK sends as."""
-
-    def __init__(self, sdk: Any, own: tuple[int, int], key: bytes) -> None:
-        self._sdk = sdk
-        self._loop = asyncio.get_running_loop()
-        self._from_sdk = mavlink.MAVLink(None)
-        self._from_sdk.robust_parsing = True
-        self.link = MavlinkLink(system_id=own[0], component_id=own[1])
-        self.signing = Signing(required=True, key=key)
-        self.link.signing = self.signing
-        for kind in mavlink.mavlink_map.values():
-            self.link.subscribe(kind, self._hand_over)
-        sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)
-
-    def text(self) -> str:
-        """Name the dropped messages; empty: none."""
-        if not self.signing.doubted:
-            return ""
-        counts = ", ".join(f"{count} {reason}" for reason, count in self.signing.doubted.most_common())
-        return f"messages dropped because of their signature: {counts}"
-
-    def _hand_over(self, message: Message, _t_s: float) -> None:
-        self._sdk.pass_received_raw_bytes(bytes(message.get_msgbuf()))
-
-    def _in_a_thread(self, data: bytes) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
-            self._loop.call_soon_threadsafe(self._send, data)
-
-    def _send(self, data: bytes) -> None:
-        for message in self._from_sdk.parse_buffer(data) or ():
-            if message.get_msgId() in mavlink.mavlink_map:
-                self.link.send(message)
-
-
 @asynccontextmanager
-async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[SignedLink]:
+async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[Signing]:
     """Carry what MAVSDK sends and hears over a url, signed, until the context ends.
+
+    `own`: system and component that MAVSDK sends as.
 
     Raises:
         LinkError: the url is none.
         mavsdk.MavsdkError: MAVSDK refuses the raw connection.
     """
     await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
-    signed = SignedLink(sdk, own, key)
-    carrying = asyncio.create_task(run_transport(signed.link, url), name="signed link")
+    loop, parser = asyncio.get_running_loop(), mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    link = MavlinkLink(system_id=own[0], component_id=own[1])
+    link.signing = signing = Signing(required=True, key=key)
+
+    def hand_over(message: Message, _t_s: float) -> None:
+        sdk.pass_received_raw_bytes(bytes(message.get_msgbuf()))
+
+    def send(data: bytes) -> None:
+        for message in parser.parse_buffer(data) or ():
+            if message.get_msgId() in mavlink.mavlink_map:
+                link.send(message)
+
+    def send_from_thread(data: bytes) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+            loop.call_soon_threadsafe(send, data)
+
+    for kind in mavlink.mavlink_map.values():
+        link.subscribe(kind, hand_over)
+    sdk.subscribe_raw_bytes_to_be_sent(send_from_thread)
+    carrying = asyncio.create_task(run_transport(link, url), name="signed link")
     try:
-        yield signed
+        yield signing
     finally:
         carrying.cancel()
         await asyncio.wait([carrying])
@@ -92,21 +78,25 @@ _HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
 
 
 class GroundLink:
-    """A ground station on an open link; made by `open_link`.
-
-    `unbelieved`: what was dropped because of its signature, in words; empty: nothing.
-    """
+    """A ground station on an open link; made by `open_link`."""
 
     def __init__(
-        self, sdk: Any, direct: Any, own: Address, heard: GroundListener, unbelieved: Callable[[], str] = lambda: ""
+        self, sdk: Any, direct: Any, own: Address, heard: GroundListener, signing: Signing | None = None
     ) -> None:
-        self.own, self.heard, self.unbelieved = own, heard, unbelieved
-        self._sdk, self._direct = sdk, direct
+        self.own, self.heard = own, heard
+        self._sdk, self._direct, self._signing = sdk, direct, signing
         self.on_ack: Listeners[[Address, Fields]] = Listeners()
         """Listeners for every COMMAND_ACK to us."""
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
+
+    def unbelieved(self) -> str:
+        """Name the messages that were dropped because of their signature; empty: none."""
+        if self._signing is None or not self._signing.doubted:
+            return ""
+        counts = ", ".join(f"{count} {reason}" for reason, count in self._signing.doubted.most_common())
+        return f"messages dropped because of their signature: {counts}"
 
     def send_command(self, target: Address, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
@@ -226,8 +216,8 @@ async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -
     with mavsdk.Mavsdk(configuration) as sdk:
         direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
         if key is not None:
-            async with open_signed(sdk, own, url, key) as signed:
-                yield GroundLink(sdk, direct, own, heard, signed.text)
+            async with open_signed(sdk, own, url, key) as signing:
+                yield GroundLink(sdk, direct, own, heard, signing)
             return
         try:
             await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
