@@ -30,16 +30,12 @@ logger = logging.getLogger(__name__)
 
 NAME: Final = "CMP_INST"
 BEAT_S: Final = 1.0
-IDLE_BEATS: Final = 5
-"""Beats from one announcement to the next while no other companion is heard."""
-FIRST_BEATS: Final = 10
-"""Beats after the start that all carry an announcement."""
 SETTLE_S: Final = 6.0
 """Time after the start in which a running companion makes itself heard."""
 CONFIRM_S: Final = 0.5
 """Least time between two announcements that make a companion count: leftovers of one that has ended come at once."""
 EXPIRE_S: Final = 12.0
-"""Silence after which a companion is gone: its announcements come every second while two hear each other."""
+"""Silence after which a companion is gone: its announcements come every second, and some are lost."""
 MOST: Final = 8
 """Companions remembered; instance numbers can be made up."""
 INSTANCE_BITS: Final = 30
@@ -61,6 +57,10 @@ class _Other(msgspec.Struct):
         """Lower goes first."""
         return self.is_new, self.instance
 
+    def words(self, does: str) -> str:
+        """For people."""
+        return f"second companion ({self.system_id}/{self.component_id}) on this link {does}: stop one of them"
+
     def counts(self, now_s: float) -> bool:
         """Check that it was heard twice, and lately."""
         return self.latest_s - self.first_s >= CONFIRM_S and now_s - self.latest_s < EXPIRE_S
@@ -80,35 +80,28 @@ class OtherCompanions:
     def why_not(self) -> str | None:
         """Reason not to write, naming the companion that does; None without one."""
         other = self._other()
-        if other is None or not self._writes() or other.rank > (self._is_new, self._instance):
-            return None
-        return f"second companion ({other.system_id}/{other.component_id}) on this link writes: stop one of them"
+        return None if other is None or other.rank > (self._is_new, self._instance) else other.words("writes")
 
     @property
     def warning(self) -> str | None:
         """Presence of another companion, for people; None without one."""
         other = self._other()
-        if other is None or not self._writes():
-            return None
-        refuses = f"second companion ({other.system_id}/{other.component_id}) on this link waits: stop one of them"
-        return self.why_not() or refuses
+        return None if other is None else self.why_not() or other.words("waits")
 
     async def run(self) -> None:
         """Announce this companion, and tell the pilot of others."""
         loop = asyncio.get_running_loop()
-        started_s, beats = loop.time(), 0
+        started_s = loop.time()
         while True:
             await asyncio.sleep(BEAT_S)  # nothing may leave before the component's first heartbeat
             now_s = loop.time()
             if self._is_new and now_s - started_s >= SETTLE_S and self.why_not() is None:
                 self._is_new = False
-            due = beats < FIRST_BEATS or self._hears(now_s) or beats % IDLE_BEATS == 0
-            if due and self._writes() and self._link.connected:
+            if self._writes() and self._link.connected:
                 value = self._instance << 1 | self._is_new
                 name = NAME.encode("ascii")
                 self._link.send(mavlink.MAVLink_named_value_int_message(int(now_s * 1e3) % 2**32, name, value))
             self._tell()
-            beats += 1
 
     def _tell(self) -> None:
         words = self.warning
@@ -117,11 +110,10 @@ class OtherCompanions:
             self._say(Severity.WARNING, words[:1].upper() + words[1:], Weight.NEWS)
         self._told = words
 
-    def _hears(self, now_s: float) -> bool:
-        return any(now_s - other.latest_s < EXPIRE_S for other in self._others.values())
-
     def _other(self) -> _Other | None:
-        """The first by rank of those that count."""
+        """Return the first by rank of those that count; None: nobody does, or this companion writes nothing."""
+        if not self._writes():
+            return None
         now_s = asyncio.get_running_loop().time()
         present = (other for other in self._others.values() if other.counts(now_s))
         return min(present, key=lambda other: other.rank, default=None)
