@@ -83,8 +83,10 @@ def test_on_a_busy_57600_baud_line_a_calibration_is_right(tmp_path: Path) -> Non
             assert isinstance(job, Job)
             result = await job.finished
             assert result.outcome == "done", result
-            left = rig.autopilot.residual(1, rig.now_s)
-            assert np.abs(left.gyro_rad_s).max() < 40 * DEG_H
+            assert job.record is not None
+            left, sigma = rig.autopilot.residual(1, rig.now_s), np.array(job.record.imus[0].gyro_sigma_use_rad_s)
+            assert sigma.max() < 30 * DEG_H
+            assert (np.abs(left.gyro_rad_s) < 3.0 * sigma).all()
             assert np.abs(left.accel_m_s2).max() < 0.5 * MG
             assert rig.wire.dropped < 50, "we asked for more than the line carries"
 

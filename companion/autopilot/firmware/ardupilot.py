@@ -73,10 +73,9 @@ def _ranges() -> dict[str, Range]:
     found: dict[str, Range] = {AT_START: SWITCH_RANGE}
     for names in map(parameters_of, INSTANCES):
         # The firmware's own gyro calibration, which we start, sets CALTEMP and id: both are restored.
-        tcal = names.tcal
-        found |= {**offset_ranges(names), **dict.fromkeys(tcal.deciding, _TCAL_RANGE)}
-        found |= dict.fromkeys((tcal.gyro_caltemp, tcal.accel_caltemp, tcal.low, tcal.high), DEGC_RANGE)
-        found |= {tcal.enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE}
+        found |= {**offset_ranges(names), **dict.fromkeys(names.tcal, _TCAL_RANGE)}
+        found |= dict.fromkeys((names.gyro_caltemp, names.accel_caltemp, names.tcal_low, names.tcal_high), DEGC_RANGE)
+        found |= {names.tcal_enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE}
     return found | dict.fromkeys(TRIM, _TRIM_RANGE)
 
 

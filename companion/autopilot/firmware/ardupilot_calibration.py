@@ -39,33 +39,26 @@ Names = tuple[str, str, str]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TcalParameters:
-    """Parameter names of one IMU's temperature calibration."""
-
-    enable: str
-    """0 off, 1 on, 2 learning until the next boot."""
-    low: str
-    high: str
-    gyro: tuple[Names, Names, Names]
-    """Coefficients by power of the temperature."""
-    accel: tuple[Names, Names, Names]
-    gyro_caltemp: str
-    """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
-    accel_caltemp: str
-
-    @property
-    def deciding(self) -> tuple[str, ...]:
-        """All names but the CALTEMPs, which the firmware's own calibrations set; the switch comes last."""
-        coefficients = (name for names in (*self.accel, *self.gyro) for name in names)
-        return (self.low, self.high, *coefficients, self.enable)
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ArduPilotParameters(ImuParameters):
     """Parameter names of one IMU; the first instance is irregular, 4 and 5 are again (autopilots 1.1)."""
 
-    tcal: TcalParameters
     use: str
+    gyro_caltemp: str
+    """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
+    accel_caltemp: str
+    tcal_enable: str
+    """0 off, 1 on, 2 learning until the next boot."""
+    tcal_low: str
+    tcal_high: str
+    tcal_gyro: tuple[Names, Names, Names]
+    """Coefficients by power of the temperature."""
+    tcal_accel: tuple[Names, Names, Names]
+
+    @property
+    def tcal(self) -> tuple[str, ...]:
+        """All names but the CALTEMPs, which the firmware's own calibrations set; the switch comes last."""
+        coefficients = (name for names in (*self.tcal_accel, *self.tcal_gyro) for name in names)
+        return (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
 
 
 def parameters_of(instance: int) -> ArduPilotParameters:
@@ -96,15 +89,13 @@ def parameters_of(instance: int) -> ArduPilotParameters:
         gyro_id=f"{ins}GYR{n}_ID",
         accel_id=f"{ins}ACC{n}_ID",
         use=f"{ins}USE{n}",
-        tcal=TcalParameters(
-            enable=f"{tcal}ENABLE",
-            low=f"{tcal}TMIN",
-            high=f"{tcal}TMAX",
-            gyro=coefficients("GYR"),
-            accel=coefficients("ACC"),
-            gyro_caltemp=caltemp.format("GYR"),
-            accel_caltemp=caltemp.format("ACC"),
-        ),
+        gyro_caltemp=caltemp.format("GYR"),
+        accel_caltemp=caltemp.format("ACC"),
+        tcal_enable=f"{tcal}ENABLE",
+        tcal_low=f"{tcal}TMIN",
+        tcal_high=f"{tcal}TMAX",
+        tcal_gyro=coefficients("GYR"),
+        tcal_accel=coefficients("ACC"),
     )
 
 
@@ -117,33 +108,33 @@ async def read_thermal(parameters: Parameters, instance: int) -> Thermal:
     Raises:
         AutopilotError: it is learning, or as `Parameters.read`.
     """
-    names = parameters_of(instance).tcal
-    enable = await read_integer(parameters, names.enable)
+    names = parameters_of(instance)
+    enable = await read_integer(parameters, names.tcal_enable)
     if enable is None:
         return Thermal()
     if enable == _LEARNING:
         raise AutopilotError(
-            f"{names.enable} = 2: IMU {instance} is learning its temperature calibration;"
+            f"{names.tcal_enable} = 2: IMU {instance} is learning its temperature calibration;"
             " let it finish, or set it to 0 or 1"
         )
     if enable != _ON:
-        return Thermal(values={names.enable: float(enable)})
-    found = await parameters.read_many((*names.deciding, names.gyro_caltemp, names.accel_caltemp))
+        return Thermal(values={names.tcal_enable: float(enable)})
+    found = await parameters.read_many((*names.tcal, names.gyro_caltemp, names.accel_caltemp))
 
     def polynomial(coefficients: tuple[Names, Names, Names]) -> Polynomial:
         one, two, three = (vector(np.array([found[name] for name in each]) * _UNIT) for each in coefficients)
         return Polynomial(
             coefficients=(ZERO, one, two, three),
             reference_degc=REFERENCE_DEGC,
-            low_degc=found[names.low],
-            high_degc=found[names.high],
+            low_degc=found[names.tcal_low],
+            high_degc=found[names.tcal_high],
         )
 
     return Thermal(
-        enabled_by=names.enable,
-        values={name: found[name] for name in names.deciding},
-        gyro=polynomial(names.gyro).zero_at(found[names.gyro_caltemp]),
-        accel=polynomial(names.accel).zero_at(found[names.accel_caltemp]),
+        enabled_by=names.tcal_enable,
+        values={name: found[name] for name in names.tcal},
+        gyro=polynomial(names.tcal_gyro).zero_at(found[names.gyro_caltemp]),
+        accel=polynomial(names.tcal_accel).zero_at(found[names.accel_caltemp]),
     )
 
 
@@ -156,19 +147,20 @@ async def thermal_changes(
     stays, held at the ends of the new span; one that is not is cleared, for it would come into force with the gyros'.
     """
     assert gyro.reference_degc == REFERENCE_DEGC
-    names, thermal, own = parameters_of(calibration.instance).tcal, calibration.thermal, calibration.parameters
+    names, thermal = parameters_of(calibration.instance), calibration.thermal
     if not thermal.values:
         raise AutopilotError(
-            f"{names.enable} does not exist: this firmware has no temperature calibration (boards of 1 MB have none)"
+            f"{names.tcal_enable} does not exist: this firmware has no temperature calibration"
+            " (boards of 1 MB have none)"
         )
     acts = accel is not None or any(map(any, thermal.accel.coefficients))
     caltemps = [names.gyro_caltemp, *([names.accel_caltemp] if acts else [])]
-    before = await parameters.read_many((*names.deciding, *caltemps))
-    wanted = {name: before[name] if thermal.enabled_by else 0.0 for each in names.accel for name in each}
-    for of, curve in ((names.gyro, gyro), *(((names.accel, accel),) if accel is not None else ())):
+    before = await parameters.read_many((*names.tcal, *caltemps))
+    wanted = {name: before[name] if thermal.enabled_by else 0.0 for each in names.tcal_accel for name in each}
+    for of, curve in ((names.tcal_gyro, gyro), *(((names.tcal_accel, accel),) if accel is not None else ())):
         for each, values in zip(of, curve.coefficients[1:], strict=True):
             wanted |= zip(each, (value / _UNIT for value in values), strict=True)
-    wanted |= {names.low: gyro.low_degc, names.high: gyro.high_degc, names.enable: float(_ON)}
+    wanted |= {names.tcal_low: gyro.low_degc, names.tcal_high: gyro.high_degc, names.tcal_enable: float(_ON)}
     wanted |= dict.fromkeys(caltemps, degc)
 
     def moved(of: Names, offset: Vector, by: Vector) -> list[Change]:
@@ -176,9 +168,9 @@ async def thermal_changes(
 
     taken_gyro, taken_accel = thermal.taken_off(degc)
     changes = [
-        *moved(own.accel_offset, calibration.accel_offset_m_s2, vector(taken_accel)),
-        *moved(own.gyro_offset, calibration.gyro_offset_rad_s, vector(taken_gyro)),
+        *moved(names.accel_offset, calibration.accel_offset_m_s2, vector(taken_accel)),
+        *moved(names.gyro_offset, calibration.gyro_offset_rad_s, vector(taken_gyro)),
         # The switch comes last, and is restored first.
-        *(Change(name, before[name], wanted[name]) for name in (*caltemps, *names.deciding)),
+        *(Change(name, before[name], wanted[name]) for name in (*caltemps, *names.tcal)),
     ]
     return [change for change in changes if change.before != change.after]

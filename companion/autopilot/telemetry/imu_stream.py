@@ -44,7 +44,6 @@ _LOOK_S: Final = 0.25
 _TURN_S: Final = 1.0
 BEAT_WITHIN_S: Final = 20.0
 """A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
-_REFUSED: Final = -1
 _BESIDE_CONSOLE: Final = 0.85
 """Share of the rate that the bias' answers leave on a slow line."""
 _TEMPERATURE_RATE_HZ: Final = 2.0
@@ -104,8 +103,6 @@ class ImuStream:
         may_be_slow: Callable[[], bool] = lambda: True,
     ) -> None:
         """`may_be_slow`: whether the eleven samples a second of ArduPilot's script will do."""
-        self.kind: ImuMessage | None = None
-        """Kind of message that brings the samples; None while there are none."""
         self.samples = 0
         self._starting = f"waiting for the autopilot to start IMU {instance}"
         self.problem = self._starting
@@ -122,6 +119,11 @@ class ImuStream:
         self._reader = ImuSamples()
         self._restart = asyncio.Event()
         self._arrived = asyncio.Event()
+
+    @property
+    def kind(self) -> ImuMessage | None:
+        """Message that brings the samples; None while there are none."""
+        return None if self._current is None else self._current.message
 
     @property
     def wants_script(self) -> bool:
@@ -195,19 +197,19 @@ class ImuStream:
             for _ in range(_ASKS):
                 if self._restart.is_set() or source.refused or source.from_script:
                     break  # the script's take over as soon as they come
-                result = await self._ask(source)
-                if result != _REFUSED and await self._sends(source):
+                answered = await self._ask(source)
+                if await self._sends(source):
                     return source
                 if source.absent:
                     break
-                if result is None and source.rate + 1 < len(source.rates_hz):
+                if not answered and source.rate + 1 < len(source.rates_hz):
                     source.rate += 1  # the denial may have been lost or be late
         return None
 
-    async def _ask(self, source: _Source) -> int | None:
-        """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
+    async def _ask(self, source: _Source) -> bool:
+        """Request a message at the fastest rate that is not denied; return whether an answer came in time."""
         if source.from_script:
-            return None
+            return False
         while True:
             self.turns += 1
             rate_hz = source.rates_hz[source.rate]
@@ -220,18 +222,17 @@ class ImuStream:
                 source.rate, source.refused, source.reason = 0, True, "denied"
             elif result in (mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED):
                 source.refused, source.reason = True, "not supported"
-            return _REFUSED if source.refused else result
+            return result is not None
 
     async def _sends(self, source: _Source) -> bool:
-        """Wait for a sample of the source, `SILENCE_S` at most."""
+        """Wait for a sample of the source, `SILENCE_S` at most; False at once where it is refused."""
         loop = asyncio.get_running_loop()
-        deadline_s = loop.time() + SILENCE_S
         asked_s = loop.time()
-        while not self._restart.is_set() and not source.absent:
+        while not (self._restart.is_set() or source.absent or source.refused):
             if source.last_s >= asked_s or loop.time() - source.last_s < _LOOK_S:
                 return True
             self._arrived.clear()
-            if not await comes(self._arrived, deadline_s - loop.time()):
+            if not await comes(self._arrived, asked_s + SILENCE_S - loop.time()):
                 break
         return False
 
@@ -273,7 +274,8 @@ class ImuStream:
                     return
                 silent_asks += 1
                 asked_s = now_s
-                if await self._ask(source) == _REFUSED:
+                await self._ask(source)
+                if source.refused:
                     return
 
     def _better_than(self, source: _Source) -> _Source | None:
@@ -368,15 +370,13 @@ class ImuStream:
     def _switch(self, source: _Source | None) -> None:
         if source is self._current:
             return
-        self._current = source
-        kind = None
+        before, self._current = self.kind, source
         if source is not None:
-            self.problem, kind = "", source.message
-        if kind != self.kind:
-            self.kind = kind
-            if kind is not None:
-                logger.info("IMU %d: %s at up to %g Hz", self._instance, kind.name, self.rate_hz)
-            self._on_kind_change(kind)
+            self.problem = ""
+        if self.kind != before:
+            if self.kind is not None:
+                logger.info("IMU %d: %s at up to %g Hz", self._instance, self.kind.name, self.rate_hz)
+            self._on_kind_change(self.kind)
 
     def _why_none(self) -> str:
         ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]

@@ -52,7 +52,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     if not present:
         raise AutopilotError("the autopilot has no gyro offsets")
     found |= await parameters.read_many(name for names in present for name in names.gyro_offset[1:])
-    more = (name for names in present for name in (names.tcal.gyro_caltemp, names.gyro_id))
+    more = (name for names in present for name in (names.gyro_caltemp, names.gyro_id))
     found |= await parameters.read_many(more, optional=True)
     if vehicle.boots != boots:
         raise AutopilotRebootedError(f"{vehicle.name} restarted while its gyro parameters were read")
@@ -61,7 +61,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
 
 async def read_active_tcal(parameters: ParameterClient, values: Mapping[str, float]) -> list[str]:
     """Read which temperature calibrations are on: there the gyro calibration changes what an offset means."""
-    switches = [names.tcal.enable for names in _present(values)]
+    switches = [names.tcal_enable for names in _present(values)]
     return [name for name, value in (await parameters.read_many(switches, optional=True)).items() if value]
 
 

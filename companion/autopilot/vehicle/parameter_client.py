@@ -78,12 +78,19 @@ class _Inbox:
         self._items.append(item)
         self._arrived.set()
 
-    async def get(self, deadline_s: float) -> _Answer | AutopilotRebootedError | None:
-        """Return the next answer, or None at the deadline (loop's clock); cancelled tasks may wait here too."""
+    async def get(self, deadline_s: float) -> _Answer | None:
+        """Return the next answer, or None at the deadline (loop's clock); cancelled tasks may wait here too.
+
+        Raises:
+            AutopilotRebootedError: the autopilot restarted.
+        """
         if not self._items:
             self._arrived.clear()
             await comes(self._arrived, deadline_s - asyncio.get_running_loop().time())
-        return self._items.popleft() if self._items else None
+        answer = self._items.popleft() if self._items else None
+        if isinstance(answer, AutopilotRebootedError):
+            raise answer
+        return answer
 
 
 class ParameterClient:
@@ -210,7 +217,7 @@ class ParameterClient:
                 # Nothing may be awaited between the guard and this.
                 self.writes += self._link.send(message, self.vehicle.disarmed.proven)
                 deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
-                while (answer := await self._next(inbox, deadline_s)) is not None:
+                while (answer := await inbox.get(deadline_s)) is not None:
                     if isinstance(answer, str):
                         raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer}")
                     if answer == wanted if whole else same_float32(answer, wanted):
@@ -262,17 +269,11 @@ class ParameterClient:
     def _learn_loss(self, tries: int) -> None:
         self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
 
-    async def _next(self, inbox: _Inbox, deadline_s: float) -> _Answer | None:
-        answer = await inbox.get(deadline_s)
-        if isinstance(answer, AutopilotRebootedError):
-            raise answer
-        return answer
-
     async def _ask(self, inbox: _Inbox, name: str, index: int) -> _Answer | None:
         """One PARAM_REQUEST_READ and the first answer to it."""
         message = mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
         self._link.send(message)
-        answer = await self._next(inbox, asyncio.get_running_loop().time() + _TIMEOUT_S)
+        answer = await inbox.get(asyncio.get_running_loop().time() + _TIMEOUT_S)
         if isinstance(answer, float):
             self._answering = inbox.name if index < 0 else self._answering
         return answer

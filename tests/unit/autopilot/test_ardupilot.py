@@ -74,19 +74,19 @@ def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
     assert one.accel_offset[1] == "INS_ACCOFFS_Y"
     assert one.accel_scale[2] == "INS_ACCSCAL_Z"
     assert (one.gyro_id, one.accel_id, one.use) == ("INS_GYR_ID", "INS_ACC_ID", "INS_USE")
-    assert one.tcal.gyro_caltemp == "INS_GYR1_CALTEMP"
+    assert one.gyro_caltemp == "INS_GYR1_CALTEMP"
     assert two.gyro_offset[0] == "INS_GYR2OFFS_X"
     assert two.accel_offset[0] == "INS_ACC2OFFS_X"
     assert two.accel_scale[0] == "INS_ACC2SCAL_X"
     assert (two.gyro_id, two.accel_id, two.use) == ("INS_GYR2_ID", "INS_ACC2_ID", "INS_USE2")
-    assert (two.tcal.gyro_caltemp, two.tcal.enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
+    assert (two.gyro_caltemp, two.tcal_enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
     assert three.accel_offset[2] == "INS_ACC3OFFS_Z"
-    assert one.tcal.enable == "INS_TCAL1_ENABLE"
+    assert one.tcal_enable == "INS_TCAL1_ENABLE"
     four = parameters_of(4)
     assert four.gyro_offset == ("INS4_GYROFFS_X", "INS4_GYROFFS_Y", "INS4_GYROFFS_Z")
-    assert (four.gyro_id, four.tcal.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
+    assert (four.gyro_id, four.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
     for names in (one, two, three, four):
-        for name in (*names.gyro_offset, *names.accel_scale, names.tcal.enable):
+        for name in (*names.gyro_offset, *names.accel_scale, names.tcal_enable):
             assert len(name) <= 16
     with pytest.raises(AutopilotError, match="IMU 6"):
         parameters_of(6)
