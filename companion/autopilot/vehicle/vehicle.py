@@ -80,7 +80,7 @@ class Vehicle:
         self.system_status: int | None = None
         """MAV_STATE of the last heartbeat."""
         self.signs = False
-        """Its last heartbeat was signed (MAVLink 2)."""
+        """The autopilot signed its last heartbeat (MAVLink 2)."""
         self.boots = 0
         self.place = TimeAndPlace(is_carried)
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
