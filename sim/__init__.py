@@ -11,7 +11,7 @@ On the command line:
 
 In a test, on any event loop, also one whose clock jumps:
 
-    aircraft = VirtualAircraft(Pose(pitch_deg=5, roll_deg=-3, heading_deg=40), motions=[Knock(start_s=20)])
+    aircraft = VirtualAircraft(Pose(pitch_deg=5, roll_deg=-3, heading_deg=40), motions=[...])
     imu = ImuModel(aircraft, "icm42688p", seed=1, gyro_bias_rad_s=(5e-4, -3e-4, 8e-4))
     autopilot = ArduPilotDouble(aircraft, [imu])
     Wire(link, autopilot)                                # tests.support.wire
@@ -22,7 +22,7 @@ In a test, on any event loop, also one whose clock jumps:
 
     aircraft, motions    where and how it stands, what happens to it         earth       frames, gravity, Earth rate
     imu_model            noise and bias of named parts, true bias at hand    devices     frames of serial devices
-    pty_device           a device as a path that can be unplugged            autopilot, px4   the doubles
+    pty_device           a device as a path that can be unplugged            ardupilot, px4   the doubles
     scenario             ready-made worlds                                   station     a bare MAVLink peer
     sitl                 physics for real firmware binaries
 

@@ -29,9 +29,8 @@ from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
 from sim.serve import describe
-from sim.sitl.ports import free_udp_port
-from sim.station import Station
-from sim.udp import open_udp
+from sim.sitl.process import free_udp_port
+from sim.station import Station, open_udp
 
 RESIDUAL_GYRO_DEG_H: Final = 10.0
 RESIDUAL_ACCEL_MG: Final = 0.3

@@ -268,7 +268,8 @@ class ImuModel:
         """What it makes of the temperature; bad ones may be put in its place."""
         gyro, accel = self.spec.gyro, self.spec.accel
         self.curve = curve or Curve((np.repeat([gyro.per_kelvin, accel.per_kelvin], 3),))
-        self._white = np.repeat([gyro.white, accel.white], 3)
+        self.white: Array = np.repeat([gyro.white, accel.white], 3)
+        """N of the six axes: three in rad/s * sqrt(s), three in m/s^2 * sqrt(s)."""
         self._limit = np.repeat([gyro.limit, accel.limit], 3)
         self._slow = _SlowPath(
             np.repeat([gyro.flicker, accel.flicker], 3), np.repeat([gyro.walk, accel.walk], 3), [seed, 1]
@@ -295,11 +296,6 @@ class ImuModel:
         """Let go of the bias before a time: an hour of it is 1.7 MB."""
         self._slow.forget_before(t_s)
 
-    @property
-    def white(self) -> Array:
-        """N of the six axes: three in rad/s * sqrt(s), three in m/s^2 * sqrt(s)."""
-        return self._white
-
     def temperature_degc(self, t_s: float) -> float:
         """What its own thermometer says."""
         return self.thermometer(self.aircraft.temperature_degc(t_s))
@@ -325,14 +321,6 @@ class ImuModel:
         result: Array = self._accel_matrix @ force_m_s2
         return result
 
-    def error_in_vehicle(self, t_s: float) -> Bias:
-        """All of the reading that is not truth, scale and misalignment included, without noise, in vehicle FRD."""
-        expected, truth = self.expected(t_s), self.aircraft.truth_at(t_s)
-        return Bias(
-            self.mounting @ expected[:3] - truth.rate_rad_s,
-            self.mounting @ expected[3:] - truth.force_m_s2,
-        )
-
     def expected(self, t_s: float) -> Array:
         """The reading without noise, rounding and limit: three rates, three specific forces."""
         truth = self.aircraft.truth_at(t_s)
@@ -355,7 +343,7 @@ class ImuModel:
         White noise is drawn in the order of reading, so one model has one reader; the bias does not care.
         """
         out = self.expected_block(t_s)
-        out += self._draw(len(t_s)) * (self._white / math.sqrt(interval_s))
+        out += self._draw(len(t_s)) * (self.white / math.sqrt(interval_s))
         for part, triad in ((out[:, :3], self.spec.gyro), (out[:, 3:], self.spec.accel)):
             if triad.step > 0.0:
                 np.rint(part / triad.step, out=part)

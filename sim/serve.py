@@ -17,13 +17,23 @@ from pathlib import Path
 from sim.accuracy import cli as accuracy
 from sim.aircraft import Pose
 from sim.devices import SerialDevice
-from sim.families import COMPASSES, GRADIENTERS, IMUS, Devices, fit
 from sim.hands import HELP, PLACEMENT_DEG, PROPPED_DEG, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
+from sim.motions import MOTIONS, TURN_DEG_S, motions_of
 from sim.pty_device import PtyDevice
-from sim.scenario import DEMO_DEVICES, DEMO_POSE, GRADIENTER_OFFSET_DEG, Scenario, demo
-from sim.sea import MOTIONS, TURN_DEG_S, motions_of
-from sim.udp import open_udp
+from sim.scenario import (
+    COMPASSES,
+    DEMO_DEVICES,
+    DEMO_POSE,
+    GRADIENTER_OFFSET_DEG,
+    GRADIENTERS,
+    IMUS,
+    Devices,
+    Scenario,
+    demo,
+    fit,
+)
+from sim.station import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
 _PROFILES = {"white_only": "icm42688p", "perfect": "icm42688p"}

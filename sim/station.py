@@ -1,12 +1,85 @@
-"""A bare MAVLink station that remembers everything: for tests of the simulator and for trying things by hand."""
+"""A bare MAVLink station that remembers everything, and UDP for it and the doubles.
+
+A double on UDP looks as a real autopilot's telemetry port or SITL's `--serial0 udpclient:` does to a companion.
+"""
 
 from __future__ import annotations
 
 import asyncio
+from bisect import bisect_left
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Protocol, TypeVar, cast
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+MAX_QUEUED_BYTES = 65536
+"""More than this in the send buffer and packets are dropped, newest first."""
+
+
+class End(Protocol):
+    """What can be put on UDP: the double, its `ground`."""
+
+    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
+        """Take the function that sends."""
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Take what came."""
+
+
+class UdpEnd(asyncio.DatagramProtocol):
+    """Joins an `End` to a socket: sends to a fixed target, or to whoever spoke last."""
+
+    def __init__(self, end: End, target: tuple[str, int] | None) -> None:
+        self._end, self._target, self._peer = end, target, target
+        self._transport: asyncio.DatagramTransport | None = None
+        self.dropped = 0
+        self.local: tuple[str, int] = ("", 0)
+        """The address the socket has."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Plug the end in."""
+        self._transport = cast("asyncio.DatagramTransport", transport)
+        self.local = transport.get_extra_info("sockname")[:2]
+        self._end.attach(self._send)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Pull the end out."""
+        self._end.attach(None)
+        self._transport = None
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Give bytes to the end."""
+        if self._target is None:
+            self._peer = addr
+        self._end.receive(data, asyncio.get_running_loop().time())
+
+    def error_received(self, exc: Exception) -> None:
+        """Nobody listens yet: go on sending."""
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._transport is not None:
+            self._transport.close()
+
+    def _send(self, data: bytes) -> None:
+        if self._transport is None or self._peer is None:
+            return
+        writing = cast("asyncio.WriteTransport", self._transport)  # typeshed forgot the method on datagrams
+        if writing.get_write_buffer_size() > MAX_QUEUED_BYTES:
+            self.dropped += 1
+            return
+        self._transport.sendto(data, self._peer)
+
+
+async def open_udp(end: End, *, target: tuple[str, int] | None = None, listen: tuple[str, int] | None = None) -> UdpEnd:
+    """Put an end on UDP: send to `target` from any free port, or listen and answer whoever spoke last."""
+    if (target is None) == (listen is None):
+        raise ValueError("give either a target to send to or an address to listen on")
+    loop = asyncio.get_running_loop()
+    local = listen if listen is not None else ("127.0.0.1" if target and target[0] == "127.0.0.1" else "0.0.0.0", 0)  # noqa: S104
+    _, protocol = await loop.create_datagram_endpoint(lambda: UdpEnd(end, target), local_addr=local)
+    return protocol
+
 
 M = TypeVar("M", bound=mavlink.MAVLink_message)
 
@@ -36,13 +109,14 @@ class Station:
         if self._transmit is not None:
             self._transmit(data)
 
+    def timed(self, kind: type[M], *, since_s: float = 0.0) -> list[tuple[float, M]]:
+        """Messages of a kind with their times, oldest first."""
+        first = bisect_left(self.heard, since_s, key=lambda entry: entry[0])
+        return [(t_s, message) for t_s, message in self.heard[first:] if isinstance(message, kind)]
+
     def all(self, kind: type[M], *, since_s: float = 0.0) -> list[M]:
         """Messages of a kind, oldest first."""
-        return [message for t_s, message in self.heard if t_s >= since_s and isinstance(message, kind)]
-
-    def timed(self, kind: type[M], *, since_s: float = 0.0) -> list[tuple[float, M]]:
-        """The same with times."""
-        return [(t_s, message) for t_s, message in self.heard if t_s >= since_s and isinstance(message, kind)]
+        return [message for _, message in self.timed(kind, since_s=since_s)]
 
     def texts(self) -> list[str]:
         """STATUSTEXT, chunk by chunk."""

@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.devices import ImuLine, SerialDevice, VectorNavBinary
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
-from sim.udp import open_udp
+from sim.station import open_udp
 
 SECONDS: Final = 180.0
 """Of the IMU's frames, made beforehand."""

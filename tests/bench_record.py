@@ -25,7 +25,7 @@ from companion.estimation.request import What
 from companion.storage.state import write_atomically
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario
-from sim.udp import UdpEnd
+from sim.station import UdpEnd
 from tests.bench_memory import daemon, last_reply, status_when
 from tests.support.live_aircraft import live_aircraft
 from tests.support.rig import Rig

@@ -29,9 +29,8 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, ImuModel
-from sim.motions import Motion, SlowTurn
+from sim.motions import DAY_S, SWELL, Motion, Sea, SlowTurn, Wave
 from sim.scenario import site_at
-from sim.sea import DAY_S, SWELL, Sea, Wave
 
 RATE_HZ: Final = 200
 TILT_HZ: Final = 10

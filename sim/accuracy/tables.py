@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from sim.accuracy import by_hand, deck, mid_warm_up, temperature, turning, warmup
+from sim.accuracy import by_hand, deck, temperature, turning, warmup
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -105,13 +105,13 @@ def _by_temperature(
         each = max(runs // 20, 1)
         progress(f"power-up: {each} aircraft of each of {len(temperature.TRIED)} parts")
         days = [(part, seed, number) for part in temperature.TRIED for number in range(each)]
-        found["power-up"] = temperature.section(many(temperature.power_up, days, jobs), each)
+        found["power-up"] = temperature.power_up_section(many(temperature.power_up, days, jobs), each)
     if "mid-warm-up" in only:
         each = max(runs // 20, 1)
         progress(f"mid-warm-up: {each} aircraft of each of {len(temperature.TRIED)} parts and rates")
-        rates = mid_warm_up.RATES_K_MIN
+        rates = temperature.RATES_K_MIN
         wanted = [(part, rate, seed, k) for part in temperature.TRIED for rate in rates for k in range(each)]
-        found["mid-warm-up"] = mid_warm_up.section(many(mid_warm_up.mid_warm_up, wanted, jobs), each)
+        found["mid-warm-up"] = temperature.mid_warm_up_section(many(temperature.mid_warm_up, wanted, jobs), each)
     return found
 
 

@@ -9,11 +9,9 @@ from typing import Literal, Protocol
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
-from sim.ardupilot.calibrations import Calibrations
 from sim.ardupilot.estimator import CoarseEstimator
-from sim.ardupilot.inertial import InertialPath
-from sim.ardupilot.parameters import ParameterStore, default_parameters
-from sim.ardupilot.versions import NEWEST, Version, since
+from sim.ardupilot.inertial import Calibrations, InertialPath
+from sim.ardupilot.parameters import NEWEST, ParameterStore, Version, default_parameters, since
 from sim.earth import Array
 from sim.firmware.channel import Channel, Stream
 from sim.firmware.double import AutopilotDouble
@@ -44,7 +42,7 @@ class Board(AutopilotDouble):
         aircraft: the truth.
         imus: one to three models; the first is IMU 1. Their `mounting_deg` is how the board is really turned, which
             AHRS_ORIENTATION (default none) is meant to undo.
-        version: "4.3" to "4.8"; `sim.ardupilot.versions` says how they differ.
+        version: "4.3" to "4.8"; `sim.ardupilot.parameters` says how they differ.
         vehicle: "copter" (loop 400 Hz) or "plane" (50 Hz: nothing above 40 Hz).
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
         up_s: how long it has been running when the simulation begins.

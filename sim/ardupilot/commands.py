@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import Board
-from sim.ardupilot.calibrations import AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
+from sim.ardupilot.inertial import AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
 from sim.ardupilot.messages import BUILDERS
-from sim.ardupilot.versions import Version, since
-from sim.firmware.command import Command
+from sim.ardupilot.parameters import Version, since
+from sim.firmware.channel import Command
 
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_ACCEPTED,

@@ -8,11 +8,12 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import Board
-from sim.ardupilot.versions import NEWEST
-from sim.earth import STANDARD_GRAVITY_M_S2
+from sim.ardupilot.parameters import NEWEST
 from sim.firmware.messages import (
+    SCALED_IMU,
     global_position_int,
     gps_raw_int,
+    in_integers,
     magnetic_body,
     pressure_hpa,
     sys_status,
@@ -52,11 +53,8 @@ def _integers(double: Board, index: int, loop_s: float) -> tuple[int, ...]:
     mx, my, mz = (truncated_16(float(value)) for value in magnetic_body(double, t_s))
     if index >= len(double.imus):
         return (0, 0, 0, 0, 0, 0, mx, my, mz, 0)  # the trap of SCALED_IMU3: sent, with a compass and no IMU
-    output = double.imu_output(index, loop_s)
-    milli_g = [truncated_16(float(value) * 1000.0 / STANDARD_GRAVITY_M_S2) for value in output[3:]]
-    milli_rad = [truncated_16(float(value) * 1000.0) for value in output[:3]]
     temperature = truncated_16(double.imus[index].temperature_degc(t_s) * 100.0)
-    return (*milli_g, *milli_rad, mx, my, mz, temperature)
+    return (*in_integers(double.imu_output(index, loop_s)), mx, my, mz, temperature)
 
 
 def raw_imu(double: Board, loop_s: float) -> Message:
@@ -67,19 +65,9 @@ def raw_imu(double: Board, loop_s: float) -> Message:
     )
 
 
-def scaled_imu(double: Board, loop_s: float) -> Message:
-    """SCALED_IMU, first IMU."""
-    return mavlink.MAVLink_scaled_imu_message(double.boot_ms(loop_s), *_integers(double, 0, loop_s))
-
-
-def scaled_imu2(double: Board, loop_s: float) -> Message:
-    """SCALED_IMU2, second IMU."""
-    return mavlink.MAVLink_scaled_imu2_message(double.boot_ms(loop_s), *_integers(double, 1, loop_s))
-
-
-def scaled_imu3(double: Board, loop_s: float) -> Message:
-    """SCALED_IMU3, third IMU, all zero if there is none."""
-    return mavlink.MAVLink_scaled_imu3_message(double.boot_ms(loop_s), *_integers(double, 2, loop_s))
+def scaled_imu(double: Board, loop_s: float, index: int) -> Message:
+    """SCALED_IMU, 2, 3; the third is all zero if there is none."""
+    return SCALED_IMU[index](double.boot_ms(loop_s), *_integers(double, index, loop_s))
 
 
 def attitude(double: Board, loop_s: float) -> Message:
@@ -149,13 +137,13 @@ BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: scaled_imu,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda double, loop_s: scaled_imu(double, loop_s, 0),
     mavlink.MAVLINK_MSG_ID_RAW_IMU: raw_imu,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: attitude,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: scaled_imu2,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU3: scaled_imu3,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: lambda double, loop_s: scaled_imu(double, loop_s, 1),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU3: lambda double, loop_s: scaled_imu(double, loop_s, 2),
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
     mavlink.MAVLINK_MSG_ID_AHRS: ahrs,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status_report,

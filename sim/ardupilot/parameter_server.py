@@ -7,10 +7,9 @@ import math
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import Board
-from sim.ardupilot.versions import since
-from sim.firmware.channel import Channel
+from sim.ardupilot.parameters import since
+from sim.firmware.channel import Channel, Write
 from sim.firmware.faults import names_match
-from sim.firmware.writes import Write
 
 NO_INDEX = 65535
 LIST_PERIOD_S = 0.00176

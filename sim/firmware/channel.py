@@ -1,4 +1,7 @@
-"""One MAVLink port of a double: its own sequence numbers, streams and bytes. When streams are due is the firmware's."""
+"""A MAVLink port of a double (sequence numbers, streams, bytes), and what arrives at it: commands and writes.
+
+When streams are due is the firmware's own.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import abc
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -112,3 +116,38 @@ class Channel(abc.ABC):
     def next_due_s(self) -> float | None:
         """When the next stream wants to be sent."""
         return min((stream.next_s for stream in self.streams.values()), default=None)
+
+
+class Command(NamedTuple):
+    """COMMAND_LONG or COMMAND_INT, and where to answer."""
+
+    channel: Channel
+    number: int
+    params: tuple[float, ...]
+    system_id: int
+    component_id: int
+    loop_s: float
+
+
+def command_of(
+    channel: Channel, message: mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message, loop_s: float
+) -> Command:
+    """The common content of the two kinds; in COMMAND_INT x, y, z are params 5 to 7."""
+    first = (message.param1, message.param2, message.param3, message.param4)
+    if isinstance(message, mavlink.MAVLink_command_int_message):
+        params = (*first, float(message.x), float(message.y), message.z)
+    else:
+        params = (*first, message.param5, message.param6, message.param7)
+    return Command(channel, message.command, params, message.get_srcSystem(), message.get_srcComponent(), loop_s)
+
+
+class Write(NamedTuple):
+    """One PARAM_SET as it arrived: the independent witness of what the companion wrote, and when."""
+
+    t_s: float
+    """The loop's clock."""
+    name: str
+    value: float
+    armed: bool
+    system_id: int
+    component_id: int

@@ -12,9 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.firmware.buzzer import Buzzer
-from sim.firmware.channel import Channel, Message
+from sim.firmware.channel import Channel, Message, Write
 from sim.firmware.faults import Faults
-from sim.firmware.writes import Write
 from sim.imu_model import Bias, ImuModel
 
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT

@@ -7,12 +7,25 @@ from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.earth import Array
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.firmware.numbers import truncated_16
 
 if TYPE_CHECKING:
     from sim.firmware.double import AutopilotDouble
 
 Message = mavlink.MAVLink_message
+SCALED_IMU = (
+    mavlink.MAVLink_scaled_imu_message,
+    mavlink.MAVLink_scaled_imu2_message,
+    mavlink.MAVLink_scaled_imu3_message,
+)
+"""By number of the IMU."""
+
+
+def in_integers(output: Array) -> list[int]:
+    """The fields xacc to zgyro of rates and specific forces (6): mG and mrad/s, cut toward zero."""
+    milli_g = output[3:] * (1000.0 / STANDARD_GRAVITY_M_S2)
+    return [truncated_16(float(value)) for value in (*milli_g, *output[:3] * 1000.0)]
 
 
 def pressure_hpa(double: AutopilotDouble) -> float:

@@ -1,8 +1,13 @@
-"""Numbers as small computers make them."""
+"""Numbers as small computers make them, and the numbered board orientations that both firmwares share with MAVLink."""
 
 from __future__ import annotations
 
 import struct
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.earth import Array, mounting_matrix
 
 
 def float32(value: float) -> float:
@@ -13,3 +18,21 @@ def float32(value: float) -> float:
 def truncated_16(value: float) -> int:
     """A C conversion of float to int16: toward zero; what does not fit is cut at the ends."""
     return int(max(-32768.0, min(32767.0, value)))
+
+
+_FINE_DEG = {68.0: 68.8, 293.0: 293.3}
+_PREFIX = "MAV_SENSOR_ROTATION_"
+_NOT_IN_MAVLINK = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
+
+
+def rotation_matrix(number: int) -> Array:
+    """Board to vehicle for a MAV_SENSOR_ORIENTATION below 100; unknown numbers are none."""
+    if number in _NOT_IN_MAVLINK:
+        return mounting_matrix(*_NOT_IN_MAVLINK[number])
+    entry = mavlink.enums["MAV_SENSOR_ORIENTATION"].get(number)
+    if entry is None or number >= 100:
+        return np.eye(3)
+    words = entry.name.removeprefix(_PREFIX).split("_")
+    angles = {word: float(value) for word, value in zip(words[0::2], words[1::2], strict=False)}
+    roll, pitch, yaw = (_FINE_DEG.get(angle, angle) for angle in (angles.get(w, 0.0) for w in ("ROLL", "PITCH", "YAW")))
+    return mounting_matrix(roll, pitch, yaw)

@@ -13,13 +13,11 @@ from typing import Self
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.flying.truth import FlyingAircraft, State
-from sim.flying.vehicle import FlyingVehicle
+from sim.flying.vehicle import FlyingAircraft, FlyingVehicle, State
 from sim.scenario import Scenario
 from sim.sitl.ardupilot import AXES, ArduPilot
 from sim.sitl.ground import GroundStation
-from sim.sitl.ports import LOOPBACK, port_free
-from sim.sitl.process import BinaryError, FirmwareProcess
+from sim.sitl.process import LOOPBACK, BinaryError, FirmwareProcess, port_free
 
 RIDER_PORT = 9012
 """Where a SITL that is told of one slave waits for it (SIM_JSON_Master.cpp); it cannot be told another."""

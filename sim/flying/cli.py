@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sim.flying.faults import FAULTS
-from sim.flying.flight import SET_UPS, WATCHED_S, Plan, SetUp, flying
+from sim.flying.flight import FAULTS, SET_UPS, WATCHED_S, Plan, SetUp, flying
 from sim.flying.verdict import HEADER, Figures, Record, figures, row, summary
 from sim.sitl.process import BinaryError
 
@@ -29,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--fault", choices=tuple(FAULTS), action="append", default=[],
         help="what happens (default: each of them); may be repeated: "
-        + "; ".join(f"{name}: {fault.words}" for name, fault in FAULTS.items()),
+        + "; ".join(f"{name}: {words}" for name, (words, _) in FAULTS.items()),
     )  # fmt: skip
     command.add_argument(
         "--set-up", choices=tuple(SET_UPS), action="append", default=[],

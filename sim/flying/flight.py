@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import shutil
 import signal
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,20 +15,15 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.companion_process import CompanionProcess
-from sim.devices import SerialDevice
 from sim.earth import Array
 from sim.flying.ardupilot import FlyingArduPilot
-from sim.flying.faults import FAULTS
 from sim.flying.px4 import FlyingPx4
-from sim.flying.truth import FlyingAircraft
-from sim.flying.vehicle import FlyingVehicle
+from sim.flying.vehicle import FlyingAircraft, FlyingVehicle
 from sim.flying.verdict import Event, Record
-from sim.imu_model import ImuModel
 from sim.scenario import demo, site_at
 from sim.serve import configuration
-from sim.sitl.daemon import READY_WITHIN_S, devices
+from sim.sitl.daemon import READY_WITHIN_S, LossyLink, devices
 from sim.sitl.ground import GroundStation
-from sim.sitl.lossy_link import LossyLink
 from sim.sitl.residuals import ground_station
 
 SetUp = Literal["script", "command", "today", "px4"]
@@ -57,6 +52,12 @@ HANGS_S = 0.3
 """A daemon cannot tell a firmware or a bench that this machine lets wait for so long from the fault of a flight."""
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
 """The pilot turns it about, with the fault in force."""
+DRIFT_DEG_S = 3.0
+LIE_DEG = 40.0
+STEP_S = 0.05
+POWERLESS_S = 20.0
+RESTARTED_AFTER_S = 1.0
+"""What a service manager waits before it starts the daemon anew."""
 OTHER_SETS = ("EK3_SRC2", "EK3_SRC3")
 SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
 
@@ -90,16 +91,6 @@ class Flight:
         """The longest time without news of the firmware since the watch began."""
         self._stack = contextlib.AsyncExitStack()
         self.daemon: CompanionProcess
-
-    @property
-    def compass(self) -> SerialDevice:
-        """The companion's."""
-        return self.vehicle.scenario.compass
-
-    @property
-    def serial_imu(self) -> ImuModel:
-        """The companion's."""
-        return self.vehicle.scenario.serial_imu
 
     def signal(self, number: signal.Signals) -> None:
         """To the daemon, if there is one."""
@@ -188,7 +179,7 @@ class Flight:
         await self.pushed()
         begun_s, record.struck_s = asyncio.get_running_loop().time(), vehicle.truth.own_s
         self.in_background(self._watch())
-        await FAULTS[self.plan.fault].strike(self)
+        await FAULTS[self.plan.fault][1](self)
         await vehicle.sleep(TURNS_AFTER_S)
         await vehicle.turn(ground, TURN_DEG)
         await vehicle.sleep(self.plan.watched_s - TURNS_AFTER_S)
@@ -226,6 +217,80 @@ class Flight:
         record.events = events_of(ground, self._since_s, lambda t_s: _at(t_s, arrived, record.estimate[:, 0]))
         record.events += self.vehicle.source_changes()
         record.events.sort()
+
+
+async def _kill(on: Flight) -> None:
+    on.signal(signal.SIGKILL)
+
+
+async def _stop(on: Flight) -> None:
+    on.signal(signal.SIGSTOP)
+
+
+async def _cut(on: Flight) -> None:
+    on.link.loss = 1.0
+
+
+async def _gyro_drifts(on: Flight) -> None:
+    imu = on.vehicle.scenario.serial_imu
+    gyro, accel = imu.true_bias(on.vehicle.now_s)
+    imu.turn_on(gyro + np.radians([0.0, 0.0, DRIFT_DEG_S]), accel)
+
+
+async def _compass_drifts(on: Flight) -> None:
+    async def drift() -> None:
+        while True:
+            _turn_compass(on, DRIFT_DEG_S * STEP_S)
+            await asyncio.sleep(STEP_S)
+
+    on.in_background(drift())
+
+
+async def _compass_lies(on: Flight) -> None:
+    _turn_compass(on, LIE_DEG)
+
+
+def _turn_compass(on: Flight, degrees: float) -> None:
+    device: Any = on.vehicle.scenario.compass
+    device.heading_error_deg += degrees
+
+
+def _killed_for(seconds: float) -> Strike:
+    async def strike(on: Flight) -> None:
+        on.signal(signal.SIGKILL)
+
+        async def comes_back() -> None:
+            await asyncio.sleep(seconds)
+            await on.start_daemon()
+
+        on.in_background(comes_back())
+
+    return strike
+
+
+async def _own_compass_lies(on: Flight) -> None:
+    await on.vehicle.lie_with_own_compass(on.ground)
+    on.signal(signal.SIGKILL)
+
+
+async def _nothing(on: Flight) -> None:
+    pass
+
+
+Strike = Callable[[Flight], Awaitable[None]]
+FAULTS: dict[str, tuple[str, Strike]] = {
+    "none": ("nothing happens", _nothing),
+    "kill": ("kill -9 of the daemon", _kill),
+    "stop": ("SIGSTOP: the daemon hangs", _stop),
+    "cable": ("its cable to the autopilot is out", _cut),
+    "gyro-drift": (f"its gyro about z begins to read {DRIFT_DEG_S:g} deg/s too much", _gyro_drifts),
+    "compass-drift": (f"its compass turns by {DRIFT_DEG_S:g} deg/s", _compass_drifts),
+    "compass-lies": (f"its compass lies by {LIE_DEG:g} deg", _compass_lies),
+    "own-compass": ("the autopilot's own compass is turned by 45 deg, and then kill -9", _own_compass_lies),
+    "restart": (f"kill -9 of the daemon, started anew after {RESTARTED_AFTER_S:g} s", _killed_for(RESTARTED_AFTER_S)),
+    "board": (f"its board has no power, and starts again after {POWERLESS_S:g} s", _killed_for(POWERLESS_S)),
+}
+"""What happens, in words, and how."""
 
 
 def is_ours(texts: Sequence[str]) -> bool:

@@ -8,7 +8,6 @@ import math
 import random
 import re
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from sim.aircraft import Site
 from sim.earth import STANDARD_GRAVITY_M_S2
-from sim.flying.truth import FlyingAircraft, State
-from sim.flying.vehicle import FlyingVehicle
+from sim.flying.vehicle import FlyingAircraft, FlyingVehicle, State
 from sim.flying.verdict import Event
 from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
-from sim.sitl.ports import LOOPBACK
-from sim.sitl.process import BinaryError, FirmwareProcess
+from sim.sitl.process import LOOPBACK, BinaryError, FirmwareProcess
 from sim.sitl.px4 import Px4
-from sim.udp import open_udp
+from sim.station import Station, open_udp
 
 MAGNETOMETER = {"cs_mag_hdg", "cs_mag_3d"}
 AUTO, LOITER = 4, 3
@@ -43,38 +40,35 @@ FORCE_OVER = 25
 """Steps over which velocities, told in whole cm/s, are compared."""
 
 
-class Truth:
+class Truth(Station):
     """Takes HIL_STATE_QUATERNION of SIH for an aircraft: rates from attitudes, forces from velocities."""
 
     def __init__(self, aircraft: FlyingAircraft, system_id: int) -> None:
+        super().__init__(system_id, mavlink.MAV_COMP_ID_USER2)
         self.boots = 0
         self._aircraft, self._system_id = aircraft, system_id
-        self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_USER2)
-        self._codec.robust_parsing = True
-        self._transmit: Callable[[bytes], None] | None = None
         self._asked_s = -math.inf
         self._before: tuple[float, Rotation] | None = None
         self._velocities: deque[tuple[float, float, float, float]] = deque(maxlen=FORCE_OVER)
         self._start: tuple[float, float, float] | None = None
 
-    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Where it sends."""
-        self._transmit = transmit
-
     def receive(self, data: bytes, t_s: float) -> None:
-        """What came; it is asked for oftener, now and then."""
-        for message in self._codec.parse_buffer(data) or ():
+        """Take what came, and keep nothing; it is asked for oftener, now and then."""
+        super().receive(data, t_s)
+        for _, message in self.heard:
             if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
                 state = self.state(message)
                 if state is not None:
                     self._aircraft.take(state, t_s)
-        if self._transmit is not None and t_s - self._asked_s > ASKED_EVERY_S:
+        self.heard.clear()
+        if t_s - self._asked_s > ASKED_EVERY_S:
             self._asked_s = t_s
             number, rate = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 1e6 / TRUTH_HZ
-            command = mavlink.MAVLink_command_long_message(
-                self._system_id, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, rate, *[0.0] * 5
+            self.send(
+                mavlink.MAVLink_command_long_message(
+                    self._system_id, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, rate, *[0.0] * 5
+                )
             )
-            self._transmit(command.pack(self._codec))
 
     def state(self, told: mavlink.MAVLink_hil_state_quaternion_message) -> State | None:
         """The next one; None for the first after a start, and for what is out of order."""

@@ -11,8 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.aircraft import VirtualAircraft
 from sim.firmware.double import AutopilotDouble
 from sim.imu_model import Bias, ImuModel
-from sim.px4.defaults import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, default_parameters
-from sim.px4.parameters import ParameterStore
+from sim.px4.parameters import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, ParameterStore, default_parameters
 from sim.px4.port import NORMAL_RATES, ONBOARD_RATES, PX4Port
 from sim.px4.vehicle_imu import Sample, VehicleImu
 
@@ -92,8 +91,6 @@ class Board(AutopilotDouble):
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
         self.console = console
-        self.timesync_answers = 0
-        """Answers to its own TIMESYNC requests."""
         ids = [EXTERNAL_IDS[n] if n in external else SIMULATED_IDS[n] for n in range(len(imus))]
         table = default_parameters()
         self.parameters = self._new_store(table, parameters or {}, ids, slots or range(len(imus)))

@@ -14,9 +14,8 @@ from typing import Literal
 import numpy as np
 
 from sim.earth import Array, mounting_matrix
-from sim.firmware.rotations import rotation_matrix
-from sim.px4.defaults import SLOTS
-from sim.px4.parameters import ParameterStore
+from sim.firmware.numbers import rotation_matrix
+from sim.px4.parameters import SLOTS, ParameterStore
 
 Kind = Literal["GYRO", "ACC"]
 _PRIORITY, _EXTERNAL_PRIORITY = 50, 75

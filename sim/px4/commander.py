@@ -11,13 +11,12 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.firmware.command import Command
-from sim.px4.arm_authorization import ArmAuthorization
+from sim.firmware.channel import Command
+from sim.px4.arming import NOT_AUTHORIZED, ArmAuthorization, Checks
 from sim.px4.board import Board
-from sim.px4.calibrations import Calibrations
-from sim.px4.checks import NOT_AUTHORIZED, Checks
 from sim.px4.messages import BUILDERS
-from sim.px4.port import HEARTBEAT, PX4Port
+from sim.px4.port import HEARTBEAT
+from sim.px4.rivals import Calibrations
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_ACCEPTED,
@@ -211,9 +210,3 @@ class Commander:
             return DENIED
         self._double.later(REBOOT_DELAY_S, lambda: self._double.reboot(DOWN_S))
         return ACCEPTED
-
-
-def heard_ground_station(port: PX4Port, message: mavlink.MAVLink_heartbeat_message, loop_s: float) -> None:
-    """Remember when a ground station's HEARTBEAT came."""
-    if message.type == mavlink.MAV_TYPE_GCS:
-        port.gcs_heard_s = loop_s

@@ -15,22 +15,18 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.earth import Array
-from sim.firmware.channel import Channel, Message
-from sim.firmware.command import command_of
+from sim.firmware.channel import Channel, Message, Write, command_of
 from sim.firmware.faults import Faults
-from sim.firmware.writes import Write
 from sim.imu_model import ImuModel
-from sim.px4.arm_authorization import ArmAuthorization
+from sim.px4.arming import ArmAuthorization, Checks
 from sim.px4.board import Board
-from sim.px4.calibrations import Calibrations
-from sim.px4.changes import Consumer
-from sim.px4.checks import Checks
-from sim.px4.commander import Commander, heard_ground_station
+from sim.px4.commander import Commander
 from sim.px4.external_vision import ExternalVision
 from sim.px4.messages import BUILDERS
 from sim.px4.parameter_server import ParameterServer
+from sim.px4.parameters import Consumer
 from sim.px4.port import PX4Port
-from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, LearnedOffsets
+from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, Calibrations, LearnedOffsets
 from sim.px4.shell import Shell
 
 __all__ = ["Applied", "Faults", "PX4Double", "Write"]
@@ -93,10 +89,6 @@ class PX4Double(Board):
     def parameter(self, name: str) -> float:
         """What is read back; KeyError if there is none of that name."""
         return self.parameters[name]
-
-    def saved_parameter(self, name: str) -> float:
-        """What the next boot will find; KeyError if there is none of that name."""
-        return self.parameters.saved[name]
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set without telling anyone, as if it had always been so: in use at once, whatever the threshold."""
@@ -237,8 +229,7 @@ class PX4Double(Board):
         forward(self.system_id, self.ports, channel, message, heartbeats=bool(self.parameters["MAV_HB_FORW_EN"]))
         self._parameter_message(channel, message, loop_s)
         if isinstance(message, mavlink.MAVLink_heartbeat_message):
-            heard_ground_station(channel, message, loop_s)
-            self._voice.go_on(channel)
+            self._voice.heard(channel, message, loop_s)
         elif isinstance(message, mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message):
             if is_for_us(self.system_id, message, broadcast=True):
                 self.commander.handle(command_of(channel, message, loop_s))
@@ -255,22 +246,19 @@ class PX4Double(Board):
                 now_ns = self.boot_us(loop_s) * 1000
                 self.answer(channel, mavlink.MAVLink_timesync_message(now_ns, message.ts1))
             else:
-                self.timesync_answers += 1
                 self.vision.timesync(message.tc1, message.ts1, loop_s)
         else:
             self.vision.take(message, loop_s)
 
     def _parameter_message(self, port: PX4Port, message: Message, loop_s: float) -> None:
+        if not is_for_us(self.system_id, message, broadcast=False):
+            return
         server = self._parameter_server
         if isinstance(message, mavlink.MAVLink_param_set_message):
-            if is_for_us(self.system_id, message, broadcast=False):
-                server.set(port, message, loop_s)
+            server.set(port, message, loop_s)
         elif isinstance(message, mavlink.MAVLink_param_request_read_message):
-            if is_for_us(self.system_id, message, broadcast=False):
-                server.read(port, message)
-        elif isinstance(message, mavlink.MAVLink_param_request_list_message) and is_for_us(
-            self.system_id, message, broadcast=False
-        ):
+            server.read(port, message)
+        elif isinstance(message, mavlink.MAVLink_param_request_list_message):
             server.list_all(port)
 
 
@@ -319,6 +307,12 @@ class Voice:
         for port in self._double.ports:
             port.texts.append((now_s, severity, text))
             self.go_on(port)
+
+    def heard(self, port: PX4Port, message: mavlink.MAVLink_heartbeat_message, loop_s: float) -> None:
+        """Remember when a ground station's HEARTBEAT came, and go on."""
+        if message.type == mavlink.MAV_TYPE_GCS:
+            port.gcs_heard_s = loop_s
+        self.go_on(port)
 
     def go_on(self, port: PX4Port) -> None:
         """Send the next text if its time has come: 20 a second."""

@@ -40,8 +40,6 @@ class ExternalVision:
         """By reason."""
         self.consumed = 0
         """Messages whose orientation came through to EKF2."""
-        self.resets = 0
-        """Of yaw to what came from outside."""
         self.sigma_rad = math.nan
         """Of yaw, as EKF2 took it last."""
         self.late_s = math.nan
@@ -126,7 +124,6 @@ class ExternalVision:
             self._reset(wrong, loop_s)
 
     def _reset(self, wrong: float, loop_s: float) -> None:
-        self.resets += 1
         self.yaw_error_rad, self._fused_s = wrong, loop_s
 
     def _wrong(self, yaw_rad: float, loop_s: float) -> float:

@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.earth import STANDARD_GRAVITY_M_S2
 from sim.firmware.messages import (
+    SCALED_IMU,
     global_position_int,
     gps_raw_int,
+    in_integers,
     magnetic_body,
     pressure_hpa,
     sys_status,
@@ -20,11 +21,6 @@ from sim.px4.board import Board
 
 Message = mavlink.MAVLink_message
 Builder = Callable[["Board", float], Message | None]
-_SCALED_IMU = (
-    mavlink.MAVLink_scaled_imu_message,
-    mavlink.MAVLink_scaled_imu2_message,
-    mavlink.MAVLink_scaled_imu3_message,
-)
 _PUBLISHED_AFTER_S = 0.0008
 """SCALED_IMU tells when a sample was published, HIGHRES_IMU when it was taken."""
 _HOLD_MODE = 4 << 16 | 3 << 24
@@ -65,13 +61,11 @@ def scaled_imu(double: Board, loop_s: float, index: int) -> Message | None:
         return None
     t_s = double.aircraft.time_at(loop_s)
     sample_s, output = double.imu_output(index, loop_s)
-    milli_g = [truncated_16(float(value) * 1000.0 / STANDARD_GRAVITY_M_S2) for value in output[3:]]
-    milli_rad = [truncated_16(float(value) * 1000.0) for value in output[:3]]
     magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s)]
     temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
     boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s) + _PUBLISHED_AFTER_S)
-    fields = (*milli_g, *milli_rad, *magnetic, temperature)
-    return _SCALED_IMU[index](boot_ms, *fields)
+    fields = (*in_integers(output), *magnetic, temperature)
+    return SCALED_IMU[index](boot_ms, *fields)
 
 
 def attitude(double: Board, loop_s: float) -> Message:

@@ -6,8 +6,8 @@ import functools
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.firmware.channel import Write
 from sim.firmware.faults import names_match
-from sim.firmware.writes import Write
 from sim.px4.board import Board
 from sim.px4.parameters import INT32, REAL32, bytes_as_float, float_as_int
 from sim.px4.port import PX4Port

@@ -1,16 +1,53 @@
-"""PX4's parameter store: two types, a working copy, what has been saved, and what others have not been told yet.
+"""PX4's parameters: defaults, the store, and how a change reaches those who use it.
 
-Facts: PX4 `src/lib/parameters/parameters.cpp` and `autosave.cpp` (2026-08), autopilots 4.4 and 7.5.
+Facts: PX4 `src/lib/parameters/parameters.cpp`, `autosave.cpp`, `SubscriptionInterval.cpp` and its metadata (2026-08),
+autopilots 4, 5.2, 7.5 and 9.2.
 """
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.firmware.double import AutopilotDouble
 from sim.firmware.numbers import float32
+
+SLOTS = 4
+SIMULATED_IDS = (1310988, 1310996, 1311004, 1311012)
+"""Device ids as PX4's own simulation has them: internal sensors."""
+EXTERNAL_IDS = (1311243, 1311499, 1311755, 1312011)
+"""Device ids on a CAN bus: external sensors."""
+LENGTH = 764
+"""Number of parameters in the list; the real firmware has 920."""
+
+_FIXED: dict[str, float] = {
+    "SENS_BOARD_X_OFF": 0.0, "SENS_BOARD_Y_OFF": 0.0, "SENS_BOARD_Z_OFF": 0.0, "SENS_BOARD_ROT": 0,
+    "SENS_IMU_AUTOCAL": 1, "IMU_GYRO_CAL_EN": 1, "IMU_INTEG_RATE": 200, "SYS_HAS_MAG": 1, "SDLOG_MODE": 0,
+    "COM_ARMABLE": 1, "COM_ARM_AUTH_ID": 10, "COM_ARM_AUTH_MET": 0, "COM_ARM_AUTH_REQ": 0, "COM_ARM_AUTH_TO": 1.0,
+    "COM_ARM_IMU_ACC": 0.7, "COM_ARM_IMU_GYR": 0.25, "CBRK_BUZZER": 0, "MIS_TAKEOFF_ALT": 2.5,
+    "MAV_SYS_ID": 1, "MAV_TYPE": 2, "MAV_HASH_CHK_EN": 1, "MAV_HB_FORW_EN": 1, "SER_TEL2_BAUD": 921600,
+    "EKF2_EV_CTRL": 0, "EKF2_EV_NOISE_MD": 0, "EKF2_MAG_TYPE": 0, "EKF2_SENS_EN": 8191, "EKF2_ABL_LIM": 0.4,
+    "EKF2_GYR_B_LIM": 0.15, "EKF2_EV_DELAY": 0.0, "EKF2_EVA_NOISE": 0.1,
+}  # fmt: skip
+
+
+def default_parameters() -> dict[str, float]:
+    """Name to default: an int is an INT32, a float a REAL32."""
+    table = dict(_FIXED)
+    for slot in range(SLOTS):
+        for kind in ("GYRO", "ACC"):
+            table |= {f"CAL_{kind}{slot}_ID": 0, f"CAL_{kind}{slot}_PRIO": -1, f"CAL_{kind}{slot}_ROT": -1}
+            table |= {f"CAL_{kind}{slot}_{axis}OFF": 0.0 for axis in "XYZ"}
+        table |= {f"CAL_ACC{slot}_{axis}SCALE": 1.0 for axis in "XYZ"}
+    # Port 0 is TELEM1 with a ground station, port 1 TELEM2 with a companion: streams, and no forwarding there.
+    for port, config, mode, rate, forward in ((0, 101, 0, 1200, 1), (1, 102, 2, 0, 0), (2, 0, 0, 0, 0)):
+        table |= {f"MAV_{port}_CONFIG": config, f"MAV_{port}_MODE": mode, f"MAV_{port}_RATE": rate}
+        table[f"MAV_{port}_FORWARD"] = forward
+    return table | {f"SIM_FILLER_{n:04d}": 0.0 for n in range(len(table), LENGTH)}
+
 
 INT32 = mavlink.MAV_PARAM_TYPE_INT32
 REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
@@ -75,12 +112,6 @@ class ParameterStore:
         self.values = dict(self.saved)
         self.unsaved.clear()
 
-    def reset(self, *prefixes: str) -> None:
-        """Back to the defaults: all, or names that begin so. Not saved yet."""
-        for name, value in self._defaults.items():
-            if not prefixes or name.startswith(prefixes):
-                self.set(name, value)
-
     def preset(self, name: str, value: float) -> None:
         """Set and save without a word, as if it had always been so."""
         self.values[name] = self.saved[name] = int(value) if self.is_int(name) else float32(value)
@@ -104,3 +135,34 @@ def bytes_as_float(value: int) -> float:
 def float_as_int(value: float) -> int:
     """The int32 that has the bytes of this float."""
     return int(struct.unpack("<i", struct.pack("<f", value))[0])
+
+
+INTERVAL_S = 1.0
+
+
+class Consumer:
+    """One reader of parameters that looks every `period_s`, and at changes at most once a second."""
+
+    def __init__(self, double: AutopilotDouble, period_s: float, action: Callable[[float], None]) -> None:
+        self._double, self._period_s, self._action = double, period_s, action
+        self._last_s = -math.inf
+        self._pending = False
+
+    def restart(self) -> None:
+        """A boot."""
+        self._last_s, self._pending = -math.inf, False
+
+    def notify(self) -> None:
+        """Something has changed."""
+        if self._pending:
+            return
+        self._pending = True
+        now_s = self._double.now_s()
+        looks_s = (math.floor(now_s / self._period_s) + 1) * self._period_s
+        self._double.later(max(looks_s, self._last_s + INTERVAL_S) - now_s, self._look)
+
+    def _look(self) -> None:
+        self._pending = False
+        now_s = self._double.now_s()
+        self._last_s = min(max(self._last_s + INTERVAL_S, now_s - INTERVAL_S), now_s)
+        self._action(now_s)

@@ -1,4 +1,4 @@
-"""One IMU of the PX4 double: means over an integration interval, corrected, and its estimator.
+"""One IMU of the PX4 double: means over an integration interval, corrected for offset and temperature; its estimator.
 
 A sample is the mean of the sensor over one interval, so its white noise is N / sqrt(interval) and independent of the
 next one's (the real one's outputs at 4 ms: autopilots 9.3.2); rounding inside the sensor adds white noise only.
@@ -11,11 +11,86 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.earth import Array
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
 from sim.imu_model import ImuModel
 from sim.px4.calibration import SensorCalibration
-from sim.px4.estimator import Ekf2
 from sim.px4.parameters import ParameterStore
+
+ACCEL_LIMIT_M_S2, GYRO_LIMIT_RAD_S = 0.4, 0.15
+"""EKF2_ABL_LIM and EKF2_GYR_B_LIM."""
+_LEARNS_S = 1.05
+_SHARE_EARLY, _SHARE_LATE, _SETTLES_S = 0.3, 0.2, 60.0
+"""Part of a horizontal change that the tilt takes: about half soon after a start, a fifth later."""
+_PUBLISHED_EVERY_S, _PUBLISHED_STEP = 1.0, 0.001
+_WANDER = np.array([0.4 * math.radians(1.0 / 3600.0)] * 3 + [5e-6 * STANDARD_GRAVITY_M_S2] * 3)
+"""From one publication to the next; what has gathered goes back by a fiftieth."""
+_OBVIOUS_M_S2 = 0.5
+"""More than this cannot be a bias: it is taken for a tilt."""
+
+
+class Ekf2:
+    """States in vehicle FRD; `update` wants the current errors of the corrected IMU output (output minus truth)."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self.published = np.zeros(6)
+        """Biases as the telemetry has them: rad/s, m/s^2."""
+        self._published_s = 0.0
+        self._random, self._wander = np.random.default_rng([seed, 11]), np.zeros(6)
+        self.gyro_bias_rad_s = np.zeros(3)
+        self.accel_bias_m_s2 = np.zeros(3)
+        self._tilt_m_s2 = np.zeros(2)
+        """The horizontal specific force, x and y, that the tilt's error stands for."""
+        self._started_s = 0.0
+        self.time_s = 0.0
+        """Of the last update."""
+        self.accel_steady_since_s = self.gyro_steady_since_s = 0.0
+
+    def reset(self, t_s: float, accel_error: Array) -> None:
+        """A start at this time: level is what the accelerometer says."""
+        self.gyro_bias_rad_s, self.accel_bias_m_s2 = np.zeros(3), np.zeros(3)
+        self.published, self._published_s = np.zeros(6), t_s
+        self._tilt_m_s2 = accel_error[:2].copy()
+        self.time_s = self._started_s = t_s
+        self.accel_steady_since_s = self.gyro_steady_since_s = t_s
+
+    def forget_gyro_bias(self) -> None:
+        """A gyro offset was taken."""
+        self.gyro_bias_rad_s = np.zeros(3)
+        self.gyro_steady_since_s = self.time_s
+
+    def forget_accel_bias(self) -> None:
+        """An accelerometer offset or scale was taken. The tilt stays."""
+        self.accel_bias_m_s2 = np.zeros(3)
+        self.accel_steady_since_s = self.time_s
+
+    @property
+    def tilt_error_rad(self) -> tuple[float, float]:
+        """Errors of roll and pitch."""
+        x, y = self._tilt_m_s2 / STANDARD_GRAVITY_M_S2
+        return -float(y), float(x)
+
+    def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
+        """Go to this time, the errors having been these since the last update."""
+        span = max(t_s - self.time_s, 0.0)
+        learnt = 1.0 - math.exp(-span / _LEARNS_S)
+        self.gyro_bias_rad_s += learnt * (gyro_error - self.gyro_bias_rad_s)
+        np.clip(self.gyro_bias_rad_s, -GYRO_LIMIT_RAD_S, GYRO_LIMIT_RAD_S, out=self.gyro_bias_rad_s)
+        self.accel_bias_m_s2[2] += learnt * (accel_error[2] - self.accel_bias_m_s2[2])
+        mismatch = accel_error[:2] - self.accel_bias_m_s2[:2] - self._tilt_m_s2
+        share = _SHARE_LATE + _SHARE_EARLY * math.exp(-(self.time_s - self._started_s) / _SETTLES_S)
+        if math.hypot(*mismatch) > _OBVIOUS_M_S2:
+            share = 1.0
+        self._tilt_m_s2 += learnt * share * mismatch
+        self.accel_bias_m_s2[:2] += learnt * (1.0 - share) * mismatch
+        np.clip(self.accel_bias_m_s2, -ACCEL_LIMIT_M_S2, ACCEL_LIMIT_M_S2, out=self.accel_bias_m_s2)
+        self.time_s = t_s
+        now = np.concatenate((self.gyro_bias_rad_s, self.accel_bias_m_s2))
+        off = (now + self._wander - self.published).tolist()
+        moved = max(math.hypot(*off[:3]), math.hypot(*off[3:])) > _PUBLISHED_STEP
+        if moved or t_s - self._published_s >= _PUBLISHED_EVERY_S:
+            self._wander = 0.98 * self._wander + _WANDER * self._random.standard_normal(6)
+            self.published, self._published_s = now + self._wander, t_s
+
 
 RAW_RATE_HZ = 1000.0
 """Rate of the sensor's own samples; their rounding adds white noise."""

@@ -12,8 +12,7 @@ import numpy as np
 from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.json_backend import JsonBackend
-from sim.sitl.ports import LOOPBACK, free_tcp_window, free_udp_port
-from sim.sitl.process import FirmwareProcess, check_binary
+from sim.sitl.process import LOOPBACK, FirmwareProcess, check_binary, free_tcp_window, free_udp_port
 from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 
 AXES = ("X", "Y", "Z")

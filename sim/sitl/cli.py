@@ -16,8 +16,8 @@ from pathlib import Path
 from sim.aircraft import Pose
 from sim.hands import Hands
 from sim.imu_model import PARTS
+from sim.motions import motions_of
 from sim.scenario import FIRST_GYRO_DEG_H, Scenario, demo
-from sim.sea import motions_of
 from sim.serve import (
     FIRMWARE_COMMANDS,
     add_hands,

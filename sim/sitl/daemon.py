@@ -1,16 +1,105 @@
-"""The real daemon on a real firmware: configuration, serial devices and process in one."""
+"""The real daemon on a real firmware: configuration, serial devices, process, and a UDP link that loses packets."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+import random
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Self
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.companion_process import CompanionProcess
 from sim.scenario import Scenario
 from sim.serve import configuration, serve
+from sim.sitl.process import LOOPBACK, free_udp_port
 from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
+
+Message = mavlink.MAVLink_message
+
+
+class LossyLink:
+    """Stands where the firmware sends to, and passes on to where the companion listens; an async context manager.
+
+    Args:
+        loss: share of the datagrams of either direction that get lost, 0..1; may be changed at any time.
+        seed: of the losses.
+        near_port: where the firmware sends to; None: any that is free.
+    """
+
+    def __init__(self, *, loss: float = 0.0, seed: int = 1, near_port: int | None = None) -> None:
+        self.loss = loss
+        self.near = (LOOPBACK, free_udp_port() if near_port is None else near_port)
+        """For the firmware's `udpclient`."""
+        self.far = (LOOPBACK, free_udp_port())
+        """Where the companion listens."""
+        self.lost = self.passed = 0
+        self._random = random.Random(seed)
+        self._codec = mavlink.MAVLink(None)
+        self._codec.robust_parsing = True
+        self._waiting: list[tuple[Callable[[Message], bool], asyncio.Future[Message]]] = []
+        self._firmware: tuple[str, int] | None = None
+        self._front: asyncio.DatagramTransport
+        self._back: asyncio.DatagramTransport
+
+    @property
+    def url(self) -> str:
+        """For the companion's configuration."""
+        return f"udpin:{self.far[0]}:{self.far[1]}"
+
+    def sent(self, condition: Callable[[Message], bool]) -> asyncio.Future[Message]:
+        """The next message of the companion for which this is true, done at the instant it passes or gets lost."""
+        future: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
+        self._waiting.append((condition, future))
+        return future
+
+    async def __aenter__(self) -> Self:
+        loop = asyncio.get_running_loop()
+        self._back, _ = await loop.create_datagram_endpoint(
+            lambda: _Face(self._from_companion), local_addr=(LOOPBACK, 0)
+        )
+        # Last: the firmware sends already, and what comes is passed on at once.
+        self._front, _ = await loop.create_datagram_endpoint(lambda: _Face(self._from_firmware), local_addr=self.near)
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        self._front.close()
+        self._back.close()
+        for _, future in self._waiting:
+            future.cancel()
+
+    def _gets_lost(self) -> bool:
+        lost = self._random.random() < self.loss
+        self.lost, self.passed = self.lost + lost, self.passed + (not lost)
+        return lost
+
+    def _from_firmware(self, data: bytes, peer: tuple[str, int]) -> None:
+        self._firmware = peer
+        if not self._gets_lost():
+            self._back.sendto(data, self.far)
+
+    def _from_companion(self, data: bytes, _: tuple[str, int]) -> None:
+        if self._firmware is not None and not self._gets_lost():
+            self._front.sendto(data, self._firmware)
+        for message in self._codec.parse_buffer(data) or ():
+            for condition, future in [*self._waiting]:
+                if not future.done() and condition(message):
+                    future.set_result(message)
+        self._waiting = [entry for entry in self._waiting if not entry[1].done()]
+
+
+class _Face(asyncio.DatagramProtocol):
+    def __init__(self, take: Callable[[bytes, tuple[str, int]], None]) -> None:
+        self._take = take
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        self._take(data, addr)
+
+    def error_received(self, exc: Exception) -> None:
+        """Nobody listens at present."""
+
 
 READY_WITHIN_S = 40.0
 PORTS_WITHIN_S = 5.0

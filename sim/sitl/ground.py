@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from bisect import bisect_left
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import Literal
@@ -50,15 +49,6 @@ class GroundStation(Station):
         super().__init__(system_id, component_id)
         self.firmware, self.kind, self.vehicle = firmware, kind, vehicle
         self._types: dict[str, int] = {}
-
-    def timed(self, kind: type[M], *, since_s: float = 0.0) -> list[tuple[float, M]]:
-        """As in `Station`, without going through everything that came before."""
-        first = bisect_left(self.heard, since_s, key=lambda entry: entry[0])
-        return [(t_s, message) for t_s, message in self.heard[first:] if isinstance(message, kind)]
-
-    def all(self, kind: type[M], *, since_s: float = 0.0) -> list[M]:
-        """Messages of a kind, oldest first."""
-        return [message for _, message in self.timed(kind, since_s=since_s)]
 
     def texts_since(self, since_s: float) -> str:
         """All STATUSTEXT of the vehicle after an instant (loop time), chunks joined."""

@@ -11,8 +11,7 @@ from typing import Any
 from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.hil_backend import HilBackend
-from sim.sitl.ports import LOOPBACK, ports_free, unlocked
-from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
+from sim.sitl.process import LOOPBACK, BinaryError, FirmwareProcess, check_binary, ports_free, unlocked
 from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 
 INSTANCES = 10

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from sim.devices import Frame, VectorNavBinary, vectornav_packet
 from sim.motions import Handling, Turn
-from sim.uart import Setting, heard
+from sim.pty_device import Setting, heard
 from tests.campaign.fault import Act, Fault, Scene
 
 IMU, TILT, COMPASS = "own", "gradienter", "compass"

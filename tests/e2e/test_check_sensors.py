@@ -10,7 +10,7 @@ from pathlib import Path
 
 from companion.config import parse
 from companion.daemon.process.check import CheckLine, run_check
-from sim.uart import Setting
+from sim.pty_device import Setting
 from tests.e2e.test_commands import companion
 from tests.support.chatter import Chatter, compass_frame, tilt_frame
 

@@ -19,7 +19,7 @@ from companion.estimation.records.record import ImuRecord, Record, WrittenParame
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
 from sim.serve import configuration
-from sim.udp import open_udp
+from sim.station import open_udp
 
 DONE, FAILED, USAGE, NO_DAEMON = 0, 1, 2, 3
 

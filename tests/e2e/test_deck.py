@@ -15,8 +15,7 @@ from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from sim.imu_model import DEG_H, MG
-from sim.motions import SlowTurn
-from sim.sea import DAY_S, Sea, Wave
+from sim.motions import DAY_S, Sea, SlowTurn, Wave
 from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
 from tests.e2e.test_calibration import started
 from tests.e2e.test_record_replay import ring, same

@@ -1,7 +1,7 @@
 """Every family of devices through a pseudo-terminal into a calibration, and what comes out against the truth.
 
 Real are the daemon, the ports and the clock. To cost little, one daemon calibrates several IMUs at once beside one
-gradienter and one compass, and a few daemons run side by side; the families are those of `sim.families`, whoever has
+gradienter and one compass, and a few daemons run side by side; the families are those of `sim.scenario`, whoever has
 added them.
 """
 
@@ -30,11 +30,10 @@ from companion.storage.profiles import FORMAT_VERSION, ProfileSource, ProfileSto
 from sim.aircraft import Pose, VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import SerialDevice
-from sim.families import COMPASSES, GRADIENTERS, IMUS, fit, law_of
 from sim.imu_model import DEG_H, MG, Bias, ImuModel
 from sim.pty_device import PtyDevice
-from sim.scenario import site_at
-from sim.udp import open_udp
+from sim.scenario import COMPASSES, GRADIENTERS, IMUS, fit, law_of, site_at
+from sim.station import open_udp
 from tests.support.extent import extent
 
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)

@@ -1,7 +1,7 @@
 """Faults of a serial line on real ports: named and counted while they last, data again within 3 s of their end.
 
-The daemon's own sensor reads ptys and sockets in real time; sim/uart.py shows what a UART makes of another speed or
-parity. Faults that bytes alone show: tests/unit/protocols/test_stream_health.py.
+The daemon's own sensor reads ptys and sockets in real time; sim/pty_device.py shows what a UART makes of another speed
+or parity. Faults that bytes alone show: tests/unit/protocols/test_stream_health.py.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from companion.links.system.connection import BURST_BYTES, BYTES_PER_S
-from sim.uart import Setting
+from sim.pty_device import Setting
 from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, listening, tilt_frame
 
 

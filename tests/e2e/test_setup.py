@@ -20,10 +20,9 @@ import pytest
 from companion import cli, config
 from companion.installation import install as installing
 from sim.firmware.double import AutopilotDouble
-from sim.pty_device import PtyDevice, reader_setting
+from sim.pty_device import PtyDevice, Setting, heard, reader_setting
 from sim.scenario import demo
-from sim.uart import Setting, heard
-from sim.udp import open_udp
+from sim.station import open_udp
 from tests.support.chatter import Chatter
 from tests.support.terminal import CTRL_C, CTRL_D, Terminal
 

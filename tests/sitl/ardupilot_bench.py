@@ -17,9 +17,8 @@ from companion.lua import ARMING_SCRIPT
 from sim.companion_process import CompanionProcess, Record
 from sim.imu_model import DEG_H, MG
 from sim.sitl.ardupilot import ArduPilotSitl
-from sim.sitl.daemon import companion_daemon
+from sim.sitl.daemon import LossyLink, Message, companion_daemon
 from sim.sitl.ground import GroundStation
-from sim.sitl.lossy_link import LossyLink, Message
 from sim.sitl.residuals import ground_station
 from tests.sitl.craft import BINARIES, missing, world
 

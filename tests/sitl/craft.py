@@ -28,7 +28,7 @@ from sim.sitl.process import BinaryError
 from sim.sitl.px4 import Px4Sitl
 from sim.sitl.residuals import ground_station
 from sim.sitl.vehicle import SitlVehicle
-from sim.udp import End, open_udp
+from sim.station import End, open_udp
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.firmware.messages import SCALED_IMU
 from sim.imu_model import MG
 from sim.motions import Handling, Turn
-from sim.sitl.observe import SCALED
 from tests.sitl.craft import Autopilot, Craft
 
 SYSTEM_TIME = mavlink.MAVLink_system_time_message
@@ -21,7 +21,7 @@ SPEED = {"ardupilot": 100.0, "px4": 250.0}
 def test_a_motion_of_the_aircraft_shows_in_the_telemetry_and_ends(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         async def fastest_deg_s() -> float:
-            rows = await craft.ground.imu(SCALED[0], 2.5, rate_hz=SPEED[craft.firmware])
+            rows = await craft.ground.imu(SCALED_IMU[0], 2.5, rate_hz=SPEED[craft.firmware])
             return float(np.degrees(np.abs(rows[:, :3]).max()))
 
         assert await fastest_deg_s() < 0.5
@@ -36,17 +36,17 @@ def test_a_turn_is_measured_by_the_gyros_to_its_size_and_undone(autopilot: Autop
     async def main(craft: Craft) -> None:
         ground = craft.ground
         for sign in (1.0, -1.0):
-            await ground.stream(SCALED[0].id, SPEED[craft.firmware])
+            await ground.stream(SCALED_IMU[0].id, SPEED[craft.firmware])
             since_s = asyncio.get_running_loop().time()
             craft.move(Turn(start_s=craft.now_s + 0.5, duration_s=2.0, pitch_deg=6.0 * sign))
             await asyncio.sleep(3.2)
-            seen = ground.all(SCALED[0], since_s=since_s)
+            seen = ground.all(SCALED_IMU[0], since_s=since_s)
             times = np.array([m.time_boot_ms for m in seen]) * 1e-3
             rates = np.array([m.ygyro for m in seen]) * 1e-3
             # Level in roll but for 3 degrees, so pitch rate is the body's y rate times cos 3 deg.
             turned = np.degrees(np.sum((rates[1:] + rates[:-1]) / 2.0 * np.diff(times)))
             assert turned == pytest.approx(6.0 * sign * np.cos(np.radians(3.0)), abs=0.35)
-        after = (await ground.imu(SCALED[0], 2.0, rate_hz=SPEED[craft.firmware])).mean(axis=0)
+        after = (await ground.imu(SCALED_IMU[0], 2.0, rate_hz=SPEED[craft.firmware])).mean(axis=0)
         np.testing.assert_allclose(after[3:] / MG, craft.expected(1)[3:] / MG, atol=1.2)
 
     autopilot.run(main)

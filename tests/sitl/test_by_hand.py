@@ -20,9 +20,8 @@ from sim.imu_model import MG
 from sim.scenario import demo
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.ground import GroundStation
-from sim.sitl.observe import mean_reading
 from sim.sitl.px4 import Px4Sitl
-from sim.sitl.residuals import SETTLE_S, ground_station
+from sim.sitl.residuals import SETTLE_S, ground_station, mean_reading
 from sim.sitl.vehicle import SitlVehicle
 from tests.sitl.craft import BINARIES, missing
 

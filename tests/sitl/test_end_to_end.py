@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sim.sitl.daemon import companion_daemon
-from sim.sitl.observe import residual
-from sim.sitl.residuals import CALIBRATE_WITHIN_S, HEADER, UNITS, Row
+from sim.sitl.residuals import CALIBRATE_WITHIN_S, HEADER, UNITS, Row, residual
 from tests.sitl.craft import Autopilot, Craft, SitlCraft, hush
 
 LONG = """

@@ -10,8 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import Array
+from sim.firmware.messages import SCALED_IMU
 from sim.imu_model import DEG_H, MG
-from sim.sitl.observe import SCALED, truncated_mean
+from sim.sitl.residuals import truncated_mean
 from tests.sitl.craft import Autopilot, Craft, hush
 
 HIGHRES = mavlink.MAVLink_highres_imu_message
@@ -29,7 +30,7 @@ async def look(craft: Craft, seconds: float = 3.0) -> Array:
     if craft.firmware == "ardupilot":
         mean: Array = (await craft.ground.imu(HIGHRES, seconds)).mean(axis=0)
         return mean
-    rows = await craft.ground.imu(SCALED[1], seconds, rate_hz=250.0)
+    rows = await craft.ground.imu(SCALED_IMU[1], seconds, rate_hz=250.0)
     step = np.array([1e-3] * 3 + [MG] * 3)
     counts = np.rint(rows / step)
     sigma = [0.386] * 3 + [0.55] * 3  # autopilots 9.3.2

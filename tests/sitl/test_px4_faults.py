@@ -14,8 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.imu_model import DEG_H, MG
-from sim.sitl.daemon import companion_daemon
-from sim.sitl.lossy_link import LossyLink
+from sim.sitl.daemon import LossyLink, companion_daemon
 from sim.sitl.px4 import Px4Sitl
 from sim.sitl.residuals import CALIBRATE_WITHIN_S
 from tests.sitl.px4_bench import QUICK, SAVED_S, calibrate, changed, flying

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from sim.imu_model import DEG_H, MG
-from sim.sea import motions_of
+from sim.motions import motions_of
 from sim.sitl.daemon import companion_daemon
-from sim.sitl.observe import residual
-from sim.sitl.residuals import DECK, Row, ground_station
+from sim.sitl.residuals import DECK, Row, ground_station, residual
 from tests.sitl.craft import BINARIES, binary_vehicle, missing
 
 WAITS_S = 75.0

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.firmware.messages import SCALED_IMU
 from sim.imu_model import DEG_H, MG
-from sim.sitl.hil_frames import FIFO_STEPS
-from sim.sitl.observe import SCALED, gridded_mean, truncated_mean
+from sim.sitl.hil_backend import FIFO_STEPS
+from sim.sitl.residuals import gridded_mean, truncated_mean
 from tests.sitl.craft import Autopilot, Craft
 
 HIGHRES = mavlink.MAVLink_highres_imu_message
@@ -22,7 +23,7 @@ UNBIASED_INTEGERS = {"ardupilot": 1, "px4": 2}
 def test_scaled_imu_is_truncated_toward_zero(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         instance = UNBIASED_INTEGERS[craft.firmware]
-        rows = await craft.ground.imu(SCALED[instance - 1], 6.0, rate_hz=RATE_HZ[craft.firmware])
+        rows = await craft.ground.imu(SCALED_IMU[instance - 1], 6.0, rate_hz=RATE_HZ[craft.firmware])
         expected = craft.expected(instance)[3:] / MG
         assert np.all(np.abs(expected) > 40.0)  # the tilt keeps every axis far from zero
         short = (np.abs(expected) - np.abs(rows[:, 3:].mean(axis=0) / MG)).tolist()
@@ -34,7 +35,7 @@ def test_scaled_imu_is_truncated_toward_zero(autopilot: Autopilot) -> None:
 def test_a_rate_below_one_mrad_s_reads_zero_most_of_the_time(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         instance = UNBIASED_INTEGERS[craft.firmware]
-        rows = await craft.ground.imu(SCALED[instance - 1], 6.0, rate_hz=RATE_HZ[craft.firmware])
+        rows = await craft.ground.imu(SCALED_IMU[instance - 1], 6.0, rate_hz=RATE_HZ[craft.firmware])
         rates = rows[:, :3].mean(axis=0)
         expected = craft.expected(instance)[:3]
         below = np.abs(expected) < 0.6e-3
@@ -76,7 +77,7 @@ def test_raw_imu_of_ardupilot_is_the_same_as_scaled_imu(autopilot: Autopilot) ->
             await craft.ground.put(name, before[name] - 0.3)
             await asyncio.sleep(0.5)
             raw = (await craft.ground.imu(mavlink.MAVLink_raw_imu_message, 3.0)).mean(axis=0)
-            scaled = (await craft.ground.imu(SCALED[0], 3.0)).mean(axis=0)
+            scaled = (await craft.ground.imu(SCALED_IMU[0], 3.0)).mean(axis=0)
         np.testing.assert_allclose(raw[3:] / MG, scaled[3:] / MG, atol=0.15)
         assert (raw[3] - craft.expected(1)[3]) / MG == pytest.approx(0.3 / MG, abs=0.8)
 
@@ -96,7 +97,7 @@ def test_px4_does_not_send_raw_imu(autopilot: Autopilot) -> None:
 @pytest.mark.only("ardupilot")
 def test_scaled_imu3_without_a_third_imu_is_sent_with_accelerometers_and_gyros_all_zero(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
-        rows = await craft.ground.imu(SCALED[2], 1.0, rate_hz=50.0)
+        rows = await craft.ground.imu(SCALED_IMU[2], 1.0, rate_hz=50.0)
         assert len(rows) > 40
         assert not rows.any()
 
@@ -107,7 +108,7 @@ def test_scaled_imu3_without_a_third_imu_is_sent_with_accelerometers_and_gyros_a
 def test_scaled_imu3_without_a_third_imu_is_accepted_and_never_sent(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         assert await craft.ground.stream(mavlink.MAVLINK_MSG_ID_SCALED_IMU3, 50.0) == mavlink.MAV_RESULT_ACCEPTED
-        assert not await craft.ground.collect(SCALED[2], 1.0)
+        assert not await craft.ground.collect(SCALED_IMU[2], 1.0)
 
     autopilot.run(main)
 
@@ -179,12 +180,12 @@ def test_px4_accepts_any_rate_and_sends_at_most_its_imu_rate(autopilot: Autopilo
     async def main(craft: Craft) -> None:
         ground = craft.ground
         for asked in (400.0, 1000.0):
-            assert await ground.stream(SCALED[1].id, asked) == mavlink.MAV_RESULT_ACCEPTED
+            assert await ground.stream(SCALED_IMU[1].id, asked) == mavlink.MAV_RESULT_ACCEPTED
             await asyncio.sleep(0.1)
-            seen = await ground.collect(SCALED[1], 2.0)
+            seen = await ground.collect(SCALED_IMU[1], 2.0)
             rate_hz = (len(seen) - 1) / (seen[-1].time_boot_ms - seen[0].time_boot_ms) * 1e3
             assert 230.0 < rate_hz < 252.0
-        await ground.stream(SCALED[1].id, 0.0)
+        await ground.stream(SCALED_IMU[1].id, 0.0)
 
     autopilot.run(main)
 
@@ -192,8 +193,8 @@ def test_px4_accepts_any_rate_and_sends_at_most_its_imu_rate(autopilot: Autopilo
 def test_the_imu_temperature_is_the_aircrafts(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         ground = craft.ground
-        await ground.stream(SCALED[0].id, 50.0)
-        seen = await ground.collect(SCALED[0], 0.5)
+        await ground.stream(SCALED_IMU[0].id, 50.0)
+        seen = await ground.collect(SCALED_IMU[0], 0.5)
         assert seen[-1].temperature / 100.0 == pytest.approx(craft.aircraft.temperature_degc(craft.now_s), abs=0.5)
 
     autopilot.run(main)

@@ -27,8 +27,7 @@ from sim.imu_model import DEG_H, MG
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.daemon import companion_daemon
 from sim.sitl.ground import GroundStation
-from sim.sitl.observe import residual
-from sim.sitl.residuals import UNITS, ground_station
+from sim.sitl.residuals import UNITS, ground_station, residual
 from tests.sitl.craft import BINARIES, missing, world
 from tests.support.extent import extent
 

@@ -18,8 +18,7 @@ from companion.estimation.collector.rolling import RollingCollector
 from companion.protocols.registry import PROTOCOLS
 from companion.samples import Sample
 from sim.devices import nmea
-from sim.pty_device import reader_setting
-from sim.uart import Setting, heard
+from sim.pty_device import Setting, heard, reader_setting
 from tests.support.still_aircraft import HEADING, TILT, imu, settings
 
 RECOVERY_S = 3.0

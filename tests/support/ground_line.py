@@ -17,7 +17,7 @@ from sim.motions import Motion
 from sim.pty_device import PtyDevice
 from sim.scenario import Firmware, Scenario, demo
 from sim.serve import configuration
-from sim.udp import open_udp
+from sim.station import open_udp
 
 
 class Said(NamedTuple):

@@ -10,7 +10,7 @@ from pathlib import Path
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
 from sim.serve import configuration
-from sim.udp import open_udp
+from sim.station import open_udp
 
 QUICK = '\n[calibration]\nmin_still_s = 2\nmax_s = 4\nat_arm = "off"\n'
 """Short, and nothing happens that nobody asked for."""

@@ -25,7 +25,7 @@ from sim.accuracy.deck import Voyage, feed, sail
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array, body_from_ned
 from sim.imu_model import DEG_H, MG, ImuModel
-from sim.sea import Sea, Wave
+from sim.motions import Sea, Wave
 
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 AROUND = (

@@ -12,8 +12,7 @@ from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import kept
 from companion.estimation.solution.prior import curve_of
 from companion.estimation.temperature.curve import Curve, PowerUpNodes, fit, settling
-from sim.accuracy.mid_warm_up import RATES_K_MIN, SPANS_S, mid_warm_up
-from sim.accuracy.temperature import Aircraft
+from sim.accuracy.temperature import RATES_K_MIN, SPANS_S, Aircraft, mid_warm_up
 from sim.imu_model import DEG_H, PARTS
 
 Array = NDArray[np.float64]

@@ -17,8 +17,8 @@ from companion.protocols.guess import (
     strangers,
 )
 from companion.protocols.registry import PROTOCOLS
+from sim.pty_device import Setting, heard
 from sim.scenario import demo
-from sim.uart import Setting, heard
 from tests.support.chatter import compass_frame, imu_frame, tilt_frame
 
 

@@ -13,8 +13,8 @@ from companion.protocols.imus.xsens import XsensDialogue
 from companion.protocols.registry import PROTOCOLS
 from sim.aircraft import VirtualAircraft
 from sim.devices import SerialDevice
-from sim.families import IMUS
 from sim.imu_model import ImuModel
+from sim.scenario import IMUS
 from tests.support.frames import sentence
 
 RESUME, MEASURE = bytes.fromhex("756501020206E5CB"), bytes.fromhex("FAFF1000F1")

@@ -16,7 +16,7 @@ import pytest
 from sim.aircraft import Iron, Pose, Site, VirtualAircraft
 from sim.devices import HMR3300, Frame, Gradienter, ImuLine, SerialDevice, VectorNavBinary
 from sim.imu_model import ImuModel
-from sim.motions import Knock, Turn
+from sim.motions import Handling, Turn
 
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 
@@ -93,7 +93,7 @@ def test_gradienter_fluid_follows_with_one_decade_a_second() -> None:
 
 
 def test_gradienter_takes_acceleration_for_tilt_and_its_mounting_into_account() -> None:
-    shaken = VirtualAircraft(motions=[Knock(start_s=0.0, duration_s=1.0, peak_deg_s=0.0, peak_m_s2=2.0)])
+    shaken = VirtualAircraft(motions=[Handling(start_s=0.0, duration_s=1.0, angle_deg=0.0, acceleration=2.0)])
     tilts = Gradienter(shaken).tilt_deg(np.linspace(0.0, 1.0, 51))
     assert np.abs(tilts).max() > 4.0
     turned = Gradienter(VirtualAircraft(POSE), mounting_deg=(0.0, 0.0, 90.0), law="axis")

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
 from sim.flying.px4 import Truth, source_changes
-from sim.flying.truth import FlyingAircraft, State
+from sim.flying.vehicle import FlyingAircraft, State
 from sim.flying.verdict import Event, Record, figures, row
 from sim.imu_model import ImuModel
 from sim.scenario import site_at

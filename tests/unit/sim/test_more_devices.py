@@ -17,9 +17,9 @@ from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.binary_imus import WIT_Z_UP, WitMotionImu
 from sim.compasses import NmeaCompass, Os5000, PniCompass, RionCompass
 from sim.devices import SerialDevice
-from sim.families import IMUS
 from sim.gradienters import BeiInclinometer, Jewell, RionInclinometer
 from sim.imu_model import ImuModel
+from sim.scenario import IMUS
 from tests.support.decoders import make_decoder
 from tests.support.frames import xor
 

@@ -22,14 +22,14 @@ async def test_parameters_are_saved_by_themselves_a_third_of_a_second_later_and_
     async with PX4Stage() as stage:
         await stage.set("CAL_ACC0_XOFF", 0.5)
         await asyncio.sleep(0.25)
-        assert stage.double.saved_parameter("CAL_ACC0_XOFF") == 0.0
+        assert stage.double.parameters.saved["CAL_ACC0_XOFF"] == 0.0
         await asyncio.sleep(0.1)
-        assert stage.double.saved_parameter("CAL_ACC0_XOFF") == 0.5
+        assert stage.double.parameters.saved["CAL_ACC0_XOFF"] == 0.5
         await stage.set("CAL_ACC0_YOFF", 0.5)
         await asyncio.sleep(1.5)
-        assert stage.double.saved_parameter("CAL_ACC0_YOFF") == 0.0
+        assert stage.double.parameters.saved["CAL_ACC0_YOFF"] == 0.0
         await asyncio.sleep(0.6)
-        assert stage.double.saved_parameter("CAL_ACC0_YOFF") == 0.5
+        assert stage.double.parameters.saved["CAL_ACC0_YOFF"] == 0.5
 
 
 async def test_a_write_while_armed_is_not_refused() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from sim.aircraft import DEFAULT_SITE, Pose, VirtualAircraft
 from sim.earth import body_from_ned
-from sim.sea import MOTIONS, Sea, Wave, motions_of
+from sim.motions import MOTIONS, Sea, Wave, motions_of
 
 
 def test_rates_are_the_derivatives_of_the_angles() -> None:

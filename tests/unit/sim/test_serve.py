@@ -18,11 +18,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import config
 from sim.__main__ import main
-from sim.families import COMPASSES, GRADIENTERS, IMUS
-from sim.scenario import demo
+from sim.scenario import COMPASSES, GRADIENTERS, IMUS, demo
 from sim.serve import configuration, serve
-from sim.station import Station
-from sim.udp import open_udp
+from sim.station import Station, open_udp
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -15,10 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from sim.motions import Turn
-from sim.sitl.hil_backend import FRAME_HZ, HilBackend
-from sim.sitl.hil_frames import on_fifo_grid
-from sim.sitl.json_backend import JsonBackend
-from sim.sitl.json_frames import ServoPacket, decode_servos
+from sim.sitl.hil_backend import FRAME_HZ, HilBackend, on_fifo_grid
+from sim.sitl.json_backend import JsonBackend, ServoPacket, decode_servos
 from sim.sitl.process import FirmwareProcess
 from sim.sitl.samples import JUMP_S, SampleBlocks
 

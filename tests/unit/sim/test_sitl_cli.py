@@ -15,7 +15,7 @@ from companion.config import parse
 from sim.__main__ import main
 from sim.sitl.cli import parser, scenario_of, vehicle_of
 from sim.sitl.daemon import daemon_configuration
-from sim.sitl.ports import unlocked
+from sim.sitl.process import unlocked
 
 # A firmware in a few lines: finds the port in its arguments as the real one does, and asks for physics.
 FAKE_ARDUPILOT = f"""\

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sim.imu_model import DEG_H, MG, ImuModel
+from sim.motions import motions_of
 from sim.scenario import demo
-from sim.sea import motions_of
-from sim.sitl.observe import STEP, excess
+from sim.sitl.residuals import STEP, excess
 
 LATE_S = 0.035
 GYRO_DEG_H, ACCEL_MG = (100.0, -60.0, 170.0), (1.0, -2.0, 3.0)

@@ -12,7 +12,7 @@ import pytest
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import body_from_ned, earth_rate_ned_rad_s, normal_gravity_m_s2
-from sim.motions import Handling, Knock, Motion, SlowTurn, Turn, Vibration
+from sim.motions import Handling, Motion, SlowTurn, Turn, Vibration
 
 CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[2] / "vectors" / "method.json").read_text(encoding="utf-8")
@@ -47,7 +47,6 @@ MOTIONS: list[Motion] = [
     SlowTurn(start_s=2.0, duration_s=6.0, rate_deg_s=-2.0),
     SlowTurn(start_s=2.0, duration_s=1.0, rate_deg_s=5.0, ramp_s=4.0),
     Turn(start_s=2.0, duration_s=1.5, roll_deg=7.0, pitch_deg=-4.0, heading_deg=100.0),
-    Knock(start_s=2.0),
     Vibration(start_s=2.0, duration_s=1.0, frequency_hz=20.0, rocking_deg_s=3.0),
 ]
 
@@ -76,12 +75,11 @@ def test_a_block_of_times_gives_what_single_times_give_and_stillness_is_known(mo
         assert aircraft.still_at(float(t_s)) == (not motion.start_s <= t_s < motion.end_s)
 
 
-def test_a_turn_stays_and_a_handling_and_a_knock_come_back() -> None:
+def test_a_turn_stays_and_a_handling_comes_back() -> None:
     aircraft = VirtualAircraft(
         Pose(5.0, -3.0, 350.0),
         motions=[
             Handling(start_s=1.0, duration_s=3.0),
-            Knock(start_s=5.0),
             Turn(start_s=6.0, duration_s=1.0, pitch_deg=-6.0, heading_deg=30.0),
             SlowTurn(start_s=8.0, duration_s=10.0, rate_deg_s=1.5, ramp_s=2.0),
         ],

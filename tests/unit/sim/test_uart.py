@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.uart import Setting, heard, receive, transmit
+from sim.pty_device import Setting, heard, receive, transmit
 
 SLOW = Setting(4800)
 USUAL = Setting(9600)
