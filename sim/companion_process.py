@@ -90,24 +90,6 @@ class CompanionProcess:
                 return
         raise TimeoutError(f"the daemon is not ready after {within_s:g} s:\n{self.log()}")
 
-    async def undo(self) -> Record:
-        """`companion undo --json`."""
-        return await self.ask("undo")
-
-    async def cancel(self) -> Record:
-        """`companion cancel --json`."""
-        return await self.ask("cancel")
-
-    async def start_calibration(self) -> Record:
-        """`companion calibrate --json`: asked for, not waited for."""
-        return await self.ask("calibrate")
-
-    async def last_record(self) -> Record:
-        """The latest of `companion history --json`."""
-        history = await self.ask("history")
-        record: Record = history["records"][0]
-        return record
-
     async def ask(self, *words: str) -> Record:
         """Run a command with --json; what it prints."""
         process = await asyncio.create_subprocess_exec(

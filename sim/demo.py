@@ -26,11 +26,11 @@ from sim.ardupilot.parameters import offset_names
 from sim.companion_process import CompanionProcess, Record
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, ImuModel
-from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
-from sim.serve import describe
-from sim.sitl.process import free_udp_port
-from sim.station import Station, open_udp
+from sim.serve import describe, serve
+from sim.sitl.ground import GroundStation
+from sim.sitl.process import LOOPBACK, free_udp_port
+from sim.station import open_udp
 
 RESIDUAL_GYRO_DEG_H: Final = 10.0
 RESIDUAL_ACCEL_MG: Final = 0.3
@@ -39,9 +39,6 @@ OBSERVE_S: Final = 15.0
 SEED: Final = 70
 """A day on which the bias of the flight controller's gyro wanders little. On one day in five it wanders by more than
 the 10 deg/h that are asked below, between the calibration and the look afterwards, and no calibration can know that."""
-OBSERVE_HZ: Final = 100.0
-READ_TRIES: Final = 50
-"""Of a tenth of a second each: a busy machine may be slower."""
 CALIBRATE_WITHIN_S: Final = 150.0
 WORDS: Final = {
     "fc": "the flight controller's first IMU",
@@ -62,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
             return asyncio.run(_run(Path(folder), arguments.seed))
         except KeyboardInterrupt:
             return 1
-        except (TimeoutError, OSError, RuntimeError) as error:
+        except (TimeoutError, OSError, RuntimeError, KeyError) as error:
             print(f"demo: {error}", file=sys.stderr)
             return 1
 
@@ -90,31 +87,24 @@ async def _run(folder: Path, seed: int) -> int:
         await asyncio.sleep(1.0)
         loop = asyncio.get_running_loop()
         begin_s = scenario.aircraft.time_at(loop.time())
-        mean = await _observe(station)
+        mean = (await station.imu(mavlink.MAVLink_highres_imu_message, OBSERVE_S)).mean(axis=0)
         end_s = scenario.aircraft.time_at(loop.time())
         truth = scenario.aircraft.truth_at(end_s)
         residual = mean - np.concatenate([truth.rate_rad_s, truth.force_m_s2])
-        stored = np.array([await _read(station, name) for kind in ("gyro", "accel") for name in offset_names(1, kind)])
+        stored = np.array([await station.get(name) for kind in ("gyro", "accel") for name in offset_names(1, kind)])
         good = _report(scenario, record, begin_s, end_s, residual, stored)
     print(f"\n{'All within limits.' if good else 'NOT within limits.'} Took {time.monotonic() - started_s:.0f} s.")
     return 0 if good else 1
 
 
-async def _serve(scenario: Scenario, folder: Path, udp: int, stack: contextlib.AsyncExitStack) -> Station:
-    """Bring the aircraft to life; its autopilot sends to a UDP port of this machine."""
-    scenario.aircraft.begin(asyncio.get_running_loop().time())
-    for name, device in scenario.ports.items():
-        await stack.enter_async_context(PtyDevice(device, folder / name))
-    link = await open_udp(scenario.autopilot, target=("127.0.0.1", udp))
-    stack.callback(link.close)
-    ground = await open_udp(scenario.autopilot.ground, listen=("127.0.0.1", 0))
-    stack.callback(ground.close)
-    autopilot = asyncio.get_running_loop().create_task(scenario.autopilot.run(), name="autopilot")
-    stack.push_async_callback(_cancel, autopilot)
-    station = Station()
-    air = await open_udp(station, target=ground.local)
+async def _serve(scenario: Scenario, folder: Path, udp: int, stack: contextlib.AsyncExitStack) -> GroundStation:
+    """Bring the aircraft to life: its autopilot sends to a UDP port of this machine, and to the ground station."""
+    station, up = GroundStation("ardupilot"), asyncio.Event()
+    air = await open_udp(station, listen=(LOOPBACK, 0))
     stack.callback(air.close)
-    station.heartbeat()
+    everything = serve(scenario, directory=folder, udp=(LOOPBACK, udp), ground=air.local, started=up)
+    stack.push_async_callback(_cancel, asyncio.create_task(everything, name="aircraft"))
+    await up.wait()
     return station
 
 
@@ -141,27 +131,6 @@ async def _set_up(companion: CompanionProcess, scenario: Scenario, udp: int) -> 
 async def _cancel(task: asyncio.Task[None]) -> None:
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-
-
-async def _read(station: Station, name: str) -> float:
-    """A parameter's value."""
-    for _ in range(READ_TRIES):
-        if values := await station.read_parameter(name):
-            return values[0]
-    raise RuntimeError(f"{name} cannot be read")
-
-
-async def _observe(station: Station) -> Array:
-    """Mean of the autopilot's HIGHRES_IMU: three rates (rad/s), three specific forces (m/s^2), FRD."""
-    message_id: int = mavlink.MAVLINK_MSG_ID_HIGHRES_IMU
-    await station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / OBSERVE_HZ)
-    station.heard.clear()
-    await asyncio.sleep(OBSERVE_S)
-    seen = station.all(mavlink.MAVLink_highres_imu_message)
-    if len(seen) < 0.5 * OBSERVE_S * OBSERVE_HZ:
-        raise RuntimeError(f"only {len(seen)} HIGHRES_IMU came in {OBSERVE_S:g} s")
-    rows = [(m.xgyro, m.ygyro, m.zgyro, m.xacc, m.yacc, m.zacc) for m in seen]
-    return np.asarray(np.mean(rows, axis=0), dtype=np.float64)
 
 
 def _report(scenario: Scenario, record: Record, begin_s: float, end_s: float, residual: Array, stored: Array) -> bool:

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from sim.aircraft import Pose, VirtualAircraft
-from sim.earth import angles_of, axis_rotation, body_from_ned
+from sim.earth import Array, angles_of, axis_rotation, body_from_ned
 from sim.motions import Handling, Turn
 
 TAKES_S: Final = 6.0
@@ -126,18 +126,16 @@ class Hands:
         self._spot, self._turned_deg = self._held(pitch_deg, roll_deg), 0.0
         return self.back(t_s)
 
-    def _held(self, pitch_deg: float, roll_deg: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    def _held(self, pitch_deg: float, roll_deg: float) -> Array:
         """As it heads now."""
         return body_from_ned(*(math.radians(a) for a in (roll_deg, pitch_deg, self._now.heading_deg)))
 
-    def bump(self, pitch_deg: float, roll_deg: float) -> None:
+    def bump(self, _t_s: float, pitch_deg: float, roll_deg: float) -> None:
         """Tip the spot itself, nose up and right side down as the aircraft was at first; seen at the next placing."""
         tipped = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg))
         self._spot = tipped @ self._spot
 
-    def _go(
-        self, t_s: float, attitude: np.ndarray[tuple[int, ...], np.dtype[np.float64]], turn_deg: float = 0.0
-    ) -> float:
+    def _go(self, t_s: float, attitude: Array, turn_deg: float = 0.0) -> float:
         roll, pitch, heading = (math.degrees(angle) for angle in angles_of(attitude))
         before, self._number = self._now, self._number + 1
         # The way that was asked for; else the short one, as an arm goes.
@@ -158,28 +156,27 @@ class Hands:
     def obey(self, line: str, t_s: float) -> str:
         """Do what one typed line says; returns what came of it."""
         word, *rest = line.split() or [""]
+        moves: dict[str, tuple[int, Callable[..., object]]] = {
+            "turn": (1, self.turn),
+            "tilt": (2, self.tilt),
+            "hold": (2, self.hold),
+            "spot": (2, self.spot),
+            "back": (0, self.back),
+            "bump": (2, self.bump),
+            "grip": (1, self.grip),
+        }
+        count, move = moves.get(word, (-1, self.back))
         try:
             figures = [float(figure) for figure in rest]
-            if word == "turn" and len(figures) == 1:
-                self.turn(t_s, figures[0])
-            elif word == "tilt" and len(figures) == 2:
-                self.tilt(t_s, figures[0], figures[1])
-            elif word == "hold" and len(figures) == 2:
-                self.hold(t_s, figures[0], figures[1])
-            elif word == "spot" and len(figures) == 2:
-                self.spot(t_s, figures[0], figures[1])
-            elif word == "back" and not figures:
-                self.back(t_s)
-            elif word == "bump" and len(figures) == 2:
-                self.bump(figures[0], figures[1])
-                return "the spot has tipped; it shows when the aircraft is put onto it again"
-            elif word == "grip" and len(figures) == 1:
-                self.grip(t_s, figures[0])
-                return f"a hand stays on it for {figures[0]:g} s"
-            else:
-                raise ValueError
         except ValueError:
+            count, figures = -1, []
+        if len(figures) != count:
             return f"found {line.strip()!r}; allowed: {HELP} ({_EXAMPLES})"
+        move(t_s, *figures)
+        if word == "bump":
+            return "the spot has tipped; it shows when the aircraft is put onto it again"
+        if word == "grip":
+            return f"a hand stays on it for {figures[0]:g} s"
         pose = self._now
         return (
             f"moving for {self._takes_s:g} s; then pitch {pose.pitch_deg:.2f}, roll {pose.roll_deg:.2f},"
@@ -187,7 +184,7 @@ class Hands:
         )
 
 
-def _up(pitch_deg: float, roll_deg: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _up(pitch_deg: float, roll_deg: float) -> Array:
     """Up in the aircraft's axes, forward, right, down."""
     return -body_from_ned(math.radians(roll_deg), math.radians(pitch_deg), 0.0)[:, 2]
 

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
-from sim.aircraft import VirtualAircraft
 from sim.devices import SerialDevice
 
 Parity = Literal["none", "even", "odd"]
@@ -207,11 +206,7 @@ class PtyDevice:
             os.close(slave)
 
     def _now_s(self) -> float:
-        return self._aircraft.time_at(asyncio.get_running_loop().time())
-
-    @property
-    def _aircraft(self) -> VirtualAircraft:
-        return self.device.aircraft
+        return self.device.aircraft.time_at(asyncio.get_running_loop().time())
 
     async def _serve(self) -> None:
         was_opened = False

@@ -162,10 +162,9 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
         lines.append("# no autopilot is simulated here; `python -m sim autopilot` is one")
     lines.append(f'url = "udpin:{udp[0]}:{udp[1]}"' if udp else f'url = "udpin:{DEFAULT_UDP}"')
     if udp is not None:
-        for number, model in enumerate(scenario.flight_controller_imus, 1):
-            if number == 1:
-                lines += ["", "[[imu]]", 'name = "fc"', 'source = "autopilot"', f"instance = {number}"]
-                lines.append(f'profile = "{_PROFILES.get(model.spec.name, model.spec.name)}"')
+        part = scenario.flight_controller_imus[0].spec.name
+        lines += ["", "[[imu]]", 'name = "fc"', 'source = "autopilot"', "instance = 1"]
+        lines.append(f'profile = "{_PROFILES.get(part, part)}"')
     if directory is None:
         site = scenario.aircraft.site
         lines += ["", f"# no gradienter, no compass; the site is {site.latitude_deg} {site.longitude_deg}"]

@@ -32,7 +32,6 @@ class UdpEnd(asyncio.DatagramProtocol):
     def __init__(self, end: End, target: tuple[str, int] | None) -> None:
         self._end, self._target, self._peer = end, target, target
         self._transport: asyncio.DatagramTransport | None = None
-        self.dropped = 0
         self.local: tuple[str, int] = ("", 0)
         """The address the socket has."""
 
@@ -66,7 +65,6 @@ class UdpEnd(asyncio.DatagramProtocol):
             return
         writing = cast("asyncio.WriteTransport", self._transport)  # typeshed forgot the method on datagrams
         if writing.get_write_buffer_size() > MAX_QUEUED_BYTES:
-            self.dropped += 1
             return
         self._transport.sendto(data, self._peer)
 

@@ -19,7 +19,7 @@ from companion.estimation.means.windows import ImuInput, ImuWindow
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.counting import Counted, TurnCounter
 from companion.samples import ImuSample
-from sim.accuracy.figures import Claim, Figure, Section, covered, rms
+from sim.accuracy.figures import Claim, Figure, Section, covered, rms, stack
 from sim.accuracy.stand import GRAVITY_ANOMALY_M_S2, NEXT_S, RATE_HZ, AnomalousSite, local, sites
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
@@ -281,10 +281,6 @@ def section(runs: list[HandRun], each: int) -> Section:
     return Section(f"By hand, without a gradienter ({each} aircraft of each part)", lines, claims)
 
 
-def _stack(runs: list[HandRun], name: str) -> Array:
-    return np.array([getattr(run, name) for run in runs])
-
-
 def _covers(words: str, errors: Array, sigmas: Array, claims: list[Claim]) -> Figure:
     found = covered(errors, sigmas, 2.0).times(100.0)
     claims.append(Claim(f"{words}: 2 sigma cover", "%", found, COVERS[1], COVERS[0]))
@@ -300,18 +296,18 @@ def _turns(parts: dict[str, list[HandRun]], claims: list[Claim]) -> list[str]:
     for row, (headings, slope) in enumerate(TURNS):
         line = f"{headings} on {slope:3.1f} deg "
         for part, runs in parts.items():
-            error, sigma = _stack(runs, "turn")[:, row], _stack(runs, "turn_sigma")[:, row]
+            error, sigma = stack(runs, "turn")[:, row], stack(runs, "turn_sigma")[:, row]
             found = rms(error).times(1.0 / MG)
             mean = float(sigma.mean()) / MG
             share = covered(error, sigma, 2.0).times(100.0)
-            off = rms(_stack(runs, "slope")[:, row]).times(1.0 / _DEGREE)
+            off = rms(stack(runs, "slope")[:, row]).times(1.0 / _DEGREE)
             line += f"{found.value:8.3f}{mean:6.3f}{share.value:5.0f} %{off.value:6.3f}"
             claims.append(Claim(f"turn, {part}, {headings} on {slope:g} deg: rms", "mg", found, TURN_MG))
         lines.append(line)
     every = [run for runs in parts.values() for run in runs]
     for headings in (2, 4):
         rows = [row for row, turn in enumerate(TURNS) if turn[0] == headings]
-        error, sigma = (_stack(every, name)[:, rows] for name in ("turn", "turn_sigma"))
+        error, sigma = (stack(every, name)[:, rows] for name in ("turn", "turn_sigma"))
         _covers(f"turn, {headings} headings", error, sigma, claims)
     return lines
 
@@ -323,13 +319,13 @@ def _six_sides(parts: dict[str, list[HandRun]], claims: list[Claim]) -> list[str
         f"{'':12}{'companion':>15}{'sigma':>15}{'2 sigma':>8}",
     ]
     for part, runs in parts.items():
-        errors, sigma = _stack(runs, "faces"), _stack(runs, "faces_sigma")
+        errors, sigma = stack(runs, "faces"), stack(runs, "faces_sigma")
         bias, scale = rms(errors[:, _BIAS]).times(1.0 / MG), rms(errors[:, _SCALE]).times(100.0)
         line = f"{part:12}{bias.value:8.3f}{scale.value:7.4f}"
         claims.append(Claim(f"faces, {part}: bias, rms", "mg", bias, BIAS_MG))
         claims.append(Claim(f"faces, {part}: scale, rms", "%", scale, SCALE_PERCENT))
         share = _covers(f"faces, {part}", errors, sigma, claims)
-        checked = Figure(100.0 * float(_stack(runs, "faces_checked").mean()), 0.0)
+        checked = Figure(100.0 * float(stack(runs, "faces_checked").mean()), 0.0)
         line += f"{sigma[:, _BIAS].mean() / MG:8.3f}{100.0 * sigma[:, _SCALE].mean():7.4f}{share.value:6.0f} %"
         claims.append(Claim(f"faces, {part}: no good stand blamed", "%", checked, 100.0, 98.0))
         lines.append(line)
@@ -342,8 +338,8 @@ def _level(parts: dict[str, list[HandRun]], claims: list[Claim]) -> list[str]:
         "",
     ]
     for part, runs in parts.items():
-        error, sigma = _stack(runs, "level"), _stack(runs, "level_sigma")
-        found, theirs = (rms(one).times(1.0 / _DEGREE) for one in (error, _stack(runs, "level_firmware")))
+        error, sigma = stack(runs, "level"), stack(runs, "level_sigma")
+        found, theirs = (rms(one).times(1.0 / _DEGREE) for one in (error, stack(runs, "level_firmware")))
         claims.append(Claim(f"level, {part}: rms", "deg", found, LEVEL_DEG))
         share = _covers(f"level, {part}", error, sigma, claims)
         lines.append(f"{part:12}{found.value:8.4f}{share.value:7.0f} %{theirs.value:8.2f}")

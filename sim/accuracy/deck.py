@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from companion.estimation.request import What
 from companion.estimation.seconds.batch import summary, unrolled
 from companion.estimation.solution.solve import solve
 from sim.accuracy.experiments import many
-from sim.accuracy.figures import Claim, Figure, Section, covered, rms
+from sim.accuracy.figures import Claim, Errors, Figure, Section, covered, rms, stack
 from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite, local
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
@@ -68,18 +68,13 @@ class Voyage:
         return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DeckRun:
-    """Errors against the mean bias of the next minutes and sigmas, (spans, 6): rad/s, m/s^2, vehicle FRD."""
-
-    error: Array
-    sigma: Array
-
-
 def sail(
     voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[GradienterModel, CompassModel], Deck] = Deck
-) -> DeckRun:
-    """One aircraft with one IMU, calibrated after so many seconds each (ascending) by the deck that is `made`."""
+) -> Errors:
+    """One aircraft with one IMU, calibrated after so many seconds each (ascending) by the deck that is `made`.
+
+    Errors (spans, 6) are against the mean bias of the next minutes: rad/s, m/s^2, vehicle FRD.
+    """
     random = np.random.default_rng([seed, 51])
     pitch, roll = random.normal(size=2) * 2.0
     pose = Pose(float(pitch), float(roll), float(random.uniform(0.0, 360.0)))
@@ -114,7 +109,7 @@ def sail(
         error, sigma = _against_the_truth(found.window, imu, tilt, compass)
         errors.append(error)
         sigmas.append(sigma)
-    return DeckRun(np.array(errors), np.array(sigmas))
+    return Errors(np.array(errors), np.array(sigmas))
 
 
 def feed(deck: Deck, imu: ImuModel, seconds: int, random: np.random.Generator, compass_sigma_deg: float) -> None:
@@ -202,10 +197,10 @@ def section(voyages: int, stands: int, seed: int, jobs: int) -> Section:
     claims: list[Claim] = []
     for index, span in enumerate(SPANS_S):
         lines += _rows(f"sea, {span} s", sea, index)
-        twice = covered(_stack(sea, "error")[:, index], _stack(sea, "sigma")[:, index], 2.0)
+        twice = covered(stack(sea, "error")[:, index], stack(sea, "sigma")[:, index], 2.0)
         claims.append(Claim(f"deck, {span} s: 2 sigma covers", "%", twice.times(100.0), 98.0, 93.0))
         for name, unit, part in _TRIADS[:2]:
-            found = rms(_stack(sea, "error")[:, index, part] / unit)
+            found = rms(stack(sea, "error")[:, index, part] / unit)
             claims.append(Claim(f"deck, {span} s: {name}", "", found, MOST[name, span], 0.0))
     for index, span in enumerate(STILL_S):
         lines += _rows(f"still, {span} s", still, index)
@@ -214,9 +209,9 @@ def section(voyages: int, stands: int, seed: int, jobs: int) -> Section:
     return Section(f"On a deck ({voyages} voyages, {stands} stands)", lines, claims)
 
 
-def _rows(title: str, runs: list[DeckRun], index: int) -> list[str]:
+def _rows(title: str, runs: list[Errors], index: int) -> list[str]:
     lines = []
-    errors, sigmas = _stack(runs, "error")[:, index], _stack(runs, "sigma")[:, index]
+    errors, sigmas = stack(runs, "error")[:, index], stack(runs, "sigma")[:, index]
     for name, unit, part in _TRIADS:
         error, sigma = errors[:, part], sigmas[:, part]
         found, twice = rms(error / unit), covered(error, sigma, 2.0)
@@ -229,12 +224,8 @@ def _rows(title: str, runs: list[DeckRun], index: int) -> list[str]:
     return lines
 
 
-def _over_the_ground(runs: list[DeckRun], index: int, span_s: int) -> Figure:
+def _over_the_ground(runs: list[Errors], index: int, span_s: int) -> Figure:
     """Sigma of the gyros over that of a mean of as long, V(T, H)."""
     model = PROFILES[STILL.part].gyro
     at_rest = math.sqrt(model.white**2 / span_s + float(floor_variance(model.flicker, model.walk, span_s, NEXT_S)))
-    return rms(_stack(runs, "sigma")[:, index, :3] / at_rest)
-
-
-def _stack(runs: list[DeckRun], name: str) -> Any:
-    return np.array([getattr(run, name) for run in runs])
+    return rms(stack(runs, "sigma")[:, index, :3] / at_rest)

@@ -26,7 +26,6 @@ from sim.accuracy.stand import (
     biases,
     collected,
     samples,
-    sigmas_stat,
     sigmas_use,
     sites,
     solved,
@@ -101,7 +100,7 @@ def white(seed: int, number: int) -> WhiteRun:
         imu = solved(standing, window).imus[0]
         inside = standing.in_vehicle(whole_seconds(times, rows, window))
         still = inside.mean(axis=0) - standing.in_vehicle(standing.imu.expected(window.start_s))
-        found.append(((biases(imu) - truth) / bound, sigmas_stat(imu) / bound, still / bound))
+        found.append(((biases(imu) - truth) / bound, imu.sigma_stat / bound, still / bound))
     return WhiteRun(*np.array(found).transpose(1, 0, 2))
 
 
@@ -220,7 +219,7 @@ def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
         imu = solved(standing, window).imus[0]
     except CalibrationRefusedError:  # gyros and accelerometers
         return IntegerRun(np.full(6, np.nan), np.full(6, np.nan), plain / steps)
-    return IntegerRun((biases(imu) - bias) / steps, sigmas_stat(imu) / steps, plain / steps)
+    return IntegerRun((biases(imu) - bias) / steps, imu.sigma_stat / steps, plain / steps)
 
 
 def predicted(noise: AxisNoise, mean_s: float, horizon_s: float) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,19 @@ class Figure(NamedTuple):
     def times(self, factor: float) -> Figure:
         """In another unit."""
         return Figure(self.value * factor, self.error * abs(factor))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """Errors and the sigmas stated for them, of one run."""
+
+    error: Array
+    sigma: Array
+
+
+def stack(runs: Sequence[object], name: str) -> Any:
+    """One attribute of all runs as an array (runs, ...)."""
+    return np.array([getattr(run, name) for run in runs])
 
 
 def rms(errors: Array) -> Figure:

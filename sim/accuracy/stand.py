@@ -117,11 +117,6 @@ class Stand:
         """True."""
         return self.imu.aircraft.pose.heading_deg
 
-    def read(self, start_s: float, period_s: float, count: int) -> Array:
-        """`count` readings (count, 6) in vehicle FRD, each the mean over `period_s`, from `start_s` on."""
-        times = start_s + (np.arange(count, dtype=np.float64) + 0.5) * period_s
-        return self.in_vehicle(self.imu.read(times, period_s))
-
     def in_vehicle(self, rows: Array) -> Array:
         """Readings (…, 6) of sensor axes in the vehicle's."""
         turn = self.imu.mounting.T
@@ -286,11 +281,6 @@ def biases(found: ImuSolution) -> Array:
             refused if found.accel_m_s2 is None else found.accel_m_s2,
         ]
     )
-
-
-def sigmas_stat(found: ImuSolution) -> Array:
-    """(6,) sigma_stat."""
-    return found.sigma_stat
 
 
 def sigmas_use(found: ImuSolution) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -25,9 +26,9 @@ from sim.accuracy.experiments import (
     predicted,
     white,
 )
-from sim.accuracy.figures import Claim, Figure, Section, beside, covered, rms
+from sim.accuracy.figures import Claim, Figure, Section, beside, covered, rms, stack
 from sim.accuracy.stand import NEXT_S, POSTURES
-from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.earth import STANDARD_GRAVITY_M_S2
 from sim.imu_model import DEG_H, PARTS, UG
 
 UPRIGHT: Final = ("level", "by eye", "5/-3")
@@ -62,8 +63,7 @@ def report(
     if {"floors", "tilt"} & set(only):
         each = max(runs // 5, len(POSTURES))
         progress(f"flicker and walk: {each} stands of each of {len(FLOORED)} parts")
-        work = [(part, seed, number) for part in FLOORED for number in range(each)]
-        flat = many(floors, work, jobs)
+        flat = many(floors, [*product(FLOORED, [seed], range(each))], jobs)
         parts = {part: flat[each * index : each * (index + 1)] for index, part in enumerate(FLOORED)}
         for name, make in (("floors", _floors), ("tilt", _tilt)):
             if name in only:
@@ -71,12 +71,12 @@ def report(
     if "warm-up" in only:
         each = max(runs // 100, 1)
         progress(f"warm-up: {each} stands of each of {len(warmup.WARMING)} parts in {len(warmup.cases())} cases")
-        heated = [(part, case, seed, k) for part in warmup.WARMING for case in warmup.cases() for k in range(each)]
-        found["warm-up"] = warmup.section(many(warmup.warm, heated, jobs), each)
+        heated = product(warmup.WARMING, warmup.cases(), [seed], range(each))
+        found["warm-up"] = warmup.section(many(warmup.warm, [*heated], jobs), each)
     if "integers" in only:
         each = max(runs // 20, 4)
         progress(f"integers: {each} stands of each of {len(NOISE_LSB)} noises")
-        cut = many(integers, [(noise, seed, number) for noise in NOISE_LSB for number in range(each)], jobs)
+        cut = many(integers, [*product(NOISE_LSB, [seed], range(each))], jobs)
         found["integers"] = _integers(
             {noise: cut[each * index : each * (index + 1)] for index, noise in enumerate(NOISE_LSB)}
         )
@@ -91,8 +91,8 @@ def report(
     if "by-hand" in only:
         each = max(runs // 10, 1)
         progress(f"by hand: {each} aircraft of each of {len(by_hand.BY_HAND)} parts")
-        boards = [(part, seed, number) for part in by_hand.BY_HAND for number in range(each)]
-        found["by-hand"] = by_hand.section(many(by_hand.by_hand, boards, jobs), each)
+        boards = product(by_hand.BY_HAND, [seed], range(each))
+        found["by-hand"] = by_hand.section(many(by_hand.by_hand, [*boards], jobs), each)
     found |= _by_temperature(runs, seed, only, jobs, progress)
     return found
 
@@ -104,14 +104,13 @@ def _by_temperature(
     if "power-up" in only:
         each = max(runs // 20, 1)
         progress(f"power-up: {each} aircraft of each of {len(temperature.TRIED)} parts")
-        days = [(part, seed, number) for part in temperature.TRIED for number in range(each)]
-        found["power-up"] = temperature.power_up_section(many(temperature.power_up, days, jobs), each)
+        days = product(temperature.TRIED, [seed], range(each))
+        found["power-up"] = temperature.power_up_section(many(temperature.power_up, [*days], jobs), each)
     if "mid-warm-up" in only:
         each = max(runs // 20, 1)
         progress(f"mid-warm-up: {each} aircraft of each of {len(temperature.TRIED)} parts and rates")
-        rates = temperature.RATES_K_MIN
-        wanted = [(part, rate, seed, k) for part in temperature.TRIED for rate in rates for k in range(each)]
-        found["mid-warm-up"] = temperature.mid_warm_up_section(many(temperature.mid_warm_up, wanted, jobs), each)
+        wanted = product(temperature.TRIED, temperature.RATES_K_MIN, [seed], range(each))
+        found["mid-warm-up"] = temperature.mid_warm_up_section(many(temperature.mid_warm_up, [*wanted], jobs), each)
     return found
 
 
@@ -120,8 +119,8 @@ def _percent(figure: Figure) -> str:
 
 
 def _white(runs: list[WhiteRun]) -> Section:
-    error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
-    plain = np.array([run.plain for run in runs])
+    error, sigma = stack(runs, "error"), stack(runs, "sigma")
+    plain = stack(runs, "plain")
     lines = ["window  rms over bound  over the plain mean  2 sigma of sigma_stat cover"]
     claims = []
     for index, span in enumerate(SPANS_S):
@@ -138,10 +137,6 @@ def _white(runs: list[WhiteRun]) -> Section:
         "beside it the luck of the readings falls out.",
     ]
     return Section(f"White noise only, perfect references ({len(runs)} stands)", lines, claims)
-
-
-def _stack(runs: list[FloorRun], name: str) -> Array:
-    return np.array([getattr(run, name) for run in runs])
 
 
 def _upright(runs: list[FloorRun]) -> list[FloorRun]:
@@ -161,15 +156,15 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
             gyro = triad == "gyro"
             noise = PARTS[part].gyro if gyro else PARTS[part].accel
             for index, span in enumerate(SPANS_S):
-                ideal = _stack(runs, "ideal")[:, index, :3] if gyro else _stack(level, "ideal")[:, index, 3:5]
+                ideal = stack(runs, "ideal")[:, index, :3] if gyro else stack(level, "ideal")[:, index, 3:5]
                 found = rms(ideal).times(1.0 / scale)
                 use = predicted(noise, span, NEXT_S) / scale
-                error, sigma = _stack(runs, "error")[:, index, columns], _stack(runs, "sigma")[:, index, columns]
+                error, sigma = stack(runs, "error")[:, index, columns], stack(runs, "sigma")[:, index, columns]
                 words = f"{part if gyro and not index else '':10}{f'{triad}, {unit}' if not index else '':13}"
                 line = f"{words}{span:3d} s{found.value:9.1f}{found.value / use:6.2f}"
                 line += f"{_percent(covered(error, sigma, 2.0)):>15}"
                 if gyro:
-                    plain, plain_sigma = _stack(runs, "plain")[:, index, :3], _stack(runs, "plain_sigma")[:, index, :3]
+                    plain, plain_sigma = stack(runs, "plain")[:, index, :3], stack(runs, "plain_sigma")[:, index, :3]
                     line += f"{rms(plain).value / scale:12.1f}{_percent(covered(plain, plain_sigma, 2.0)):>8}"
                 lines.append(line)
                 if part == "icm42688p" and gyro and span == SPANS_S[-1]:
@@ -192,7 +187,7 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
         "tilt reference       its own error     rms   over it   mean of |error|",
     ]
     claims = []
-    tilted = _stack(runs, "tilted")
+    tilted = stack(runs, "tilted")
     for index, (name, sigma) in enumerate(TILTS):
         own = float(np.radians(sigma)) * STANDARD_GRAVITY_M_S2 / UG
         found = rms(tilted[:, index]).times(1.0 / UG)
@@ -221,7 +216,7 @@ def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
     ]
     claims = []
     for noise, runs in noises.items():
-        error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
+        error, sigma = stack(runs, "error"), stack(runs, "sigma")
         refused = np.isnan(error)
         coarse = ~refused & (sigma >= _HALF_A_STEP)
         measured = np.where(refused | coarse, np.nan, error)
@@ -242,7 +237,7 @@ def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
         if coarse.any():
             kept = covered(np.where(coarse, error, np.nan), sigma, 1.0).times(100.0)
             claims.append(Claim(f"integers, noise {noise:g}: half a step covers", "%", kept, 100.0, 99.9))
-        lines.append(words + f"{rms(np.array([run.plain for run in runs])).value * _LSB_DEG_H:11.0f}")
+        lines.append(words + f"{rms(stack(runs, 'plain')).value * _LSB_DEG_H:11.0f}")
     lines += [
         "",
         "Refused: around zero, where nothing is known but that the bias is small. Half a step: sigma says so,",

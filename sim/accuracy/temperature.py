@@ -19,7 +19,7 @@ from companion.estimation.records.history import MeasuredBias, Point, PowerUp, b
 from companion.estimation.solution.joint import at_end, with_warm
 from companion.estimation.solution.prior import ExpectedImu, curve_of, expect, pose_effect
 from companion.estimation.temperature.curve import settling
-from sim.accuracy.figures import Claim, Section, covered, rms
+from sim.accuracy.figures import Claim, Errors, Section, covered, rms, stack
 from sim.accuracy.stand import POSTURES, References, collected, samples, sites, solved, stand
 from sim.earth import Array
 from sim.imu_model import DEG_H, PARTS, AxisNoise
@@ -36,14 +36,6 @@ _SHORTEST_S: Final = 3
 _THERMOMETER_K: Final = 0.05
 _TAUS_S: Final = 3.0 ** np.arange(8.0)
 _UP: Final = (0.0, 0.0, -1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class PowerUpRun:
-    """Errors at the next power-up, (3,) each, in units of the part's run-to-run scatter."""
-
-    error: Array
-    sigma: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +123,8 @@ class Aircraft:
         return points
 
 
-def power_up(part: str, seed: int, number: int) -> PowerUpRun:
-    """One aircraft of a part: twenty days, and what is known when it is switched on again."""
+def power_up(part: str, seed: int, number: int) -> Errors:
+    """One aircraft of a part: twenty days, and what is known when it is switched on again, over the part's scatter."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
     aircraft = Aircraft(PARTS[part].gyro, random)
@@ -150,7 +142,7 @@ def power_up(part: str, seed: int, number: int) -> PowerUpRun:
     )
     expected = expect(known, "gyro", now, pose_effect(None), noise_profile(part).gyro)
     assert expected is not None
-    return PowerUpRun(
+    return Errors(
         error=(np.array(expected.value) - truth) / scatter,
         sigma=np.sqrt(expected.variance) / scatter,
     )
@@ -161,7 +153,7 @@ def _vector(values: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def power_up_section(runs: list[PowerUpRun], each: int) -> Section:
+def power_up_section(runs: list[Errors], each: int) -> Section:
     """So many aircraft of every part."""
     lines = [
         "the gyros' bias at power-up, rms error in deg/h: by the curve, sigma, 2 sigma cover;",
@@ -173,7 +165,7 @@ def power_up_section(runs: list[PowerUpRun], each: int) -> Section:
     for k, part in enumerate(TRIED):
         scatter = PARTS[part].gyro.scatter / DEG_H
         own = runs[each * k : each * (k + 1)]
-        error, sigma = (np.array([getattr(run, n) for run in own]) for n in ("error", "sigma"))
+        error, sigma = (stack(own, n) for n in ("error", "sigma"))
         ratio, share = rms(error), covered(error, sigma, 2.0).times(100.0)
         mean = float(np.sqrt(np.square(sigma).mean()))
         lines.append(
@@ -294,9 +286,9 @@ def mid_warm_up_section(runs: list[MidRun], each: int) -> Section:
                 then, left = rms(warm[told]).times(1.0 / DEG_H), rms(later).times(1.0 / DEG_H)
                 lines.append(
                     f"{part if rate == RATES_K_MIN[0] and not k else '':11}{rate:4g} K/min{span:5d} s"
-                    f"{before.value:9.1f}{_size(of_plain):7.1f}"
-                    f"{size.value:9.1f}{_size(sigma):7.1f}{share.value:6.1f}%"
-                    f"{then.value:9.1f}{_size(of_warm[told]):7.1f}{foreseen.value:6.1f}%{left.value:8.0f}"
+                    f"{before.value:9.1f}{rms(of_plain).value / DEG_H:7.1f}"
+                    f"{size.value:9.1f}{rms(sigma).value / DEG_H:7.1f}{share.value:6.1f}%"
+                    f"{then.value:9.1f}{rms(of_warm[told]).value / DEG_H:7.1f}{foreseen.value:6.1f}%{left.value:8.0f}"
                 )
         for words, pairs in (("at the end", ends), ("when warm", warms)):
             errors, sigmas = (np.concatenate(one) for one in zip(*pairs, strict=True))
@@ -311,7 +303,3 @@ def mid_warm_up_section(runs: list[MidRun], each: int) -> Section:
             )
     lines += ["", f"{DAYS} days before as above; the rate is that of the middle of the minute."]
     return Section(f"In mid-warm-up ({each} aircraft of each part and rate)", lines, claims)
-
-
-def _size(sigma: Array) -> float:
-    return float(np.sqrt(np.square(sigma).mean())) / DEG_H

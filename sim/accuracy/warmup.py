@@ -14,7 +14,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import allan_model, noise_profile
 from sim.accuracy.experiments import FIELD_HEADING_DEG, FIELD_TILT_DEG, SPANS_S
-from sim.accuracy.figures import Claim, Figure, Section, covered, rms
+from sim.accuracy.figures import Claim, Figure, Section, covered, rms, stack
 from sim.accuracy.stand import (
     GRAVITY_ANOMALY_M_S2,
     POSTURES,
@@ -163,7 +163,7 @@ def section(runs: list[WarmRun], each: int) -> Section:
                 mine = [run for case in wanted if case.thermometer == thermometer for run in by_case[part, case]]
                 if not mine:
                     continue
-                error, sigma = np.array([run.error for run in mine]), np.array([run.sigma for run in mine])
+                error, sigma = stack(mine, "error"), stack(mine, "sigma")
                 shares, accel = (
                     [covered(error[:, at, part_of], sigma[:, at, part_of], 2.0).times(100.0) for at in range(3)]
                     for part_of in (_GYRO, _ACCEL)

@@ -78,8 +78,8 @@ class Board(AutopilotDouble):
             tunes_go_on=False,
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
-        self._auxiliary, self.script = auxiliary, script
-        self.parameters = self._new_store(parameters or {})
+        self.script = script
+        self.parameters = self._new_store(parameters or {}, auxiliary=auxiliary)
         self.estimator = CoarseEstimator()
         self.airspeed_m_s = 0.0
         """What its VFR_HUD says."""
@@ -132,10 +132,6 @@ class Board(AutopilotDouble):
         """Time to the answer to a read, which waits for the next turn of a slow thread: 5 to 95 ms."""
         return float(self.random.uniform(0.005, 0.095))
 
-    def coin(self) -> bool:
-        """Heads or tails."""
-        return bool(self.random.integers(2))
-
     @abc.abstractmethod
     def announce(self, names: Iterable[str]) -> None:
         """PARAM_VALUE on every port for what the autopilot itself has changed and saved."""
@@ -149,11 +145,8 @@ class Board(AutopilotDouble):
             for number, chunk in enumerate(chunks):
                 self.answer(channel, mavlink.MAVLink_statustext_message(severity, chunk, text_id, number))
 
-    def _table(self) -> dict[str, tuple[float, int]]:
-        return default_parameters(self.version, len(self.imus), auxiliary=self._auxiliary)
-
-    def _new_store(self, overrides: Mapping[str, float]) -> ParameterStore:
-        table = self._table()
+    def _new_store(self, overrides: Mapping[str, float], *, auxiliary: bool) -> ParameterStore:
+        table = default_parameters(self.version, len(self.imus), auxiliary=auxiliary)
         own = "MAV_SYSID" if since(self.version, "4.7") else "SYSID_THISMAV"
         table[own] = (float(self.system_id), table[own][1])
         table["SCHED_LOOP_RATE"] = (LOOP_RATE_HZ[self.vehicle], table["SCHED_LOOP_RATE"][1])

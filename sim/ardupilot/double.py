@@ -57,11 +57,6 @@ class ArduPilotDouble(Board):
 
     # What tests and people do to it.
 
-    @property
-    def writes(self) -> list[Write]:
-        """Every PARAM_SET that arrived, obeyed or not, in order."""
-        return self._parameter_server.writes
-
     def parameter(self, name: str) -> float:
         """What is stored; KeyError if there is none of that name."""
         return self.parameters.values[name]
@@ -88,10 +83,6 @@ class ArduPilotDouble(Board):
         if self.armed:
             self.armed = False
             self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
-
-    def hears(self, component_id: int) -> bool:
-        """Whether that component of our system was heard since the last boot; else its messages end here."""
-        return self._router.knows(component_id)
 
     def prearm_failures(self, loop_s: float) -> list[str]:
         """Why it would not arm, in the firmware's words without the prefix."""
@@ -194,7 +185,7 @@ class ArduPilotDouble(Board):
         elif isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
             self.external_nav.take(message, loop_s)
         elif isinstance(message, mavlink.MAVLink_play_tune_message):
-            self.buzzer.take(message, loop_s, armed=self.armed)
+            self.buzzer.take(message, loop_s)
         elif isinstance(message, mavlink.MAVLink_tunnel_message):
             if self.script and bytes(message.payload[: message.payload_length]) == b"CMPF\x01":
                 self._floats_until_s = loop_s + FLOATS_ASKED_S
@@ -218,10 +209,6 @@ class Router:
     def forget(self) -> None:
         """A reboot."""
         self._routes.clear()
-
-    def knows(self, component_id: int) -> bool:
-        """Whether a component of our own system has been heard on any port."""
-        return (self._system_id, component_id) in self._routes
 
     def route(self, came_by: Channel, message: Message) -> bool:
         """Learn, forward, and say whether the autopilot is to handle the message itself."""

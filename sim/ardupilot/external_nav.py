@@ -18,7 +18,6 @@ COMPASS = 1
 EXTNAV = 6
 LEAST_SPACING_MS = 20
 HEALTHY_S = 0.3
-IN_USE_S = 5.0
 YAW_NOISE_RAD = 0.2
 """VISO_YAW_M_NSE's default: the least sigma that is believed; above 1.5 rad it is cut."""
 GATE_SIGMAS = 3.0
@@ -65,10 +64,6 @@ class ExternalNav:
     def healthy(self, loop_s: float) -> bool:
         """What the check before arming asks."""
         return loop_s - self._heard_s < HEALTHY_S
-
-    def in_use(self, loop_s: float) -> bool:
-        """Whether the EKF counts this as its source of yaw at present."""
-        return self.selected and loop_s - self._fused_s < IN_USE_S
 
     def take(self, message: mavlink.MAVLink_vision_position_estimate_message, loop_s: float) -> None:
         """Handle a VISION_POSITION_ESTIMATE."""

@@ -146,10 +146,6 @@ class InertialPath:
         caltemps = np.repeat([values[caltemp_name(number, "GYR")], values[caltemp_name(number, "ACC")]], 3)
         return values[tcal_name(number, "TMIN")], values[tcal_name(number, "TMAX")], coefficients, caltemps
 
-    def board(self) -> Array:
-        """The orientation in use, board to vehicle."""
-        return self._board
-
     def _advance(self, targets: Array, step_s: float) -> None:
         """Let the filter follow targets (n, 6), each for a step."""
         key = (round(step_s, 6), self._cutoff_hz())

@@ -43,7 +43,7 @@ def highres_imu(double: Board, loop_s: float) -> Message:
     baro_degc = double.aircraft.temperature_degc(t_s) + 7.63
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz,
-        pressure_hpa(double), 0.0, double.aircraft.site.height_m, baro_degc, 8191, 0,
+        pressure_hpa(double.aircraft.site.height_m), 0.0, double.aircraft.site.height_m, baro_degc, 8191, 0,
     )  # fmt: skip
 
 

@@ -23,14 +23,13 @@ class ParameterServer:
 
     def __init__(self, double: Board) -> None:
         self._double = double
-        self.writes: list[Write] = []
 
     def set(self, channel: Channel, message: mavlink.MAVLink_param_set_message, loop_s: float) -> None:
         """PARAM_SET: stored at once, armed or not; the answer goes to every port some milliseconds later."""
         double, faults = self._double, self._double.faults
         name, value = message.param_id, message.param_value
         source = (message.get_srcSystem(), message.get_srcComponent())
-        self.writes.append(Write(loop_s, name, value, double.armed, *source))
+        double.writes.append(Write(loop_s, name, value, double.armed, *source))
         if names_match(faults.ignore, name):
             return
         if name not in double.parameters:
@@ -88,7 +87,7 @@ class ParameterServer:
     def _whose_turn(self, asker: Channel) -> Channel:
         """The link by which the error to a read leaves: the one that is served when it is ready."""
         others = [channel for channel in self._double.channels if channel is not asker]
-        return others[0] if others and self._double.coin() else asker
+        return others[0] if others and self._double.random.integers(2) else asker
 
     def announce(self, name: str, *, wrong: bool = False) -> None:
         """PARAM_VALUE on every port, index 65535, as after a write."""

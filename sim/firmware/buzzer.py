@@ -1,8 +1,7 @@
 """The buzzer of a double: what PLAY_TUNE makes it play, note by note, written from MAVLink's text and the firmwares.
 
 Both firmwares take QBasic's PLAY (ArduPilot MMLPlayer.cpp, PX4 lib/tunes/tunes.cpp); only the part of it is here that
-anybody needs for a signal. A firmware neither refuses a tune while it is armed nor says anything of it: `while_armed`
-counts what a companion should not have sent.
+anybody needs for a signal.
 """
 
 from __future__ import annotations
@@ -54,16 +53,13 @@ class Buzzer:
     def __init__(self, *, goes_on: bool) -> None:
         self.played: list[Played] = []
         """Every tune, in order."""
-        self.while_armed = 0
-        """Of these, tunes that came while it was armed."""
         self.broken_off = 0
         """Tunes that a later one cut short, or that were read from their middle."""
         self._goes_on = goes_on
 
-    def take(self, message: mavlink.MAVLink_play_tune_message, now_s: float, *, armed: bool) -> None:
+    def take(self, message: mavlink.MAVLink_play_tune_message, now_s: float) -> None:
         """PLAY_TUNE for this autopilot."""
         tune = Played(now_s, notes_of(message.tune + message.tune2))
-        self.while_armed += armed
         if self.played and now_s < self.played[-1].at_s + self.played[-1].seconds:
             self.broken_off += 1
             if self._goes_on:

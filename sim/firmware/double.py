@@ -53,6 +53,8 @@ class AutopilotDouble(abc.ABC):
         """The board's unique id, in AUTOPILOT_VERSION."""
         self.calibrating = False
         self.boots = 0
+        self.writes: list[Write] = []
+        """Every PARAM_SET that arrived, obeyed or not, in order; integers as numbers."""
         declination = math.radians(aircraft.site.declination_deg)
         north, down = FIELD_MILLIGAUSS
         self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
@@ -120,11 +122,6 @@ class AutopilotDouble(abc.ABC):
     @abc.abstractmethod
     def disarm(self) -> None:
         """The pilot disarms."""
-
-    @property
-    @abc.abstractmethod
-    def writes(self) -> list[Write]:
-        """Every PARAM_SET that arrived, obeyed or not, in order."""
 
     @abc.abstractmethod
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:

@@ -28,9 +28,9 @@ def in_integers(output: Array) -> list[int]:
     return [truncated_16(float(value)) for value in (*milli_g, *output[:3] * 1000.0)]
 
 
-def pressure_hpa(double: AutopilotDouble) -> float:
-    """Of the standard atmosphere at the site."""
-    return float(1013.25 * (1.0 - double.aircraft.site.height_m / 44330.8) ** 5.25588)
+def pressure_hpa(height_m: float) -> float:
+    """Static pressure of the standard atmosphere."""
+    return float(1013.25 * (1.0 - height_m / 44330.8) ** 5.25588)
 
 
 def magnetic_body(double: AutopilotDouble, t_s: float) -> Array:

@@ -74,8 +74,6 @@ class FlyingAircraft(VirtualAircraft):
         self._count = 0
         self.recorded: list[tuple[float, ...]] = []
         """Every 20 ms of the firmware's clock: own_s, roll, pitch, yaw (rad, not wrapped), position (m), velocity."""
-        self.late = 0
-        """How often something was asked for that had not arrived."""
 
     @property
     def own_s(self) -> float:
@@ -138,7 +136,6 @@ class FlyingAircraft(VirtualAircraft):
         found: Array = (rows[columns, after - 1] * (1.0 - share) + rows[columns, after] * share).T
         late_s = np.clip(asked - last[_T], 0.0, LATE_S)
         if late_s[-1] > 0.0:
-            self.late += 1
             before = rows[:, -min(_SLOPE_ROWS, rows.shape[1])]
             found += np.outer(late_s, (last - before)[columns] / max(last[_T] - before[_T], 1e-3))
         return found

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
-from sim.earth import Array
 from sim.firmware.channel import Channel, Message, Write, command_of
 from sim.firmware.faults import Faults
 from sim.imu_model import ImuModel
@@ -29,22 +28,9 @@ from sim.px4.port import PX4Port
 from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, Calibrations, LearnedOffsets
 from sim.px4.shell import Shell
 
-__all__ = ["Applied", "Faults", "PX4Double", "Write"]
+__all__ = ["Faults", "PX4Double", "Write"]
 
 AUTOSAVE_S, AUTOSAVE_EVERY_S = 0.3, 2.0
-
-
-class Applied(NamedTuple):
-    """What one IMU works with at this moment, whatever its parameters say."""
-
-    gyro_offset_rad_s: Array
-    accel_offset_m_s2: Array
-    accel_scale: Array
-    gyro_slot: int | None
-    """n of CAL_GYROn_*; None: no slot has its device id."""
-    accel_slot: int | None
-    rotation: Array
-    """Sensor to vehicle."""
 
 
 class PX4Double(Board):
@@ -81,11 +67,6 @@ class PX4Double(Board):
 
     # What tests and people do to it.
 
-    @property
-    def writes(self) -> list[Write]:
-        """Every PARAM_SET that arrived, obeyed or not, in order; integers as numbers."""
-        return self._parameter_server.writes
-
     def parameter(self, name: str) -> float:
         """What is read back; KeyError if there is none of that name."""
         return self.parameters[name]
@@ -114,14 +95,6 @@ class PX4Double(Board):
             self.armed = False
             self.say(mavlink.MAV_SEVERITY_INFO, "Disarmed by external command\t")
             self.learned_offsets.disarmed(self.now_s(), self.now_s() - self._armed_s)
-
-    def applied(self, instance: int) -> Applied:
-        """What IMU `instance` (1..) works with: the truth behind the parameters."""
-        imu = self.vehicle_imus[instance - 1]
-        gyro, accel = imu.gyro, imu.accel
-        return Applied(
-            gyro.offset.copy(), accel.offset.copy(), accel.scale.copy(), gyro.slot, accel.slot, accel.rotation.copy()
-        )
 
     def prearm_failures(self, loop_s: float) -> list[str]:
         """Why it would not arm, in the firmware's words without the prefix; the authorisation apart."""
@@ -238,7 +211,7 @@ class PX4Double(Board):
                 self.authorization.acknowledged(message)
         elif isinstance(message, mavlink.MAVLink_play_tune_message):
             if is_for_us(self.system_id, message, broadcast=True):
-                self.buzzer.take(message, loop_s, armed=self.armed)
+                self.buzzer.take(message, loop_s)
         elif isinstance(message, mavlink.MAVLink_serial_control_message):
             self.shell.take(channel, message, loop_s)
         elif isinstance(message, mavlink.MAVLink_timesync_message):

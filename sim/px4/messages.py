@@ -44,14 +44,14 @@ def heartbeat(double: Board, loop_s: float) -> Message:
 
 def highres_imu(double: Board, loop_s: float) -> Message:
     """HIGHRES_IMU: the primary IMU less the published estimate of its bias; the temperature is the air's."""
-    t_s = double.aircraft.time_at(loop_s)
+    t_s, height_m = double.aircraft.time_at(loop_s), double.aircraft.site.height_m
     sample_s, output = double.imu_output(double.primary_imu, loop_s)
     double.update_estimators(loop_s)
     gx, gy, gz, ax, ay, az = (output - double.vehicle_imus[double.primary_imu].estimator.published).tolist()
     mx, my, mz = (magnetic_body(double, t_s) * 0.001).tolist()
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(double.aircraft.loop_time_of(sample_s)), ax, ay, az, gx, gy, gz, mx, my, mz,
-        pressure_hpa(double), 0.0, double.aircraft.site.height_m, double.aircraft.temperature_degc(t_s) + 7.63, 4095, 0,
+        pressure_hpa(height_m), 0.0, height_m, double.aircraft.temperature_degc(t_s) + 7.63, 4095, 0,
     )  # fmt: skip
 
 

@@ -29,7 +29,6 @@ class ParameterServer:
 
     def __init__(self, double: Board) -> None:
         self._double = double
-        self.writes: list[Write] = []
         self._telling: set[int] = set()
 
     def restart(self) -> None:
@@ -42,7 +41,7 @@ class ParameterServer:
         name, kind = message.param_id, message.param_type
         value = float(float_as_int(message.param_value)) if kind == INT32 else message.param_value
         source = (message.get_srcSystem(), message.get_srcComponent())
-        self.writes.append(Write(loop_s, name, value, double.armed, *source))
+        double.writes.append(Write(loop_s, name, value, double.armed, *source))
         if names_match(double.faults.ignore, name):
             return
         if name == HASH_NAME:

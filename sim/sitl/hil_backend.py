@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.earth import STANDARD_GRAVITY_M_S2, body_from_ned
+from sim.firmware.messages import pressure_hpa
 from sim.imu_model import ImuModel
 from sim.sitl.samples import Sample, SampleBlocks
 
@@ -43,11 +44,6 @@ def on_fifo_grid(reading: Sequence[float]) -> list[float]:
     steps = [round(value / step) for value, step in zip(reading, FIFO_STEPS, strict=True)]
     # A little beyond the number, or the conversion may fall back to the one before.
     return [(n + math.copysign(_ABOVE, n)) * step if n else 0.0 for n, step in zip(steps, FIFO_STEPS, strict=True)]
-
-
-def pressure_hpa(height_m: float) -> float:
-    """Static pressure of the standard atmosphere."""
-    return float(1013.25 * (1.0 - height_m / 44330.8) ** 5.25588)
 
 
 class Codec:
@@ -166,7 +162,8 @@ class HilBackend:
         self._server: asyncio.Server | None = None
         self._driving: asyncio.Task[None] | None = None
         self._answered = asyncio.Event()
-        self._locked = False
+        self.locked = False
+        """Whether the firmware answers our frames."""
         self.port = 0
         self.boots = 0
         """Connections, that is firmware starts."""
@@ -181,11 +178,6 @@ class HilBackend:
     def physics_s(self) -> float:
         """The firmware's simulated time since its boot."""
         return self.frames / FRAME_HZ
-
-    @property
-    def locked(self) -> bool:
-        """Whether the firmware answers our frames."""
-        return self._locked
 
     async def __aenter__(self) -> Self:
         """Listen."""
@@ -213,7 +205,7 @@ class HilBackend:
         codec = Codec()
         self.blocks.restart()
         self._answered.clear()
-        self._locked = self.armed = False
+        self.locked = self.armed = False
         self.boots += 1
         self.frames = 0
         driving = self._driving = asyncio.create_task(self._drive(codec, writer), name="hil frames")
@@ -221,7 +213,7 @@ class HilBackend:
             while data := await reader.read(4096):
                 for _, armed in codec.actuator_controls(data):
                     self.armed = armed
-                    self._locked = True
+                    self.locked = True
                     self._answered.set()
         except OSError:  # the firmware has gone
             pass
@@ -238,9 +230,9 @@ class HilBackend:
             while True:
                 self._answered.clear()
                 self.frames += 1
-                writer.write(self._frame(codec, self.blocks.next(1.0 / FRAME_HZ, self._now_s(loop))))
+                writer.write(self._frame(codec, self.blocks.next(1.0 / FRAME_HZ, self._aircraft.time_at(loop.time()))))
                 await writer.drain()
-                if self._locked and not self._answered.is_set():
+                if self.locked and not self._answered.is_set():
                     await self._wait_answer()
                 due_s += 1.0 / FRAME_HZ
                 behind_s = loop.time() - due_s
@@ -256,9 +248,6 @@ class HilBackend:
                 await self._answered.wait()
         except TimeoutError:
             self.unanswered += 1
-
-    def _now_s(self, loop: asyncio.AbstractEventLoop) -> float:
-        return self._aircraft.time_at(loop.time())
 
     def _frame(self, codec: Codec, sample: Sample) -> bytes:
         """Everything that is new at this instant; sensor 0 first, since it moves the firmware's clock."""

@@ -79,7 +79,8 @@ class JsonBackend:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._peer: tuple[str, int] | None = None
         self._count = -1
-        self._physics_s = 0.0
+        self.physics_s = 0.0
+        """The firmware's simulated time since its boot."""
         self._last = b""
         self._last_s = 0.0
         self.port = 0
@@ -87,11 +88,6 @@ class JsonBackend:
         """Firmware starts seen."""
         self.frames = 0
         """Frames sent, since the last boot."""
-
-    @property
-    def physics_s(self) -> float:
-        """The firmware's simulated time since its boot."""
-        return self._physics_s
 
     async def __aenter__(self) -> Self:
         """Bind the port."""
@@ -139,7 +135,7 @@ class JsonBackend:
 
     def _begin(self, peer: tuple[str, int]) -> None:
         """A firmware has started: its time starts from zero, and so must ours, or it would leap."""
-        self._peer, self._count, self._physics_s = peer, -1, 0.0
+        self._peer, self._count, self.physics_s = peer, -1, 0.0
         self.blocks.restart()
         self.boots += 1
         self.frames = 0
@@ -157,9 +153,9 @@ class JsonBackend:
         assert self._loop is not None
         interval_s = 1.0 / packet.frame_rate_hz
         self._count = packet.frame_count
-        self._physics_s += interval_s
+        self.physics_s += interval_s
         self._last_s = self._loop.time()
         now_s = self._aircraft.time_at(self._last_s)
-        self._last = encode_frame(self._physics_s, self.blocks.next(interval_s, now_s))
+        self._last = encode_frame(self.physics_s, self.blocks.next(interval_s, now_s))
         self.frames += 1
         return self._last

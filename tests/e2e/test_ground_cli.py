@@ -38,7 +38,7 @@ def test_calibrated_and_undone_from_the_ground(tmp_path: Path) -> None:
             assert done.json["vehicle"] == {"system_id": 1, "firmware": "ArduPilot", "armed": "disarmed"}
             assert autopilot.parameter(GYRO) != before
             # The daemon's own word for it, on the aircraft, by another way.
-            record = await line.daemon.last_record()
+            record = (await line.daemon.ask("history"))["records"][0]
             assert record["state"] == "done"
             sigma_rad_s = max(sigma for imu in record["imus"] for sigma in imu["gyro_sigma_use_rad_s"])
             assert done.json["gyro_sigma_deg_h"] == pytest.approx(sigma_rad_s * 57.29578 * 3600, rel=1e-3)

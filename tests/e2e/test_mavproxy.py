@@ -106,7 +106,7 @@ def test_what_the_documentation_says_to_type(tmp_path: Path) -> None:
             await station.prints(r"AP: Calibration started: keep the aircraft still")
             await station.prints(r"Got COMMAND_ACK: USER_1: ACCEPTED", within_s=60.0)
             figures = await station.prints(r"AP: \.\.\. sigma [\d.]+ deg/h(?: warming)?, [\d.]+ mg")
-            record = await line.daemon.last_record()
+            record = (await line.daemon.ask("history"))["records"][0]
             assert record["state"] == "done"
             assert figures.endswith(record["reason"])
             assert autopilot.parameter("INS_ACCOFFS_X") != before

@@ -45,8 +45,8 @@ def values(rig: Rig, wanted: list[str] = ALL) -> dict[str, float]:
 
 def uses(rig: Rig, instance: int = 1) -> tuple[list[float], list[float]]:
     """Gyro and accelerometer offsets that PX4 really takes off."""
-    applied = rig.px4.applied(instance)
-    return applied.gyro_offset_rad_s.tolist(), applied.accel_offset_m_s2.tolist()
+    imu = rig.px4.vehicle_imus[instance - 1]
+    return imu.gyro.offset.tolist(), imu.accel.offset.tolist()
 
 
 def in_use_as_stored(rig: Rig, instance: int = 1, slot: int = 0) -> bool:

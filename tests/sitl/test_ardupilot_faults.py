@@ -89,7 +89,7 @@ def test_only_what_the_record_says_changes_and_undo_brings_the_whole_list_back(t
             b.assert_right(now)
             assert_as_recorded(record, await b.changed())
             assert {*OUR_GYROS, *OUR_ACCELS} <= (await b.changed()).keys()
-            answer = await daemon.undo()
+            answer = await daemon.ask("undo")
             assert answer["state"] == "done", answer
             assert await b.changed() == {}
 
@@ -173,7 +173,7 @@ def test_with_a_fifth_of_all_packets_lost_the_result_is_right_or_refused(tmp_pat
             assert_as_recorded(record, changed)
             if record["state"] == "done":
                 b.assert_right(now)
-                answer = await daemon.undo()
+                answer = await daemon.ask("undo")
                 print(answer)
                 await until_quiet(daemon)
                 assert answer["state"] == "done", answer

@@ -74,7 +74,7 @@ def test_the_scripts_floats_tell_the_second_imu_without_a_write_before_the_resul
             b.assert_right(now, instance=2)
             assert_as_recorded(record, changed)
             assert {*SECOND_GYROS, *SECOND_ACCELS} <= changed.keys()
-            assert (await daemon.undo())["state"] == "done"
+            assert (await daemon.ask("undo"))["state"] == "done"
             assert await b.changed() == {}
 
     asyncio.run(main())

@@ -61,7 +61,7 @@ def test_a_fifth_of_all_packets_lost(tmp_path: Path, seed: int) -> None:
                 if record["state"] == "done":
                     assert_right(vehicle, wrote)
                     assert changed(before, await ground.whole_list(60.0)) == set(wrote)
-                    undone = await daemon.undo()
+                    undone = await daemon.ask("undo")
                     assert undone["state"] == "done", undone
                 else:
                     await asyncio.sleep(20.0)

@@ -42,7 +42,7 @@ def test_the_console_tells_the_second_imu_without_a_write_before_the_result(tmp_
                 assert np.sqrt(np.mean(gyro**2)) < 4.0
                 assert (np.abs(gyro) < 2.5 * sigma_deg_h).all()
                 assert np.abs(accel).max() < 0.2
-                assert (await daemon.undo())["state"] == "done"
+                assert (await daemon.ask("undo"))["state"] == "done"
                 assert not changed(before, await ground.whole_list(60.0))
 
     asyncio.run(main())

@@ -43,12 +43,12 @@ def test_undo_leaves_every_parameter_of_px4_as_it_was_also_after_a_power_cycle_a
                 # Somebody else writes one of ours: nothing is overwritten blindly.
                 await ground.put("CAL_GYRO0_XOFF", 0.001)
                 await vehicle.sleep(3.0)
-                refused = await daemon.undo()
+                refused = await daemon.ask("undo")
                 assert "CAL_GYRO0_XOFF" in str(refused)
                 assert "somebody else" in str(refused)
                 await ground.put("CAL_GYRO0_XOFF", wrote["CAL_GYRO0_XOFF"])
                 await vehicle.sleep(3.0)
-                undone = await daemon.undo()
+                undone = await daemon.ask("undo")
                 assert not changed(before, await ground.whole_list(60.0)), undone
 
     asyncio.run(main())

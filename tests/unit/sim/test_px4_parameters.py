@@ -36,7 +36,7 @@ async def test_a_write_while_armed_is_not_refused() -> None:
     async with PX4Stage() as stage:
         stage.double.arm()
         await stage.set_vector(0, "ACC", (0.3, 0.0, 0.0))
-        assert stage.double.applied(1).accel_offset_m_s2 == pytest.approx([0.3, 0.0, 0.0])
+        assert stage.double.vehicle_imus[0].accel.offset == pytest.approx([0.3, 0.0, 0.0])
         assert all(write.armed for write in stage.double.writes)
 
 
