@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
 import sys
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Self
 
+from companion.errors import DaemonUnreachableError
+from companion.links.system.control_client import ask
+
 READY_WITHIN_S: Final = 40.0
+POLL_S: Final = 0.1
 
 Record = dict[str, Any]
+
+
+async def status_of(config: Path) -> Record | None:
+    """The status of the daemon with this configuration, from its control socket; None while it does not answer."""
+    with contextlib.suppress(DaemonUnreachableError):
+        async for reply in ask(_socket_of(config), {"command": "status"}):
+            return reply.get("status")
+    return None
+
+
+def _socket_of(config: Path) -> Path:
+    control = tomllib.loads(config.read_text(encoding="utf-8")).get("control", {})
+    return Path(control.get("socket", "/run/companion/control.sock"))
 
 
 class CompanionProcess:
@@ -70,12 +89,8 @@ class CompanionProcess:
             return await self._process.wait()
 
     async def status(self) -> Record | None:
-        """`companion status --json`; None while it does not answer."""
-        asking = await asyncio.create_subprocess_exec(
-            *self.command("status", "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
-        )
-        output, _ = await asking.communicate()
-        return json.loads(output) if asking.returncode == 0 else None
+        """Its status; None while it does not answer."""
+        return await status_of(self.folder / "companion.toml")
 
     async def ready(self, within_s: float = READY_WITHIN_S) -> None:
         """Wait until the daemon answers and knows that the aircraft is disarmed."""
@@ -83,6 +98,7 @@ class CompanionProcess:
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
         while loop.time() < deadline_s:
+            await asyncio.sleep(POLL_S)
             if self._process.returncode is not None:
                 raise RuntimeError(f"the daemon ended:\n{self.log()}")
             status = await self.status()

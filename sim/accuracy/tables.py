@@ -81,7 +81,7 @@ def report(
             {noise: cut[each * index : each * (index + 1)] for index, noise in enumerate(NOISE_LSB)}
         )
     if "deck" in only:
-        voyages, stands = max(runs // 10, 4), max(runs // 40, 4)
+        voyages, stands = max(runs // 10, 2), max(runs // 40, 2)
         progress(f"deck: {voyages} voyages, {stands} stands")
         found["deck"] = deck.section(voyages, stands, seed, jobs)
     if "turning" in only:

@@ -60,20 +60,8 @@ VN100: Final = ImuSpec(
 SPECS: Final = {"vn100": VN100, **{name: PARTS[name] for name in ("icm42688p", "bmi088", "adis16405")}}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Compass:
-    """What the heading looks like."""
-
-    noise_deg: float = 0.5
-    resolution_deg: float = 0.0
-
-
-COMPASSES: Final[dict[str, Compass | None]] = {
-    "0.5 deg": Compass(),
-    "steps of 0.1": Compass(noise_deg=0.05, resolution_deg=0.1),
-    "steps of 1": Compass(noise_deg=0.2, resolution_deg=1.0),
-    "none": None,
-}
+COMPASSES: Final = {"0.5 deg": (0.5, 0.0), "steps of 0.1": (0.05, 0.1), "steps of 1": (0.2, 1.0), "none": None}
+"""Noise and resolution in degrees."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,9 +161,10 @@ class Platform:
             times = np.arange(0.03, end_s, 1.0 / COMPASS_HZ)
             angles = np.degrees(self.aircraft.angles_over(times)[:, 2])
             angles += random.standard_normal() - self.aircraft.site.declination_deg
-            angles += random.normal(size=len(times)) * self.compass.noise_deg
-            if self.compass.resolution_deg:
-                angles = np.round(angles / self.compass.resolution_deg) * self.compass.resolution_deg
+            noise_deg, resolution_deg = self.compass
+            angles += random.normal(size=len(times)) * noise_deg
+            if resolution_deg:
+                angles = np.round(angles / resolution_deg) * resolution_deg
             for t_s, angle in zip(times.tolist(), np.round(np.mod(angles, 360.0), 6).tolist(), strict=True):
                 found.append((t_s, partial(collector.add_compass, CompassSample(t_s, angle))))
         return sorted(found, key=lambda one: one[0])

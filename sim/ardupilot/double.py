@@ -19,14 +19,9 @@ from sim.ardupilot.external_nav import ExternalNav
 from sim.ardupilot.messages import BUILDERS, script_floats
 from sim.ardupilot.parameter_server import ParameterServer
 from sim.ardupilot.parameters import device_id, offset_names
-from sim.firmware.channel import Channel, Message, Stream, Write, command_of
+from sim.firmware.channel import Channel, Message, Stream, command_of
 from sim.firmware.double import HEARTBEAT
-from sim.firmware.faults import Faults
-from sim.firmware.numbers import float32
 from sim.imu_model import ImuModel
-
-__all__ = ["ArduPilotDouble", "Faults", "Write", "float32", "offset_names"]
-
 
 FLOATS = mavlink.MAVLINK_MSG_ID_DEBUG_FLOAT_ARRAY
 FLOATS_EVERY_S = 0.09

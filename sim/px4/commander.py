@@ -193,11 +193,11 @@ class Commander:
         return ACCEPTED
 
     def _calibrate(self, command: Command) -> int:
-        double, worker = self._double, self._calibrations
-        if double.armed or worker.busy:
+        double = self._double
+        if double.armed or double.calibrating:
             return TEMPORARILY_REJECTED
         if command.params[0] == 1.0:
-            worker.gyros()
+            self._calibrations.gyros()
         elif command.params[3] != 0.0:
             return UNSUPPORTED
         return ACCEPTED

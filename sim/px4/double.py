@@ -14,8 +14,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
-from sim.firmware.channel import Channel, Message, Write, command_of
-from sim.firmware.faults import Faults
+from sim.firmware.channel import Channel, Message, command_of
 from sim.imu_model import ImuModel
 from sim.px4.arming import ArmAuthorization, Checks
 from sim.px4.board import Board
@@ -27,8 +26,6 @@ from sim.px4.parameters import Consumer
 from sim.px4.port import PX4Port
 from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, Calibrations, LearnedOffsets
 from sim.px4.shell import Shell
-
-__all__ = ["Faults", "PX4Double", "Write"]
 
 AUTOSAVE_S, AUTOSAVE_EVERY_S = 0.3, 2.0
 
@@ -142,7 +139,6 @@ class PX4Double(Board):
             imu.restart()
         for part in (
             self._parameter_server,
-            self.calibrations,
             self.authorization,
             self.commander,
             self.vision,

@@ -26,29 +26,22 @@ _INFO, _CRITICAL = mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_CRITICAL
 
 
 class Calibrations:
-    """The commander's worker: one job at a time."""
+    """PX4's own gyro calibration on command.
+
+    The command is acknowledged at the start; what came of it is only said in texts. It does not take the Earth's
+    rotation out, and changes nothing below the threshold of 0.01 rad/s.
+    """
 
     def __init__(self, double: Board) -> None:
         self._double = double
-        self.busy = False
-
-    def restart(self) -> None:
-        """A boot."""
-        self.busy = False
 
     def gyros(self) -> None:
         """param1 = 1: mean of 250 samples of each gyro."""
-        self._begin("gyro")
+        self._double.calibrating = True
+        self._double.say(_INFO, "[cal] calibration started: 2 gyro")
         for percent in range(0, 101, 10):
             self._double.later(percent / 100.0 * 0.99, functools.partial(self._progress, percent))
         self._double.later(GYRO_TIME_S, lambda: self._finish_gyros(1))
-
-    def _occupy(self) -> None:
-        self.busy = self._double.calibrating = True
-
-    def _begin(self, what: str) -> None:
-        self._occupy()
-        self._double.say(_INFO, f"[cal] calibration started: 2 {what}")
 
     def _progress(self, percent: int) -> None:
         self._double.say(_INFO, f"[cal] progress <{percent}>")
@@ -58,7 +51,7 @@ class Calibrations:
         self._double.later(LINGERS_S, self._free)
 
     def _free(self) -> None:
-        self.busy = self._double.calibrating = False
+        self._double.calibrating = False
 
     def _still(self, over_s: float) -> bool:
         t_s = self._double.aircraft.time_at(self._double.now_s())

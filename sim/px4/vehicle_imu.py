@@ -29,7 +29,17 @@ _OBVIOUS_M_S2 = 0.5
 
 
 class Ekf2:
-    """States in vehicle FRD; `update` wants the current errors of the corrected IMU output (output minus truth)."""
+    """A coarse stand-in for EKF2: its bias estimates, and the tilt that has swallowed the accelerometer's bias.
+
+    States are in vehicle FRD; `update` wants the current errors of the corrected IMU output (output minus truth).
+
+    The gyro bias and the vertical accelerometer's are found within seconds, the Earth's rotation known. Of a horizontal
+    one everything goes into the tilt at the start; a later change goes mostly into a bias estimate, so that after a
+    write the old tilt stays, for minutes, until a reboot. An offset that is taken clears the estimate (autopilots 9.2,
+    9.3.2). Biases are published once a second, or as soon as one has moved by 0.001 (rad/s, m/s^2), and stand still
+    between (`PublishSensorBias` of EKF2.cpp); at rest they wander by fractions of a deg/h (seen on the real one: 0.2 to
+    0.5 deg/h, up to 10 micro-g).
+    """
 
     def __init__(self, seed: int = 0) -> None:
         self.published = np.zeros(6)

@@ -30,8 +30,6 @@ class Disk:
         self.cut_at: int | None = None
         """The power goes at this operation."""
         self.on_cut: Callable[[], None] = lambda: None
-        self.lost_at = ""
-        """Where the power went."""
 
     @contextlib.contextmanager
     def mounted(self) -> Iterator[None]:
@@ -87,7 +85,6 @@ class Disk:
             return
         self.cut_at = None
         after = name == "replace" and self._chance.random() < 0.5
-        self.lost_at = f"{name} {Path(path).name}"
         if after:
             _REAL["replace"](path, others[0])
             # The caller does it once more; the file has to be there for that.
@@ -109,5 +106,4 @@ class Disk:
                 size = copy.stat().st_size
                 with copy.open("r+b") as file:
                     file.truncate(int(share * (size + 1)))
-                self.lost_at += f" at byte {int(share * (size + 1))} of {size}"
         self.torn = (None, 1.0)

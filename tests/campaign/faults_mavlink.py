@@ -18,7 +18,6 @@ LOST = (
 )
 ARMED = r"armed|Armed"
 WRITES = "writing"
-NO_WRITE: dict[Phase, str] = {"armed": "nothing is written while armed"}
 
 
 def wire(**what: Any) -> tuple[Act, Act]:

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.support.wire import End, Wire
+from sim.station import End
+from tests.support.wire import Wire
 
 Packet = mavlink.MAVLink_message
 

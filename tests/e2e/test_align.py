@@ -15,7 +15,7 @@ from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.estimation.records.record import Record
 from sim.aircraft import Pose
-from sim.ardupilot.double import offset_names
+from sim.ardupilot.parameters import offset_names
 from sim.devices import HMR3300, Gradienter
 from sim.hands import Hands
 from sim.imu_model import MG
@@ -67,35 +67,32 @@ async def aligned(rig: Rig, hands: Hands) -> JobResult:
     return await follow(rig, hands, started(rig.service.calibrating.start_alignment(Align(action="zero"), "test")))
 
 
-def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path) -> None:
+async def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path) -> None:
     made, hands = rig(tmp_path)
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            result, before = await calibrated(made)
-            assert result.outcome == "done", result
-            assert before.alignment is None
-            off_mg, sigma_mg = worst_horizontal(before, made)
-            assert 1.7 < sigma_mg < 1.8
-            assert 1.0 < off_mg < 2.5
-            result = await aligned(made, hands)
-            assert result.outcome == "done", result
-            record = made.service.calibrating.alignment.record
-            assert record is not None
-            assert record.checked
-            off = np.abs(np.subtract(record.offset_deg, ZERO_DEG))
-            assert off.max() < 2.5 * record.sigma_deg
-            result, after = await calibrated(made)
-            assert result.outcome == "done", result
-            assert after.alignment is not None
-            assert after.alignment.offset_deg == record.offset_deg
-            off_mg, sigma_mg = worst_horizontal(after, made)
-            assert sigma_mg <= TARGET_MG
-            assert off_mg < 2.5 * sigma_mg
-            assert made.service.status()["alignment"]["in_force"] is True
-
-    run_virtual(main())
+    async with made.running():
+        await made.ready()
+        result, before = await calibrated(made)
+        assert result.outcome == "done", result
+        assert before.alignment is None
+        off_mg, sigma_mg = worst_horizontal(before, made)
+        assert 1.7 < sigma_mg < 1.8
+        assert 1.0 < off_mg < 2.5
+        result = await aligned(made, hands)
+        assert result.outcome == "done", result
+        record = made.service.calibrating.alignment.record
+        assert record is not None
+        assert record.checked
+        off = np.abs(np.subtract(record.offset_deg, ZERO_DEG))
+        assert off.max() < 2.5 * record.sigma_deg
+        result, after = await calibrated(made)
+        assert result.outcome == "done", result
+        assert after.alignment is not None
+        assert after.alignment.offset_deg == record.offset_deg
+        off_mg, sigma_mg = worst_horizontal(after, made)
+        assert sigma_mg <= TARGET_MG
+        assert off_mg < 2.5 * sigma_mg
+        assert made.service.status()["alignment"]["in_force"] is True
 
 
 async def moved(rig: Rig, hands: Hands, job: Job, stand: int, degrees: float) -> None:
@@ -142,43 +139,37 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
     run_virtual(again({}, None, forget=True))
 
 
-def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
+async def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
     made, _ = rig(tmp_path)
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
-            await made.until(lambda: "measuring" in job.words, 60.0)
-            made.double.arm()
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "armed during the alignment" in result.reason
-            refused = made.service.calibrating.start_alignment(Align(action="zero"), "test")
-            assert isinstance(refused, Refusal)
-            assert refused.kind == "armed"
-
-    run_virtual(main())
+    async with made.running():
+        await made.ready()
+        job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
+        await made.until(lambda: "measuring" in job.words, 60.0)
+        made.double.arm()
+        result = await job.finished
+        assert result.outcome == "failed"
+        assert "armed during the alignment" in result.reason
+        refused = made.service.calibrating.start_alignment(Align(action="zero"), "test")
+        assert isinstance(refused, Refusal)
+        assert refused.kind == "armed"
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, told: bool) -> None:
+async def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, told: bool) -> None:
     made, hands = rig(tmp_path)
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
-            await made.until(lambda: "waiting for it to move" in job.words, 60.0)
-            if told:
-                made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)
-            else:
-                made.double.set_parameter(offset_names(1, "accel")[0], 0.03)
-                await moved(made, hands, job, 2, 180.0)
-                await moved(made, hands, job, 3, 180.0)
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "were changed in between: align again" in result.reason
-            assert made.service.calibrating.alignment.record is None
-
-    run_virtual(main())
+    async with made.running():
+        await made.ready()
+        job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
+        await made.until(lambda: "waiting for it to move" in job.words, 60.0)
+        if told:
+            made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)
+        else:
+            made.double.set_parameter(offset_names(1, "accel")[0], 0.03)
+            await moved(made, hands, job, 2, 180.0)
+            await moved(made, hands, job, 3, 180.0)
+        result = await job.finished
+        assert result.outcome == "failed"
+        assert "were changed in between: align again" in result.reason
+        assert made.service.calibrating.alignment.record is None

@@ -19,7 +19,6 @@ from tests.e2e.test_align_turn import true_mg
 from tests.e2e.test_page import press
 from tests.support.by_hand import Meddle, alone, follow
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 MOVES_S = 6.0
 ID = 0x3A0002 + (7 << 8)
@@ -92,44 +91,38 @@ NAMED = (
 )
 
 
-def test_all_that_goes_wrong_on_all_sides(tmp_path: Path) -> None:
+async def test_all_that_goes_wrong_on_all_sides(tmp_path: Path) -> None:
     made, hands = alone(tmp_path, placement_deg=0.02, propped_deg=4.0, imu_rate_hz=10.0, parameters=SCALES)
     clumsy = Clumsy(made, hands)
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            clumsy.wrong = {2: clumsy.tilts_too_early, 3: clumsy.lifts_it, 4: clumsy.rocks, 5: clumsy.lets_go,
-                            6: clumsy.arms, 7: clumsy.restarts}  # fmt: skip
-            result, job = await run(made, hands, clumsy, action="faces", write=True)
-            assert result.outcome == "done", result
-            assert isinstance(job.product, FacesRecord)
-            assert len(made.service.status()["stands"]["done"]) == len(job.product.stands) <= 13
-            for words in (*NAMED, "it stands as in stand 2"):
-                assert words in said(made), words
-            np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
-            np.testing.assert_allclose(read(made, "accel") / MG, true_mg(made), atol=0.15)
-
-    run_virtual(main())
+    async with made.running():
+        await made.ready()
+        clumsy.wrong = {2: clumsy.tilts_too_early, 3: clumsy.lifts_it, 4: clumsy.rocks, 5: clumsy.lets_go,
+                        6: clumsy.arms, 7: clumsy.restarts}  # fmt: skip
+        result, job = await run(made, hands, clumsy, action="faces", write=True)
+        assert result.outcome == "done", result
+        assert isinstance(job.product, FacesRecord)
+        assert len(made.service.status()["stands"]["done"]) == len(job.product.stands) <= 13
+        for words in (*NAMED, "it stands as in stand 2"):
+            assert words in said(made), words
+        np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
+        np.testing.assert_allclose(read(made, "accel") / MG, true_mg(made), atol=0.15)
 
 
-def test_an_imu_that_is_exchanged_between_the_stands_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+async def test_an_imu_that_is_exchanged_between_the_stands_is_named_and_nothing_is_written(tmp_path: Path) -> None:
     made, hands = alone(tmp_path, propped_deg=1.0, placement_deg=0.02, imu_rate_hz=10.0)
     other = ImuModel(made.aircraft, "icm42688p", seed=9, accel_bias_m_s2=[8.0 * MG, -9.0 * MG, 7.0 * MG])
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            old = [read(made, one).tolist() for one in ("accel", "scale")]
+    async with made.running():
+        await made.ready()
+        old = [read(made, one).tolist() for one in ("accel", "scale")]
 
-            def meddle(stand: int, _: float) -> None:
-                if stand == 3:
-                    made.double.exchange_imu(other, ID)
+        def meddle(stand: int, _: float) -> None:
+            if stand == 3:
+                made.double.exchange_imu(other, ID)
 
-            result, _ = await run(made, hands, meddle, action="faces", write=True)
-            assert result.outcome == "failed"
-            assert "imu fc was exchanged in between (device id" in result.reason
-            assert f"now {ID}): align again" in result.reason
-            assert [read(made, one).tolist() for one in ("accel", "scale")] == old
-
-    run_virtual(main())
+        result, _ = await run(made, hands, meddle, action="faces", write=True)
+        assert result.outcome == "failed"
+        assert "imu fc was exchanged in between (device id" in result.reason
+        assert f"now {ID}): align again" in result.reason
+        assert [read(made, one).tolist() for one in ("accel", "scale")] == old

@@ -16,7 +16,7 @@ from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.estimation.records.align_record import TurnRecord
 from sim.aircraft import Pose
-from sim.ardupilot.double import offset_names
+from sim.ardupilot.parameters import offset_names
 from sim.earth import mounting_matrix
 from sim.hands import Hands
 from sim.imu_model import MG
@@ -64,34 +64,31 @@ def residual_mg(rig: Rig, record: TurnRecord) -> Any:
     return true_mg(rig) - np.array(before) / MG
 
 
-def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path) -> None:
+async def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path) -> None:
     made, hands = rig(tmp_path, STEEP)
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            names = offset_names(1, "accel")
-            old = [made.double.parameter(name) for name in names]
-            record = await turned(made, hands, 2, write=True)
-            assert made.service.calibrating.manager.reason.endswith("written")
-            assert record.checked
-            assert record.slope_deg == pytest.approx(float(np.hypot(STEEP.pitch_deg, STEEP.roll_deg)), abs=0.06)
-            (imu,) = record.imus
-            sigma = np.array(imu.level_sigma_mg)[:2]
-            # How the board leans across the slope is left open by half a turn.
-            assert sigma.max() < 1.5 * TARGET_MG
-            assert not any("the same way" in warning for warning in record.warnings)
-            off = np.abs(np.subtract(imu.level_bias_mg, residual_mg(made, record)))[:2]
-            assert (off < 2.5 * sigma).all()
-            assert {one.outcome for one in imu.written.values()} == {"verified"}
-            written = np.array([made.double.parameter(name) for name in names]) / MG
-            assert (np.abs(written - true_mg(made))[:2] < 2.5 * sigma).all()
-            undone = made.service.calibrating.manager.start_undo("test")
-            assert not isinstance(undone, Refusal)
-            assert (await undone.finished).outcome == "done"
-            assert [made.double.parameter(name) for name in names] == old
-
-    run_virtual(main())
+    async with made.running():
+        await made.ready()
+        names = offset_names(1, "accel")
+        old = [made.double.parameter(name) for name in names]
+        record = await turned(made, hands, 2, write=True)
+        assert made.service.calibrating.manager.reason.endswith("written")
+        assert record.checked
+        assert record.slope_deg == pytest.approx(float(np.hypot(STEEP.pitch_deg, STEEP.roll_deg)), abs=0.06)
+        (imu,) = record.imus
+        sigma = np.array(imu.level_sigma_mg)[:2]
+        # How the board leans across the slope is left open by half a turn.
+        assert sigma.max() < 1.5 * TARGET_MG
+        assert not any("the same way" in warning for warning in record.warnings)
+        off = np.abs(np.subtract(imu.level_bias_mg, residual_mg(made, record)))[:2]
+        assert (off < 2.5 * sigma).all()
+        assert {one.outcome for one in imu.written.values()} == {"verified"}
+        written = np.array([made.double.parameter(name) for name in names]) / MG
+        assert (np.abs(written - true_mg(made))[:2] < 2.5 * sigma).all()
+        undone = made.service.calibrating.manager.start_undo("test")
+        assert not isinstance(undone, Refusal)
+        assert (await undone.finished).outcome == "done"
+        assert [made.double.parameter(name) for name in names] == old
 
 
 def late(made: Rig, seconds: float) -> None:
@@ -164,7 +161,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
     run_virtual(level())
 
 
-def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
+async def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A board that sits 1.2 deg to the right and 0.8 deg nose down; its attitude follows only after a restart."""
@@ -172,46 +169,41 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
     made, hands = rig(tmp_path, FLAT, "px4", mounting_deg=board_deg, parameters={"SENS_BOARD_X_OFF": 0.3})
     names = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF")
 
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
+    async with made.running():
+        await made.ready()
+        old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
+        result = await follow(made, hands, started(made.service.calibrating.start_alignment(Align.read(FACES), "test")))
+        assert result.outcome == "done", result
+        hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
+        await asyncio.sleep(15.0)
+        with monkeypatch.context() as patched:
+            patched.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
             result = await follow(
-                made, hands, started(made.service.calibrating.start_alignment(Align.read(FACES), "test"))
+                made,
+                hands,
+                started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test")),
             )
-            assert result.outcome == "done", result
-            hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
-            await asyncio.sleep(15.0)
-            with monkeypatch.context() as patched:
-                patched.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
-                result = await follow(
-                    made,
-                    hands,
-                    started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test")),
-                )
-            assert result.outcome == "failed"
-            assert result.reason == "the attitude did not follow the new level, or it moved; old values back"
-            assert made.autopilot.parameter(names[0]) == pytest.approx(0.3)
-            job = started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test"))
-            result = await follow(made, hands, job)
-            assert result.outcome == "done", result
-            record = job.product
-            assert isinstance(record, TurnRecord)
-            assert record.board is not None
-            up = mounting_matrix(*board_deg).T @ np.array([0.0, 0.0, -1.0])
-            true_deg = np.degrees([np.arctan2(-up[1], -up[2]), np.arcsin(up[0])])
-            written = [made.autopilot.parameter(name) for name in names]
-            np.testing.assert_allclose(written, true_deg, atol=0.05)
-            assert {one.outcome for one in record.board.written.values()} == {"verified"}
-            assert made.service.offsets.owed.words == "reboot PX4: tilt 1.2 deg off"
-            assert made.service.status()["headline"]["word"] != "READY"
-            undone = made.service.calibrating.manager.start_undo("test")
-            assert not isinstance(undone, Refusal)
-            assert (await undone.finished).outcome == "done"
-            assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
-            undone = made.service.calibrating.manager.start_undo("test")
-            assert not isinstance(undone, Refusal)
-            assert (await undone.finished).reason.endswith("old values back: faces")
-            assert {name: made.autopilot.parameter(name) for name in old} == old
-
-    run_virtual(main())
+        assert result.outcome == "failed"
+        assert result.reason == "the attitude did not follow the new level, or it moved; old values back"
+        assert made.autopilot.parameter(names[0]) == pytest.approx(0.3)
+        job = started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test"))
+        result = await follow(made, hands, job)
+        assert result.outcome == "done", result
+        record = job.product
+        assert isinstance(record, TurnRecord)
+        assert record.board is not None
+        up = mounting_matrix(*board_deg).T @ np.array([0.0, 0.0, -1.0])
+        true_deg = np.degrees([np.arctan2(-up[1], -up[2]), np.arcsin(up[0])])
+        written = [made.autopilot.parameter(name) for name in names]
+        np.testing.assert_allclose(written, true_deg, atol=0.05)
+        assert {one.outcome for one in record.board.written.values()} == {"verified"}
+        assert made.service.offsets.owed.words == "reboot PX4: tilt 1.2 deg off"
+        assert made.service.status()["headline"]["word"] != "READY"
+        undone = made.service.calibrating.manager.start_undo("test")
+        assert not isinstance(undone, Refusal)
+        assert (await undone.finished).outcome == "done"
+        assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
+        undone = made.service.calibrating.manager.start_undo("test")
+        assert not isinstance(undone, Refusal)
+        assert (await undone.finished).reason.endswith("old values back: faces")
+        assert {name: made.autopilot.parameter(name) for name in old} == old

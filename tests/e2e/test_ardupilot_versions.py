@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.ardupilot.double import offset_names
+from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 RENAMED = re.compile(r"SR\d_|MAV\d?_|SYSID_|ARMING_CHECK|ARMING_SKIPCHK|SERIAL\d_OPTIONS")
 """Names that 4.7 changed."""
@@ -49,46 +48,42 @@ class Traffic:
 
 
 @pytest.mark.parametrize("version", ["4.5", "4.7"])
-def test_from_4_5_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(tmp_path: Path, version: str) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, max_s=12.0, version=version, script=True, imu_rate_hz=50.0, device_rate_hz=5.0, feed_s=0.4)
-        traffic = Traffic(rig)
-        async with rig.running():
-            await rig.ready()
-            result, record = await calibrated(rig, timeout_s=400.0)
-            assert result.outcome == "done", result
-            kind = rig.service.devices.imus["fc"].stream.kind
-            assert kind is not None
-            assert kind.name == ("HIGHRES_IMU" if version == "4.7" else "floats of the script")
-            assert list(record.imus[0].written) == [*offset_names(1, "accel"), *offset_names(1, "gyro")]
-            left = rig.double.residual(1, rig.now_s)
-            assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
-            assert np.abs(left.accel_m_s2).max() < 0.3 * MG
-            assert {"INS_GYROFFS_X", "AHRS_ORIENTATION"} <= traffic.names
-            assert not [name for name in traffic.names if RENAMED.match(name)]
-
-    run_virtual(main())
+async def test_from_4_5_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(
+    tmp_path: Path, version: str
+) -> None:
+    rig = Rig(tmp_path, max_s=12.0, version=version, script=True, imu_rate_hz=50.0, device_rate_hz=5.0, feed_s=0.4)
+    traffic = Traffic(rig)
+    async with rig.running():
+        await rig.ready()
+        result, record = await calibrated(rig, timeout_s=400.0)
+        assert result.outcome == "done", result
+        kind = rig.service.devices.imus["fc"].stream.kind
+        assert kind is not None
+        assert kind.name == ("HIGHRES_IMU" if version == "4.7" else "floats of the script")
+        assert list(record.imus[0].written) == [*offset_names(1, "accel"), *offset_names(1, "gyro")]
+        left = rig.double.residual(1, rig.now_s)
+        assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
+        assert np.abs(left.accel_m_s2).max() < 0.3 * MG
+        assert {"INS_GYROFFS_X", "AHRS_ORIENTATION"} <= traffic.names
+        assert not [name for name in traffic.names if RENAMED.match(name)]
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_most_once(
+async def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_most_once(
     tmp_path: Path, firmware: str
 ) -> None:
-    async def main() -> None:
-        part = "icm42688p" if firmware == "ardupilot" else "bmi088"
-        rig = slow(tmp_path, firmware=firmware, part=part)
-        traffic = Traffic(rig)
-        async with rig.running():
-            await rig.ready()
-            await calibrated(rig, timeout_s=200.0)
-            await started(rig.service.calibrating.manager.start_undo("test")).finished
-        assert mavlink.MAV_CMD_PREFLIGHT_STORAGE not in traffic.commands
-        assert traffic.commands.count(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION) == (firmware == "ardupilot")
-        harmless = {
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-            mavlink.MAV_CMD_REQUEST_MESSAGE,
-            mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
-        }
-        assert set(traffic.commands) <= harmless
-
-    run_virtual(main())
+    part = "icm42688p" if firmware == "ardupilot" else "bmi088"
+    rig = slow(tmp_path, firmware=firmware, part=part)
+    traffic = Traffic(rig)
+    async with rig.running():
+        await rig.ready()
+        await calibrated(rig, timeout_s=200.0)
+        await started(rig.service.calibrating.manager.start_undo("test")).finished
+    assert mavlink.MAV_CMD_PREFLIGHT_STORAGE not in traffic.commands
+    assert traffic.commands.count(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION) == (firmware == "ardupilot")
+    harmless = {
+        mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+        mavlink.MAV_CMD_REQUEST_MESSAGE,
+        mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
+    }
+    assert set(traffic.commands) <= harmless

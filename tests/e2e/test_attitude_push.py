@@ -96,198 +96,173 @@ async def flight(
 
 
 @pytest.mark.parametrize(("firmware", "own_imu"), [("ardupilot", False), ("px4", True)])
-def test_the_heading_follows_the_aircraft_through_a_turn(tmp_path: Path, firmware: Firmware, own_imu: bool) -> None:
+async def test_the_heading_follows_the_aircraft_through_a_turn(
+    tmp_path: Path, firmware: Firmware, own_imu: bool
+) -> None:
     """Within the compass' degree and the delay of the autopilot's own telemetry, on truth."""
 
-    async def main() -> None:
-        async with flight(tmp_path, firmware=firmware, own_imu=own_imu, imu_rate_hz=50.0) as flying:
-            rig = flying.rig
-            rig.autopilot.arm()
-            flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
-            await flying.sleep(8.0)
-            yaw = flying.witness.of(Vision)[-1].yaw
-            assert math.degrees(abs(math.remainder(yaw - flying.true_yaw_rad, 2.0 * math.pi))) < 2.0
-            last = flying.witness.of(Vision)[-1]
-            roll, pitch, _ = rig.aircraft.angles_rad(rig.aircraft.time_at(rig.now_s))
-            assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
-            assert flying.theirs_deg() < 3.0
-
-    run_virtual(main())
+    async with flight(tmp_path, firmware=firmware, own_imu=own_imu, imu_rate_hz=50.0) as flying:
+        rig = flying.rig
+        rig.autopilot.arm()
+        flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
+        await flying.sleep(8.0)
+        yaw = flying.witness.of(Vision)[-1].yaw
+        assert math.degrees(abs(math.remainder(yaw - flying.true_yaw_rad, 2.0 * math.pi))) < 2.0
+        last = flying.witness.of(Vision)[-1]
+        roll, pitch, _ = rig.aircraft.angles_rad(rig.aircraft.time_at(rig.now_s))
+        assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
+        assert flying.theirs_deg() < 3.0
 
 
-def test_nothing_is_pushed_before_a_calibration_or_without_a_compass(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False) as flying:
-            await flying.sleep(30.0)
-            assert not flying.witness.of(Vision)
-            assert flying.attitude.view()["why_not"] == "waiting for a calibration"
-            flying.rig.unplugged.add("compass")
-            await flying.sleep(10.0)
-            assert not flying.witness.of(Vision)
-
-    run_virtual(main())
+async def test_nothing_is_pushed_before_a_calibration_or_without_a_compass(tmp_path: Path) -> None:
+    async with flight(tmp_path, calibrated=False) as flying:
+        await flying.sleep(30.0)
+        assert not flying.witness.of(Vision)
+        assert flying.attitude.view()["why_not"] == "waiting for a calibration"
+        flying.rig.unplugged.add("compass")
+        await flying.sleep(10.0)
+        assert not flying.witness.of(Vision)
 
 
-def test_a_silent_imu_stops_the_push_at_once_and_says_so(tmp_path: Path) -> None:
+async def test_a_silent_imu_stops_the_push_at_once_and_says_so(tmp_path: Path) -> None:
     """In flight a second of silence is the end until the next landing; a short one is bridged."""
 
-    async def main() -> None:
-        async with flight(tmp_path) as flying:
-            rig = flying.rig
-            rig.autopilot.arm()
-            await flying.sleep(1.0)
-            rig.unplugged.add("own")
-            silent_s = rig.now_s
-            await flying.sleep(0.6)
-            last_s = flying.witness.times(Vision)[-1]
-            assert last_s < silent_s + 0.25
-            assert not flying.attitude.health.pushing
-            rig.unplugged.discard("own")
-            await flying.pushing(5.0)
-            assert rig.now_s - silent_s > 3.0  # well for a while first
-            rig.unplugged.add("own")
-            await flying.sleep(2.0)
-            rig.unplugged.discard("own")
-            await flying.sleep(5.0)
-            assert flying.attitude.view()["why_not"] == "attitude lost in flight: it is aligned again on the ground"
-            texts = rig.ground.texts()
-            assert any(text.startswith("Attitude push stopped: IMU own sends nothing") for text in texts)
-            rig.autopilot.disarm()
-            await flying.pushing(30.0)
-
-    run_virtual(main())
+    async with flight(tmp_path) as flying:
+        rig = flying.rig
+        rig.autopilot.arm()
+        await flying.sleep(1.0)
+        rig.unplugged.add("own")
+        silent_s = rig.now_s
+        await flying.sleep(0.6)
+        last_s = flying.witness.times(Vision)[-1]
+        assert last_s < silent_s + 0.25
+        assert not flying.attitude.health.pushing
+        rig.unplugged.discard("own")
+        await flying.pushing(5.0)
+        assert rig.now_s - silent_s > 3.0  # well for a while first
+        rig.unplugged.add("own")
+        await flying.sleep(2.0)
+        rig.unplugged.discard("own")
+        await flying.sleep(5.0)
+        assert flying.attitude.view()["why_not"] == "attitude lost in flight: it is aligned again on the ground"
+        texts = rig.ground.texts()
+        assert any(text.startswith("Attitude push stopped: IMU own sends nothing") for text in texts)
+        rig.autopilot.disarm()
+        await flying.pushing(30.0)
 
 
-def test_a_new_alignment_that_turns_the_heading_is_a_reset(tmp_path: Path) -> None:
+async def test_a_new_alignment_that_turns_the_heading_is_a_reset(tmp_path: Path) -> None:
     """The aircraft is carried round while the daemon hears no IMU; PX4 resets its yaw by the counter."""
 
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4") as flying:
-            await flying.sleep(2.0)
-            assert flying.witness.of(Vision)[-1].reset_counter == 0
-            flying.rig.unplugged.add("own")
-            await flying.sleep(1.5)
-            flying.turn(heading_deg=50.0)
-            await flying.sleep(5.0)
-            flying.rig.unplugged.discard("own")
-            await flying.pushing(40.0)
-            await flying.sleep(3.0)
-            assert flying.witness.of(Vision)[-1].reset_counter == 1
-            assert flying.theirs_deg() < 2.0
-
-    run_virtual(main())
+    async with flight(tmp_path, firmware="px4") as flying:
+        await flying.sleep(2.0)
+        assert flying.witness.of(Vision)[-1].reset_counter == 0
+        flying.rig.unplugged.add("own")
+        await flying.sleep(1.5)
+        flying.turn(heading_deg=50.0)
+        await flying.sleep(5.0)
+        flying.rig.unplugged.discard("own")
+        await flying.pushing(40.0)
+        await flying.sleep(3.0)
+        assert flying.witness.of(Vision)[-1].reset_counter == 1
+        assert flying.theirs_deg() < 2.0
 
 
-def test_a_tilt_that_differs_for_long_stops_the_push(tmp_path: Path) -> None:
+async def test_a_tilt_that_differs_for_long_stops_the_push(tmp_path: Path) -> None:
     """One of the two is wrong and nobody can say which."""
 
-    async def main() -> None:
-        async with flight(tmp_path, used=False) as flying:
-            rig = flying.rig
-            rig.autopilot.arm()
-            rig.double.set_parameter("AHRS_TRIM_Y", math.radians(9.0))
-            await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
-            assert "tilt differs by" in flying.attitude.health.why_not
-            rig.double.set_parameter("AHRS_TRIM_Y", 0.0)
-            await flying.pushing(20.0)
-
-    run_virtual(main())
+    async with flight(tmp_path, used=False) as flying:
+        rig = flying.rig
+        rig.autopilot.arm()
+        rig.double.set_parameter("AHRS_TRIM_Y", math.radians(9.0))
+        await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
+        assert "tilt differs by" in flying.attitude.health.why_not
+        rig.double.set_parameter("AHRS_TRIM_Y", 0.0)
+        await flying.pushing(20.0)
 
 
-def test_a_heading_that_goes_its_own_way_after_agreeing_stops_the_push(tmp_path: Path) -> None:
+async def test_a_heading_that_goes_its_own_way_after_agreeing_stops_the_push(tmp_path: Path) -> None:
     """Before they have ever agreed the autopilot may have any heading: that is what ours is for."""
 
-    async def main() -> None:
-        async with flight(tmp_path, used=False, calibrated=False) as flying:
-            rig = flying.rig
-            rig.double.estimator.compass = False
-            rig.double.estimator.yaw_error_rad = math.radians(60.0)
-            await flying.calibrate()
-            await flying.pushing()
-            await flying.sleep(15.0)
-            assert flying.attitude.health.pushing
-            rig.double.estimator.yaw_error_rad = 0.0
-            await flying.sleep(15.0)
-            rig.autopilot.arm()
-            rig.double.estimator.yaw_error_rad = math.radians(-60.0)
-            await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
-            assert "heading differs by" in flying.attitude.health.why_not
-            assert "attitude push stopped" in rig.service.status()["headline"]["reason"]
-            rig.double.estimator.yaw_error_rad = 0.0
-            await flying.pushing(20.0)
-
-    run_virtual(main())
+    async with flight(tmp_path, used=False, calibrated=False) as flying:
+        rig = flying.rig
+        rig.double.estimator.compass = False
+        rig.double.estimator.yaw_error_rad = math.radians(60.0)
+        await flying.calibrate()
+        await flying.pushing()
+        await flying.sleep(15.0)
+        assert flying.attitude.health.pushing
+        rig.double.estimator.yaw_error_rad = 0.0
+        await flying.sleep(15.0)
+        rig.autopilot.arm()
+        rig.double.estimator.yaw_error_rad = math.radians(-60.0)
+        await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
+        assert "heading differs by" in flying.attitude.health.why_not
+        assert "attitude push stopped" in rig.service.status()["headline"]["reason"]
+        rig.double.estimator.yaw_error_rad = 0.0
+        await flying.pushing(20.0)
 
 
-def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> None:
+async def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> None:
     """A motor's field: the gyros know better for a while, and then nobody does."""
 
-    async def main() -> None:
-        async with flight(tmp_path, used=False) as flying:
-            rig = flying.rig
-            rig.autopilot.arm()
-            compass: Any = rig.devices["compass"]
-            begun_s = rig.now_s
-            compass.heading_error_deg = 3.0
-            while compass.heading_error_deg < 40.0:
-                await flying.sleep(0.05)
-                compass.heading_error_deg += 0.15
-            await rig.until(lambda: not flying.attitude.health.pushing, 60.0)
-            assert "compass disagrees for" in flying.attitude.health.why_not
-            assert rig.now_s - begun_s > 18.0
-            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 6.0
-            compass.heading_error_deg = 0.0
-            await flying.pushing(20.0)
-
-    run_virtual(main())
+    async with flight(tmp_path, used=False) as flying:
+        rig = flying.rig
+        rig.autopilot.arm()
+        compass: Any = rig.devices["compass"]
+        begun_s = rig.now_s
+        compass.heading_error_deg = 3.0
+        while compass.heading_error_deg < 40.0:
+            await flying.sleep(0.05)
+            compass.heading_error_deg += 0.15
+        await rig.until(lambda: not flying.attitude.health.pushing, 60.0)
+        assert "compass disagrees for" in flying.attitude.health.why_not
+        assert rig.now_s - begun_s > 18.0
+        assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 6.0
+        compass.heading_error_deg = 0.0
+        await flying.pushing(20.0)
 
 
-def test_a_heading_that_drifts_is_not_believed_until_it_is_aligned_again(tmp_path: Path) -> None:
+async def test_a_heading_that_drifts_is_not_believed_until_it_is_aligned_again(tmp_path: Path) -> None:
     """3 deg/s: of a gyro that no compass holds. The autopilot's gyros say nothing of the kind."""
 
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4") as flying:
-            rig = flying.rig
-            rig.autopilot.arm()
-            flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
-            await flying.sleep(6.0)
-            assert flying.attitude.health.pushing
-            gyro, accel = rig.own_model.true_bias(0.0)
-            rig.unplugged.add("compass")
-            rig.own_model.turn_on(gyro + np.radians([0.0, 0.0, 3.0]), accel)
-            await rig.until(lambda: not flying.attitude.health.pushing, 3.7)
-            assert "deg off the autopilot's gyros" in flying.attitude.health.why_not
-            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 9.0
-            assert flying.theirs_deg() < 8.0
-            rig.own_model.turn_on(gyro, accel)
-            rig.unplugged.discard("compass")
-            stopped_s = rig.now_s
-            await flying.sleep(15.0)
-            assert not flying.witness.of(Vision, stopped_s + 0.1)
-            rig.autopilot.disarm()
-            await flying.pushing(40.0)
-            await flying.sleep(3.0)
-            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 2.0
-
-    run_virtual(main())
+    async with flight(tmp_path, firmware="px4") as flying:
+        rig = flying.rig
+        rig.autopilot.arm()
+        flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
+        await flying.sleep(6.0)
+        assert flying.attitude.health.pushing
+        gyro, accel = rig.own_model.true_bias(0.0)
+        rig.unplugged.add("compass")
+        rig.own_model.turn_on(gyro + np.radians([0.0, 0.0, 3.0]), accel)
+        await rig.until(lambda: not flying.attitude.health.pushing, 3.7)
+        assert "deg off the autopilot's gyros" in flying.attitude.health.why_not
+        assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 9.0
+        assert flying.theirs_deg() < 8.0
+        rig.own_model.turn_on(gyro, accel)
+        rig.unplugged.discard("compass")
+        stopped_s = rig.now_s
+        await flying.sleep(15.0)
+        assert not flying.witness.of(Vision, stopped_s + 0.1)
+        rig.autopilot.disarm()
+        await flying.pushing(40.0)
+        await flying.sleep(3.0)
+        assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 2.0
 
 
-def test_two_compasses_that_differ_are_not_settled_by_pushing(tmp_path: Path) -> None:
+async def test_two_compasses_that_differ_are_not_settled_by_pushing(tmp_path: Path) -> None:
     """EKF2 takes 40 deg without a word, and arms; ours is pushed once that compass is out of use."""
 
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4", calibrated=False) as flying:
-            compass: Any = flying.rig.devices["compass"]
-            flying.rig.autopilot.has_compass = True
-            compass.heading_error_deg = 40.0
-            await flying.calibrate()
-            await flying.sleep(10.0)
-            assert not flying.witness.of(Vision)
-            assert "40 deg from the autopilot's compass: one of the two is wrong" in flying.attitude.health.why_not
-            flying.rig.autopilot.has_compass = False
-            await flying.pushing(10.0)
-
-    run_virtual(main())
+    async with flight(tmp_path, firmware="px4", calibrated=False) as flying:
+        compass: Any = flying.rig.devices["compass"]
+        flying.rig.autopilot.has_compass = True
+        compass.heading_error_deg = 40.0
+        await flying.calibrate()
+        await flying.sleep(10.0)
+        assert not flying.witness.of(Vision)
+        assert "40 deg from the autopilot's compass: one of the two is wrong" in flying.attitude.health.why_not
+        flying.rig.autopilot.has_compass = False
+        await flying.pushing(10.0)
 
 
 def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.cli.client import setup_lines
 from tests.e2e.test_attitude_push import Flight, flight
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 Firmware = Literal["ardupilot", "px4"]
 BEFORE: dict[Firmware, dict[str, float]] = {
@@ -56,30 +55,27 @@ async def follow(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmware: Firmware) -> None:
-    async def main() -> None:
-        async with flight(
-            tmp_path,
-            firmware=firmware,
-            calibrated=False,
-            used=False,
-            parameters={**BEFORE[firmware], RIVAL[firmware]: 1.0},
-        ) as flying:
-            rig = flying.rig
-            shown = await ask(rig)
-            assert shown["state"] == "not applied"
-            assert {row["parameter"]: row["wanted"] for row in shown["parameters"]} == pytest.approx(AFTER[firmware])
-            assert all(f"{name} {value:g}" in shown["reason"] for name, value in AFTER[firmware].items())
-            assert shown["risks"]
-            lines = setup_lines(shown)
-            assert lines[0] == f"heading: not applied: {shown['reason']}"
-            assert any(line.startswith(f"gate: not wanted; for at_arm = gate: {GATE[firmware]}") for line in lines)
-            assert any(line.startswith(f"rival: {RIVAL[firmware]} = 1: ") for line in lines)
-            assert {name: rig.autopilot.parameter(name) for name in BEFORE[firmware]} == pytest.approx(BEFORE[firmware])
-            await follow(rig)
-            assert (await ask(rig))["state"] == "applied"
-
-    run_virtual(main())
+async def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmware: Firmware) -> None:
+    async with flight(
+        tmp_path,
+        firmware=firmware,
+        calibrated=False,
+        used=False,
+        parameters={**BEFORE[firmware], RIVAL[firmware]: 1.0},
+    ) as flying:
+        rig = flying.rig
+        shown = await ask(rig)
+        assert shown["state"] == "not applied"
+        assert {row["parameter"]: row["wanted"] for row in shown["parameters"]} == pytest.approx(AFTER[firmware])
+        assert all(f"{name} {value:g}" in shown["reason"] for name, value in AFTER[firmware].items())
+        assert shown["risks"]
+        lines = setup_lines(shown)
+        assert lines[0] == f"heading: not applied: {shown['reason']}"
+        assert any(line.startswith(f"gate: not wanted; for at_arm = gate: {GATE[firmware]}") for line in lines)
+        assert any(line.startswith(f"rival: {RIVAL[firmware]} = 1: ") for line in lines)
+        assert {name: rig.autopilot.parameter(name) for name in BEFORE[firmware]} == pytest.approx(BEFORE[firmware])
+        await follow(rig)
+        assert (await ask(rig))["state"] == "applied"
 
 
 @pytest.mark.parametrize(("parameter", "value", "named"), [
@@ -87,23 +83,20 @@ def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmwa
     ("SYS_HAS_MAG", 0, "SYS_HAS_MAG = 0"),
     ("EKF2_SENS_EN", 8191 - 1024, "bit 10 of EKF2_SENS_EN"),
 ])  # fmt: skip
-def test_without_a_compass_px4_has_nothing_to_go_back_to(
+async def test_without_a_compass_px4_has_nothing_to_go_back_to(
     tmp_path: Path, parameter: str, value: int, named: str
 ) -> None:
     """The real EKF2 uses no magnetometer in flight with any of these (tests/sitl flies the stream's end)."""
 
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4", calibrated=False, used=False) as flying:
-            rig = flying.rig
-            await follow(rig)
-            shown = await ask(rig)
-            assert (shown["state"], shown["net"]["kind"]) == ("applied", "autopilot")
-            rig.autopilot.write_as_another_station(parameter, value)
-            shown = await ask(rig)
-            assert (shown["state"], shown["net"]["kind"]) == ("not applied", "none")
-            assert shown["reason"].startswith(f"this autopilot has no compass in use ({named}): ")
-
-    run_virtual(main())
+    async with flight(tmp_path, firmware="px4", calibrated=False, used=False) as flying:
+        rig = flying.rig
+        await follow(rig)
+        shown = await ask(rig)
+        assert (shown["state"], shown["net"]["kind"]) == ("applied", "autopilot")
+        rig.autopilot.write_as_another_station(parameter, value)
+        shown = await ask(rig)
+        assert (shown["state"], shown["net"]["kind"]) == ("not applied", "none")
+        assert shown["reason"].startswith(f"this autopilot has no compass in use ({named}): ")
 
 
 async def set_up(flying: Flight) -> None:
@@ -118,46 +111,42 @@ async def set_up(flying: Flight) -> None:
     await flying.sleep(12.0)
 
 
-def test_where_there_is_no_script_the_companion_asks_for_another_heading_and_for_its_own_again(tmp_path: Path) -> None:
+async def test_where_there_is_no_script_the_companion_asks_for_another_heading_and_for_its_own_again(
+    tmp_path: Path,
+) -> None:
     """In flight for that of the gyros: its own compass may have come to lie."""
 
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False, used=False) as flying:
-            rig = flying.rig
-            await set_up(flying)
-            assert flying.attitude.view()["safety_net"] == "command"
-            assert rig.double.external_nav.source_set == 1
-            rig.autopilot.arm()
-            rig.unplugged.add("own")
-            await flying.sleep(0.6)
-            assert rig.double.external_nav.source_set == 3
-            assert flying.theirs_deg() < 2.0
-            rig.unplugged.discard("own")
-            await flying.pushing(5.0)
-            await flying.sleep(9.0)
-            assert rig.double.external_nav.source_set == 3
-            await rig.until(lambda: rig.double.external_nav.source_set == 1, 2.0)
-            await flying.sleep(0.1)
-            texts = [text for text in rig.ground.texts() if text.startswith("Heading: ")]
-            assert texts[-2:] == ["Heading: gyros, companion's is not pushed", "Heading: companion"]
-            flying.attitude.close()  # as the end of the daemon does, at once
-            await flying.sleep(0.1)
-            assert rig.double.external_nav.source_set == 3
-
-    run_virtual(main())
+    async with flight(tmp_path, calibrated=False, used=False) as flying:
+        rig = flying.rig
+        await set_up(flying)
+        assert flying.attitude.view()["safety_net"] == "command"
+        assert rig.double.external_nav.source_set == 1
+        rig.autopilot.arm()
+        rig.unplugged.add("own")
+        await flying.sleep(0.6)
+        assert rig.double.external_nav.source_set == 3
+        assert flying.theirs_deg() < 2.0
+        rig.unplugged.discard("own")
+        await flying.pushing(5.0)
+        await flying.sleep(9.0)
+        assert rig.double.external_nav.source_set == 3
+        await rig.until(lambda: rig.double.external_nav.source_set == 1, 2.0)
+        await flying.sleep(0.1)
+        texts = [text for text in rig.ground.texts() if text.startswith("Heading: ")]
+        assert texts[-2:] == ["Heading: gyros, companion's is not pushed", "Heading: companion"]
+        flying.attitude.close()  # as the end of the daemon does, at once
+        await flying.sleep(0.1)
+        assert rig.double.external_nav.source_set == 3
 
 
-def test_where_the_script_runs_the_companion_leaves_it_to_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False, used=False) as flying:
-            rig = flying.rig
-            store = rig.double.parameters  # as the script makes it
-            store._types["CMPG_HEADING"], store.values["CMPG_HEADING"] = mavlink.MAV_PARAM_TYPE_REAL32, 1.0
-            store.names += ("CMPG_HEADING",)
-            await set_up(flying)
-            assert flying.attitude.view()["safety_net"] == "script"
-            rig.unplugged.add("own")
-            await flying.sleep(5.0)
-            assert rig.double.external_nav.source_set == 1
-
-    run_virtual(main())
+async def test_where_the_script_runs_the_companion_leaves_it_to_it(tmp_path: Path) -> None:
+    async with flight(tmp_path, calibrated=False, used=False) as flying:
+        rig = flying.rig
+        store = rig.double.parameters  # as the script makes it
+        store._types["CMPG_HEADING"], store.values["CMPG_HEADING"] = mavlink.MAV_PARAM_TYPE_REAL32, 1.0
+        store.names += ("CMPG_HEADING",)
+        await set_up(flying)
+        assert flying.attitude.view()["safety_net"] == "script"
+        rig.unplugged.add("own")
+        await flying.sleep(5.0)
+        assert rig.double.external_nav.source_set == 1

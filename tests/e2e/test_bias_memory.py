@@ -182,14 +182,11 @@ def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: 
     assert len(store.read()["fc"].points) == 1
 
 
-def test_what_is_undone_is_forgotten(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **FEW).running() as rig:
-            await rig.ready()
-            assert (await calibrated(rig))[0].outcome == "done"
-            assert len(BiasStore(tmp_path).read()["fc"].points) == 1
-            undone = await started(rig.service.calibrating.manager.start_undo("test")).finished
-            assert undone.outcome == "done"
-            assert BiasStore(tmp_path).read()["fc"].points == ()
-
-    run_virtual(main())
+async def test_what_is_undone_is_forgotten(tmp_path: Path) -> None:
+    async with Rig(tmp_path, **FEW).running() as rig:
+        await rig.ready()
+        assert (await calibrated(rig))[0].outcome == "done"
+        assert len(BiasStore(tmp_path).read()["fc"].points) == 1
+        undone = await started(rig.service.calibrating.manager.start_undo("test")).finished
+        assert undone.outcome == "done"
+        assert BiasStore(tmp_path).read()["fc"].points == ()

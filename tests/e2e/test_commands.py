@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from companion.estimation.records.record import ImuRecord, Record, WrittenParameter
+from sim.companion_process import POLL_S, READY_WITHIN_S, status_of
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
 from sim.serve import configuration
@@ -93,19 +94,22 @@ async def _until_disarmed(config: Path) -> None:
 
 
 async def _until(config: Path, armed: str) -> None:
-    await _until_status(config, armed, lambda status: status["vehicle"]["armed"] == armed)
+    await until_status(config, armed, lambda status: status["vehicle"]["armed"] == armed)
 
 
 async def _until_read(config: Path) -> None:
-    await _until_status(config, "good devices", lambda status: all(one["good"] for one in status["devices"]))
+    await until_status(config, "good devices", lambda status: all(one["good"] for one in status["devices"]))
 
 
-async def _until_status(config: Path, what: str, holds: Callable[[Any], bool]) -> None:
-    for _ in range(40):
-        said = await companion("-c", str(config), "status", "--json")
-        if said.code == DONE and holds(said.json):
+async def until_status(config: Path, what: str, holds: Callable[[Any], bool]) -> None:
+    status: Any = None
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(READY_WITHIN_S):
+            while status is None or not holds(status):
+                await asyncio.sleep(POLL_S)
+                status = await status_of(config)
             return
-    raise AssertionError(f"the daemon never said {what}: {said}")
+    raise AssertionError(f"the daemon never said {what}: {status}")
 
 
 def test_a_day_at_the_flight_line(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.service import JobResult, Refusal
 from companion.estimation.machine import State
 from companion.estimation.request import What
-from sim.ardupilot.double import offset_names
+from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started
 from tests.support.rig import Rig
@@ -64,56 +64,50 @@ def gyro_error_deg_h(rig: Rig) -> float:
     return float(np.abs(rig.double.residual(1, rig.now_s).gyro_rad_s).max() / DEG_H)
 
 
-def test_accelerometers_then_the_firmwares_calibration_once_then_the_fine_gyro_offsets(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path, auxiliary=True, max_s=30.0).running() as rig:
-            await rig.ready()
-            sent = Sent(rig)
-            before = imu_parameters(rig)
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert sent.commands == 1
-            place = sent.log.index(GYRO_CALIBRATION)
-            assert set(offset_names(1, "accel")) <= set(sent.log[:place])
-            assert set(sent.log[place + 1 :]) == set(offset_names(1, "gyro"))
-            # Over the firmware's coarse ones, of which no trace is left in ours.
-            assert gyro_error_deg_h(rig) < FINE_DEG_H
-            rig.double.update_estimator(rig.now_s)
-            assert np.abs(rig.double.estimator.omega_i).max() < 72 * DEG_H
-            written = record.imus[0].written
-            assert list(written) == FC_PARAMETERS
-            assert {name: what.before for name, what in written.items()} == {n: before[n] for n in FC_PARAMETERS}
-            assert {what.outcome for what in written.values()} == {"verified"}
-            # Everything else that the firmware has changed is named, and comes back.
-            others = {n for n, value in imu_parameters(rig).items() if value != before[n]} - set(FC_PARAMETERS)
-            assert {"INS_GYR2OFFS_X", "INS4_GYROFFS_Z", "INS_GYR1_CALTEMP"} <= others
-            words = " ".join(record.warnings)
-            assert all(name in words for name in others)
-            started(rig.service.calibrating.manager.start_undo("test"))
-            await rig.until(lambda: imu_parameters(rig) == before, 20.0)
-
-    run_virtual(main())
+async def test_accelerometers_then_the_firmwares_calibration_once_then_the_fine_gyro_offsets(tmp_path: Path) -> None:
+    async with make(tmp_path, auxiliary=True, max_s=30.0).running() as rig:
+        await rig.ready()
+        sent = Sent(rig)
+        before = imu_parameters(rig)
+        result, record = await calibrated(rig)
+        assert result.outcome == "done", result
+        assert sent.commands == 1
+        place = sent.log.index(GYRO_CALIBRATION)
+        assert set(offset_names(1, "accel")) <= set(sent.log[:place])
+        assert set(sent.log[place + 1 :]) == set(offset_names(1, "gyro"))
+        # Over the firmware's coarse ones, of which no trace is left in ours.
+        assert gyro_error_deg_h(rig) < FINE_DEG_H
+        rig.double.update_estimator(rig.now_s)
+        assert np.abs(rig.double.estimator.omega_i).max() < 72 * DEG_H
+        written = record.imus[0].written
+        assert list(written) == FC_PARAMETERS
+        assert {name: what.before for name, what in written.items()} == {n: before[n] for n in FC_PARAMETERS}
+        assert {what.outcome for what in written.values()} == {"verified"}
+        # Everything else that the firmware has changed is named, and comes back.
+        others = {n for n, value in imu_parameters(rig).items() if value != before[n]} - set(FC_PARAMETERS)
+        assert {"INS_GYR2OFFS_X", "INS4_GYROFFS_Z", "INS_GYR1_CALTEMP"} <= others
+        words = " ".join(record.warnings)
+        assert all(name in words for name in others)
+        started(rig.service.calibrating.manager.start_undo("test"))
+        await rig.until(lambda: imu_parameters(rig) == before, 20.0)
 
 
-def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_waited_for(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path, parameters={"INS_TCAL2_ENABLE": 1.0}).running() as rig:
-            await rig.ready()
-            sent = Sent(rig)
-            words: set[str] = set()
-            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            while not job.finished.done():
-                words.add(job.words)
-                await asyncio.sleep(0.5)
-            assert job.finished.result().outcome == "done"
-            assert sent.commands == 0
-            assert job.record is not None
-            assert "INS_TCAL2_ENABLE is on" in " ".join(job.record.warnings)
-            assert any(each.startswith("EKF adjusting: ") for each in words), words
-            rig.double.update_estimator(rig.now_s)
-            assert np.abs(rig.double.estimator.omega_i).max() < 80 * DEG_H
-
-    run_virtual(main())
+async def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_waited_for(tmp_path: Path) -> None:
+    async with make(tmp_path, parameters={"INS_TCAL2_ENABLE": 1.0}).running() as rig:
+        await rig.ready()
+        sent = Sent(rig)
+        words: set[str] = set()
+        job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
+        while not job.finished.done():
+            words.add(job.words)
+            await asyncio.sleep(0.5)
+        assert job.finished.result().outcome == "done"
+        assert sent.commands == 0
+        assert job.record is not None
+        assert "INS_TCAL2_ENABLE is on" in " ".join(job.record.warnings)
+        assert any(each.startswith("EKF adjusting: ") for each in words), words
+        rig.double.update_estimator(rig.now_s)
+        assert np.abs(rig.double.estimator.omega_i).max() < 80 * DEG_H
 
 
 def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_result(tmp_path: Path) -> None:
@@ -137,20 +131,17 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
     assert "wait 2 min before take-off: cancelled by test" in words
 
 
-def test_a_calibration_of_the_firmware_that_fails_is_said_and_ours_stays(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path).running() as rig:
-            await rig.ready()
-            sent = Sent(rig)
-            rig.double.faults.gyro_calibration_fails = True
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert sent.commands == 1
-            assert "Gyros not calibrated" in " ".join(record.warnings)
-            assert "Gyros not calibrated" in rig.double.prearm_failures(rig.now_s)
-            assert gyro_error_deg_h(rig) < FINE_DEG_H
-
-    run_virtual(main())
+async def test_a_calibration_of_the_firmware_that_fails_is_said_and_ours_stays(tmp_path: Path) -> None:
+    async with make(tmp_path).running() as rig:
+        await rig.ready()
+        sent = Sent(rig)
+        rig.double.faults.gyro_calibration_fails = True
+        result, record = await calibrated(rig)
+        assert result.outcome == "done", result
+        assert sent.commands == 1
+        assert "Gyros not calibrated" in " ".join(record.warnings)
+        assert "Gyros not calibrated" in rig.double.prearm_failures(rig.now_s)
+        assert gyro_error_deg_h(rig) < FINE_DEG_H
 
 
 PHASES: dict[str, Callable[[Rig, Sent], bool]] = {
@@ -164,41 +155,38 @@ PHASES: dict[str, Callable[[Rig, Sent], bool]] = {
 @pytest.mark.parametrize(
     ("phase", "gyr_cal"), [*((phase, 0.0) for phase in PHASES), ("while the effect is looked at", 1.0)]
 )
-def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_measured(
+async def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_measured(
     tmp_path: Path, phase: str, gyr_cal: float
 ) -> None:
-    async def main() -> None:
-        async with make(tmp_path, parameters={"INS_GYR_CAL": gyr_cal}).running() as rig:
-            await rig.ready()
-            # The boot has just measured them; another offset makes the step worth the firmware's calibration.
-            rig.double.write_as_another_station("INS_GYROFFS_X", 0.004)
-            rig.double.write_as_another_station("INS_GYR2OFFS_Y", 0.002)
-            await asyncio.sleep(1.0)
-            sent = Sent(rig)
-            before = imu_parameters(rig)
-            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            while not PHASES[phase](rig, sent):
-                await asyncio.sleep(0.005)
-                assert not job.finished.done(), job.finished.result()
-            rig.double.reboot(down_s=1.0)
-            result = await job.finished
-            assert result.outcome == "failed", result
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
-            after = imu_parameters(rig)
-            differ = {name for name in before if after[name] != before[name]}
-            if gyr_cal:
-                # What the start-up calibration wrote is its own; nothing of ours is left.
-                gyros = {name for name in before if ("GYR" in name and "OFFS" in name) or "CALTEMP" in name}
-                assert differ <= gyros
-                assert job.record is not None
-                written = job.record.imus[0].written
-                assert all(after[name] != written[name].after for name in written)
-            else:
-                assert differ == set()
-            assert rig.service.offsets.recovery.why_no_undo() == "nothing to undo"
-            assert sent.commands <= 1
-
-    run_virtual(main())
+    async with make(tmp_path, parameters={"INS_GYR_CAL": gyr_cal}).running() as rig:
+        await rig.ready()
+        # The boot has just measured them; another offset makes the step worth the firmware's calibration.
+        rig.double.write_as_another_station("INS_GYROFFS_X", 0.004)
+        rig.double.write_as_another_station("INS_GYR2OFFS_Y", 0.002)
+        await asyncio.sleep(1.0)
+        sent = Sent(rig)
+        before = imu_parameters(rig)
+        job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
+        while not PHASES[phase](rig, sent):
+            await asyncio.sleep(0.005)
+            assert not job.finished.done(), job.finished.result()
+        rig.double.reboot(down_s=1.0)
+        result = await job.finished
+        assert result.outcome == "failed", result
+        await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+        after = imu_parameters(rig)
+        differ = {name for name in before if after[name] != before[name]}
+        if gyr_cal:
+            # What the start-up calibration wrote is its own; nothing of ours is left.
+            gyros = {name for name in before if ("GYR" in name and "OFFS" in name) or "CALTEMP" in name}
+            assert differ <= gyros
+            assert job.record is not None
+            written = job.record.imus[0].written
+            assert all(after[name] != written[name].after for name in written)
+        else:
+            assert differ == set()
+        assert rig.service.offsets.recovery.why_no_undo() == "nothing to undo"
+        assert sent.commands <= 1
 
 
 def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_back_when_it_comes_again(

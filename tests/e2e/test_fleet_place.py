@@ -16,7 +16,6 @@ from sim.earth import normal_gravity_m_s2
 from sim.scenario import site_at
 from tests.support.fleet import HERON, Aircraft, check
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 LOCATIONS: tuple[Location, ...] = ("full", "1km", "off")
 PLACE = site_at(47.123456, 11.654321, 623.4)
@@ -86,34 +85,31 @@ def telling(items: list[Any], relative: float) -> dict[str, str]:
     }
 
 
-def test_no_figure_tells_more_of_the_place_than_is_wanted(tmp_path: Path) -> None:
-    async def main() -> None:
-        (tmp_path / "aircraft").mkdir()
-        await lived(tmp_path / "aircraft")
-        folders = {location: tmp_path / location for location in LOCATIONS}
-        for folder in folders.values():
-            shutil.copytree(tmp_path / "aircraft", folder)
-        full, rounded, none = [await told(folder, location) for location, folder in folders.items()]
-        found = telling(full, 1e-5)
-        # The search finds them where they are, also the gravity within what was worked out with it.
-        assert {"latitude", "height", "declination", "inclination", "gravity"} <= {*found.values()}
-        assert "gravity times 0.005" in found.values()
-        assert telling(none, 2e-3) == {}
-        # A kilometre is 1e-2 deg of latitude, and no gravity or field tells it to that.
-        assert telling(rounded, 1e-5) == {}
-        assert {".site.latitude_deg", ".site.gravity_m_s2"} <= telling(rounded, 1e-3).keys()
-        site = rounded[0]["body"]["site"]
-        assert (site["latitude_deg"], site["height_m"]) == (47.12, 600.0)
-        # What it is for is there as before.
-        for one, other in zip(full, none, strict=True):
-            assert other["body"].keys() == one["body"].keys()
-        before, now = full[0]["body"]["imus"][0], none[0]["body"]["imus"][0]
-        for key in ("gyro_bias_rad_s", "accel_bias_m_s2", "written", "gyro_id"):
-            assert now[key] == before[key]
-        for key in ("gyro_sigma_use_rad_s", "accel_sigma_use_m_s2", "gyro_sigma_stat_rad_s"):
-            for sigma, exact in zip(now[key], before[key], strict=True):
-                assert abs(sigma / exact - 1.0) <= 0.05
-                # With all its digits the latitude could be worked out from it.
-                assert sigma == float(f"{sigma:.1e}")
-
-    run_virtual(main())
+async def test_no_figure_tells_more_of_the_place_than_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "aircraft").mkdir()
+    await lived(tmp_path / "aircraft")
+    folders = {location: tmp_path / location for location in LOCATIONS}
+    for folder in folders.values():
+        shutil.copytree(tmp_path / "aircraft", folder)
+    full, rounded, none = [await told(folder, location) for location, folder in folders.items()]
+    found = telling(full, 1e-5)
+    # The search finds them where they are, also the gravity within what was worked out with it.
+    assert {"latitude", "height", "declination", "inclination", "gravity"} <= {*found.values()}
+    assert "gravity times 0.005" in found.values()
+    assert telling(none, 2e-3) == {}
+    # A kilometre is 1e-2 deg of latitude, and no gravity or field tells it to that.
+    assert telling(rounded, 1e-5) == {}
+    assert {".site.latitude_deg", ".site.gravity_m_s2"} <= telling(rounded, 1e-3).keys()
+    site = rounded[0]["body"]["site"]
+    assert (site["latitude_deg"], site["height_m"]) == (47.12, 600.0)
+    # What it is for is there as before.
+    for one, other in zip(full, none, strict=True):
+        assert other["body"].keys() == one["body"].keys()
+    before, now = full[0]["body"]["imus"][0], none[0]["body"]["imus"][0]
+    for key in ("gyro_bias_rad_s", "accel_bias_m_s2", "written", "gyro_id"):
+        assert now[key] == before[key]
+    for key in ("gyro_sigma_use_rad_s", "accel_sigma_use_m_s2", "gyro_sigma_stat_rad_s"):
+        for sigma, exact in zip(now[key], before[key], strict=True):
+            assert abs(sigma / exact - 1.0) <= 0.05
+            # With all its digits the latitude could be worked out from it.
+            assert sigma == float(f"{sigma:.1e}")

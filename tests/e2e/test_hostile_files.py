@@ -15,7 +15,6 @@ from companion.component.service import Refusal
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.state import sealed
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 
 def changes(name: str, before: float) -> bytes:
@@ -31,36 +30,33 @@ def changes(name: str, before: float) -> bytes:
     ],
     ids=["journal", "undo"],
 )
-def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
+async def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
     tmp_path: Path, name: str, damage: Callable[[Path], Any], reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """tests/unit/storage/test_state.py has the other contents and the other files."""
     path = tmp_path / name
     damage(path)
 
-    async def main() -> None:
-        rig = Rig(tmp_path, version="4.6", parameters={"INS_GYROFFS_X": 0.001})
-        async with rig.running():
-            await rig.ready()
-            await asyncio.sleep(10.0)
-            (said,) = [words for words in caplog.messages if path.name in words]
-            assert said in rig.service.status()["warnings"]
-            assert said.startswith(f"{path}: cannot be {reason}: ")
-            assert rig.service.offsets.ledger.fault is None
-            assert not rig.service.offsets.ledger.pending
-            if name == "undo-1.json":
-                answer = rig.service.calibrating.manager.start_undo("test")
-                assert isinstance(answer, Refusal)
-                assert answer.reason == "nothing to undo; what was kept could not be used"
-            else:
-                assert "Interrupted write, file damaged: calibrate" in rig.ground.texts()
-            assert rig.double.writes == []
-
-    run_virtual(main())
+    rig = Rig(tmp_path, version="4.6", parameters={"INS_GYROFFS_X": 0.001})
+    async with rig.running():
+        await rig.ready()
+        await asyncio.sleep(10.0)
+        (said,) = [words for words in caplog.messages if path.name in words]
+        assert said in rig.service.status()["warnings"]
+        assert said.startswith(f"{path}: cannot be {reason}: ")
+        assert rig.service.offsets.ledger.fault is None
+        assert not rig.service.offsets.ledger.pending
+        if name == "undo-1.json":
+            answer = rig.service.calibrating.manager.start_undo("test")
+            assert isinstance(answer, Refusal)
+            assert answer.reason == "nothing to undo; what was kept could not be used"
+        else:
+            assert "Interrupted write, file damaged: calibrate" in rig.ground.texts()
+        assert rig.double.writes == []
 
 
 @pytest.mark.parametrize(("version", "name"), [("4.6", "CAL_GYRO0_XOFF"), ("4.8", "INS5_GYROFFS_X")])
-def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_end(
+async def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_end(
     tmp_path: Path, version: str, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Of another firmware, or of an IMU that is gone: nobody waits for it for ever, and what is there is put back."""
@@ -68,12 +64,9 @@ def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_en
     found = ChangeSet(1, tuple(Changed(each, before=0.0, after=0.001) for each in dict.fromkeys((name, there))))
     ChangeLog(tmp_path).journal.write(found)
 
-    async def main() -> None:
-        async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
-            ours = name.startswith("INS")
-            assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
-            assert len(rig.double.writes) == int(ours)
-            assert any(name in words for words in caplog.messages)
-
-    run_virtual(main())
+    async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
+        await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
+        ours = name.startswith("INS")
+        assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
+        assert len(rig.double.writes) == int(ours)
+        assert any(name in words for words in caplog.messages)

@@ -10,7 +10,6 @@ from companion.estimation.records.validity import Why
 from tests.e2e.test_calibration import calibrated, started
 from tests.e2e.test_faults import values
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 QUICK: dict[str, Any] = {"min_still_s": 4.0, "max_s": 8.0}
 
@@ -28,27 +27,24 @@ async def told(rig: Rig) -> str:
     return lines[heading + 1]
 
 
-def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_as_one(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.ready()
-            before = values(rig.double)
-            assert (await calibrated(rig))[0].outcome == "done"
-            rig.double.faults.arm_after_writes = 2
-            failed = await started(rig.service.calibrating.manager.start_undo("test")).finished
-            assert failed.outcome == "failed"
-            assert "undone in part (" in failed.reason
-            assert failed.reason.endswith("the rest follows once disarmed")
-            assert "calibration, 11 parameters: old values not restored yet" in await told(rig)
-            rig.double.disarm()
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
-            assert values(rig.double) == before
-            assert rig.service.status()["undoable"] == []
-            assert " old values back, 20" in await told(rig)
-            (record,) = rig.service.calibrating.store.history()
-            assert record.undone_at
-            await rig.until(
-                lambda: {each.why for each in rig.service.arming.in_force.findings(rig.now_s)} == {Why.UNDONE}, 5.0
-            )
-
-    run_virtual(main())
+async def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_as_one(tmp_path: Path) -> None:
+    async with Rig(tmp_path, **QUICK).running() as rig:
+        await rig.ready()
+        before = values(rig.double)
+        assert (await calibrated(rig))[0].outcome == "done"
+        rig.double.faults.arm_after_writes = 2
+        failed = await started(rig.service.calibrating.manager.start_undo("test")).finished
+        assert failed.outcome == "failed"
+        assert "undone in part (" in failed.reason
+        assert failed.reason.endswith("the rest follows once disarmed")
+        assert "calibration, 11 parameters: old values not restored yet" in await told(rig)
+        rig.double.disarm()
+        await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
+        assert values(rig.double) == before
+        assert rig.service.status()["undoable"] == []
+        assert " old values back, 20" in await told(rig)
+        (record,) = rig.service.calibrating.store.history()
+        assert record.undone_at
+        await rig.until(
+            lambda: {each.why for each in rig.service.arming.in_force.findings(rig.now_s)} == {Why.UNDONE}, 5.0
+        )

@@ -13,7 +13,6 @@ from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated, started
 from tests.support import page
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 
 async def press(rig: Rig, button: str, /, **body: Any) -> tuple[int, str]:
@@ -65,101 +64,92 @@ class Watch:
         return self.words
 
 
-def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, max_s=12.0).running() as rig:
-            await rig.ready()
-            assert rig.service.status()["why_no_undo"] is not None
-            assert await press(rig, "undo") == (409, await at_the_socket(rig, "undo"))
-            assert await press(rig, "cancel") == (200, "nothing was running")
+async def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words(tmp_path: Path) -> None:
+    async with Rig(tmp_path, max_s=12.0).running() as rig:
+        await rig.ready()
+        assert rig.service.status()["why_no_undo"] is not None
+        assert await press(rig, "undo") == (409, await at_the_socket(rig, "undo"))
+        assert await press(rig, "cancel") == (200, "nothing was running")
 
-            rig.double.arm()
-            await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "armed", 3.0)
-            status, words = await press(rig, "calibrate")
-            assert (status, words) == (409, await at_the_socket(rig, "calibrate"))
-            assert "armed" in words
-            rig.double.disarm()
-            await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "disarmed", 3.0)
+        rig.double.arm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "armed", 3.0)
+        status, words = await press(rig, "calibrate")
+        assert (status, words) == (409, await at_the_socket(rig, "calibrate"))
+        assert "armed" in words
+        rig.double.disarm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "disarmed", 3.0)
 
-            allowed = '"both", "gyros", "accelerometers"'
-            wrong = f"calibrate: 'what': found \"nothing\"; allowed: {allowed}"
-            assert await press(rig, "calibrate", what="nothing") == (409, wrong)
-            assert await press(rig, "calibrate") == (200, "calibration started")
-            job = rig.service.calibrating.manager.job
-            assert job is not None
-            assert job.what is What.BOTH
-            busy = await press(rig, "calibrate")
-            assert busy[0] == 409
-            assert "running" in busy[1]
-            assert await press(rig, "cancel") == (200, "cancelled by the page's cancel")
-            assert (await job.finished).outcome == "cancelled"
+        allowed = '"both", "gyros", "accelerometers"'
+        wrong = f"calibrate: 'what': found \"nothing\"; allowed: {allowed}"
+        assert await press(rig, "calibrate", what="nothing") == (409, wrong)
+        assert await press(rig, "calibrate") == (200, "calibration started")
+        job = rig.service.calibrating.manager.job
+        assert job is not None
+        assert job.what is What.BOTH
+        busy = await press(rig, "calibrate")
+        assert busy[0] == 409
+        assert "running" in busy[1]
+        assert await press(rig, "cancel") == (200, "cancelled by the page's cancel")
+        assert (await job.finished).outcome == "cancelled"
 
-            before = rig.double.parameter("INS_GYROFFS_X")
-            assert await press(rig, "calibrate", what="gyros") == (200, "calibration started")
-            job = rig.service.calibrating.manager.job
-            assert job is not None
-            assert job.what is What.GYROS
-            assert (await job.finished).outcome == "done"
-            assert rig.double.parameter("INS_GYROFFS_X") != before
-            assert rig.service.status()["why_no_undo"] is None
-            status, words = await press(rig, "undo")
-            assert status == 200
-            assert "old values back" in words
-            assert rig.double.parameter("INS_GYROFFS_X") == before
-
-    run_virtual(main())
+        before = rig.double.parameter("INS_GYROFFS_X")
+        assert await press(rig, "calibrate", what="gyros") == (200, "calibration started")
+        job = rig.service.calibrating.manager.job
+        assert job is not None
+        assert job.what is What.GYROS
+        assert (await job.finished).outcome == "done"
+        assert rig.double.parameter("INS_GYROFFS_X") != before
+        assert rig.service.status()["why_no_undo"] is None
+        status, words = await press(rig, "undo")
+        assert status == 200
+        assert "old values back" in words
+        assert rig.double.parameter("INS_GYROFFS_X") == before
 
 
-def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, max_s=12.0).running() as rig:
-            await rig.ready()
-            await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 5.0)
-            assert headline(rig) == ("bad", "NOT CALIBRATED", "not calibrated yet: calibrate")
-            watch = Watch(rig)
-            rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(rig.now_s) + 1.0, duration_s=8.0, seed=3))
-            result, record = await calibrated(rig)
-            await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
-            assert result.outcome == "done"
-            words = await watch.stop()
-            assert words[-5:] == ["HOLD STILL", "MEASURING", "WRITING", "CHECKING", "READY"] or words[-6:] == [
-                "HOLD STILL", "MEASURING", "WRITING", "CHECKING", "SETTLING", "READY",
-            ], words  # fmt: skip
-            tone, _, reason = headline(rig)
-            assert tone == "good"
-            assert re.match(r"calibrated \d+ s ago, \d+\.\d deg/h, \d\.\d\d mg", reason)
+async def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: Path) -> None:
+    async with Rig(tmp_path, max_s=12.0).running() as rig:
+        await rig.ready()
+        await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 5.0)
+        assert headline(rig) == ("bad", "NOT CALIBRATED", "not calibrated yet: calibrate")
+        watch = Watch(rig)
+        rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(rig.now_s) + 1.0, duration_s=8.0, seed=3))
+        result, record = await calibrated(rig)
+        await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
+        assert result.outcome == "done"
+        words = await watch.stop()
+        assert words[-5:] == ["HOLD STILL", "MEASURING", "WRITING", "CHECKING", "READY"] or words[-6:] == [
+            "HOLD STILL", "MEASURING", "WRITING", "CHECKING", "SETTLING", "READY",
+        ], words  # fmt: skip
+        tone, _, reason = headline(rig)
+        assert tone == "good"
+        assert re.match(r"calibrated \d+ s ago, \d+\.\d deg/h, \d\.\d\d mg", reason)
 
-            rig.double.arm()
-            await rig.until(lambda: headline(rig)[1] == "ARMED", 3.0)
-            assert headline(rig)[0] == "good"
-            rig.double.disarm()
-            await rig.until(lambda: headline(rig)[1] == "READY", 3.0)
+        rig.double.arm()
+        await rig.until(lambda: headline(rig)[1] == "ARMED", 3.0)
+        assert headline(rig)[0] == "good"
+        rig.double.disarm()
+        await rig.until(lambda: headline(rig)[1] == "READY", 3.0)
 
-            job = started(rig.service.calibrating.manager.start_undo("test"))
-            await rig.until(lambda: headline(rig)[1] == "PUTTING BACK", 3.0)
-            assert (await job.finished).outcome == "done"
-            await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 3.0)
-            assert rig.service.status()["calibration"] is None
-            assert record.state == "done"
+        job = started(rig.service.calibrating.manager.start_undo("test"))
+        await rig.until(lambda: headline(rig)[1] == "PUTTING BACK", 3.0)
+        assert (await job.finished).outcome == "done"
+        await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 3.0)
+        assert rig.service.status()["calibration"] is None
+        assert record.state == "done"
 
-            rig.double.arm()
-            await rig.until(lambda: headline(rig)[:2] == ("bad", "ARMED"), 3.0)
-            assert "not calibrated" in headline(rig)[2]
-
-    run_virtual(main())
+        rig.double.arm()
+        await rig.until(lambda: headline(rig)[:2] == ("bad", "ARMED"), 3.0)
+        assert "not calibrated" in headline(rig)[2]
 
 
-def test_left_alone_it_says_how_long_to_hold_still_until_it_is_ready(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, max_s=15.0, at_arm="gate").running() as rig:
-            watch = Watch(rig)
-            await rig.until(lambda: headline(rig)[1] == "READY", 120.0)
-            words = await watch.stop()
-            assert {"HOLD STILL", "WRITING", "READY"} <= set(words)
-            # In the first second devices have said nothing yet; from then on nobody has to do anything.
-            assert not {"NOT CALIBRATED", "NOT READY", "FAILED"} & set(words[words.index("HOLD STILL") :]), words
-            counted = watch.seconds
-            assert len(set(counted)) > 5
-            assert counted == sorted(counted, reverse=True)
-
-    run_virtual(main())
+async def test_left_alone_it_says_how_long_to_hold_still_until_it_is_ready(tmp_path: Path) -> None:
+    async with Rig(tmp_path, max_s=15.0, at_arm="gate").running() as rig:
+        watch = Watch(rig)
+        await rig.until(lambda: headline(rig)[1] == "READY", 120.0)
+        words = await watch.stop()
+        assert {"HOLD STILL", "WRITING", "READY"} <= set(words)
+        # In the first second devices have said nothing yet; from then on nobody has to do anything.
+        assert not {"NOT CALIBRATED", "NOT READY", "FAILED"} & set(words[words.index("HOLD STILL") :]), words
+        counted = watch.seconds
+        assert len(set(counted)) > 5
+        assert counted == sorted(counted, reverse=True)

@@ -24,9 +24,9 @@ from tests.e2e.test_commands import (
     FlightLine,
     _end,
     _until_disarmed,
-    _until_status,
     companion,
     flight_line,
+    until_status,
 )
 from tests.support.browser import DESKTOP, PHONE, Tab, chromium, find
 from tests.support.rig import Rig
@@ -56,7 +56,7 @@ async def scene(
         flight_line(folder, more=f'[web]\nbind = "{bind}"\n', still_s=still_s) as line,
         chromium(folder / "profile") as browser,
     ):
-        await _until_status(line.config, "where the page is", lambda status: bool(status["page"]["url"]))
+        await until_status(line.config, "where the page is", lambda status: bool(status["page"]["url"]))
         status = await companion("-c", str(line.config), "status", "--json")
         port = re.search(r":(\d+)/$", status.json["page"]["url"])
         assert port is not None

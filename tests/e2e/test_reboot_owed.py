@@ -14,44 +14,40 @@ from companion.autopilot.parameters.change import Change
 from companion.daemon.offsets.reboot import RebootOwed, owed_in
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig, inline
-from tests.support.virtual_time import run_virtual
 
 LARGE = (Change("CAL_ACC0_XOFF", 0.3, 0.0),)
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_no_face_says_ready_after_a_restart_of_the_companion_until_px4_was_restarted(
+async def test_no_face_says_ready_after_a_restart_of_the_companion_until_px4_was_restarted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, restarted: bool
 ) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, firmware="px4", max_s=12.0, parameters={"CAL_ACC0_XOFF": 0.3})
-        monkeypatch.setenv("COMPANION_BOOT_ID", "before")
-        async with rig.running():
-            await rig.ready()
-            assert (await calibrated(rig))[0].outcome == "done"
-            assert "reboot PX4: tilt " in rig.service.status()["headline"]["reason"]
-        rig.wire.__init__(rig.link, rig.px4)  # type: ignore[misc]
-        rig.radio.__init__(rig.ground, rig.px4.ground)  # type: ignore[misc]
-        monkeypatch.setenv("COMPANION_BOOT_ID", "after")  # the board was off, too
-        if restarted:
+    rig = Rig(tmp_path, firmware="px4", max_s=12.0, parameters={"CAL_ACC0_XOFF": 0.3})
+    monkeypatch.setenv("COMPANION_BOOT_ID", "before")
+    async with rig.running():
+        await rig.ready()
+        assert (await calibrated(rig))[0].outcome == "done"
+        assert "reboot PX4: tilt " in rig.service.status()["headline"]["reason"]
+    rig.wire.__init__(rig.link, rig.px4)  # type: ignore[misc]
+    rig.radio.__init__(rig.ground, rig.px4.ground)  # type: ignore[misc]
+    monkeypatch.setenv("COMPANION_BOOT_ID", "after")  # the board was off, too
+    if restarted:
+        rig.px4.reboot()
+        await asyncio.sleep(4.0)
+    async with rig.running():
+        words = set()
+        for _ in range(40):
+            words.add(rig.service.status()["headline"]["word"])
+            await asyncio.sleep(1.0)
+        status = rig.service.status()
+        assert ("READY" in words) is restarted
+        assert owed_in(tmp_path).path.exists() is not restarted
+        if not restarted:
+            assert "reboot PX4: tilt " in status["headline"]["reason"]
+            assert status["arming"]["verdict"] != "accept"
             rig.px4.reboot()
-            await asyncio.sleep(4.0)
-        async with rig.running():
-            words = set()
-            for _ in range(40):
-                words.add(rig.service.status()["headline"]["word"])
-                await asyncio.sleep(1.0)
-            status = rig.service.status()
-            assert ("READY" in words) is restarted
-            assert owed_in(tmp_path).path.exists() is not restarted
-            if not restarted:
-                assert "reboot PX4: tilt " in status["headline"]["reason"]
-                assert status["arming"]["verdict"] != "accept"
-                rig.px4.reboot()
-                await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 60.0)
-                assert not owed_in(tmp_path).path.exists()
-
-    run_virtual(main())
+            await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 60.0)
+            assert not owed_in(tmp_path).path.exists()
 
 
 @pytest.mark.parametrize(
@@ -66,7 +62,7 @@ def test_no_face_says_ready_after_a_restart_of_the_companion_until_px4_was_resta
         (None, 30.0, True, True),  # not heard yet
     ],
 )
-def test_a_restart_that_nobody_saw_shows_in_the_time_since_boot(
+async def test_a_restart_that_nobody_saw_shows_in_the_time_since_boot(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     boot_s: float | None,
@@ -86,14 +82,11 @@ def test_a_restart_that_nobody_saw_shows_in_the_time_since_boot(
         made.load()
         return made
 
-    async def main() -> None:
-        await asyncio.sleep(1000.0)
-        before = known(100.0, "one")
-        await before.after(LARGE)
-        await before.after([Change("CAL_ACC0_XOFF", 0.0, 0.001)])
-        assert before.words == "reboot PX4: tilt 1.8 deg off"
-        await asyncio.sleep(later_s)
-        again = known(boot_s, "one" if same_board else "other")
-        assert again.words == (before.words if owed else None)
-
-    run_virtual(main())
+    await asyncio.sleep(1000.0)
+    before = known(100.0, "one")
+    await before.after(LARGE)
+    await before.after([Change("CAL_ACC0_XOFF", 0.0, 0.001)])
+    assert before.words == "reboot PX4: tilt 1.8 deg off"
+    await asyncio.sleep(later_s)
+    again = known(boot_s, "one" if same_board else "other")
+    assert again.words == (before.words if owed else None)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.e2e.test_commands import DONE, FAILED, NO_DAEMON, companion, flight_line
+from tests.e2e.test_commands import DONE, FAILED, NO_DAEMON, companion, flight_line, until_status
 
 LONGER_THAN_A_WINDOW_S = 8.0
 
@@ -32,10 +32,10 @@ def test_record_calibrate_pull_the_plug_replay(tmp_path: Path) -> None:
             assert f"already recording to {mine}" in second.err, second
             assert f"recording to {mine}" in (await companion("-c", config, "status")).out
 
-            recorded_s = 0.0
-            while recorded_s < LONGER_THAN_A_WINDOW_S:  # one that began before would not be recomputed
-                status = await companion("-c", config, "status", "--json")
-                recorded_s = status.json["recording"]["file"]["seconds"]
+            # A calibration that began before would not be recomputed.
+            await until_status(
+                line.config, "recording", lambda status: status["recording"]["file"]["seconds"] > LONGER_THAN_A_WINDOW_S
+            )
             done = await companion("-c", config, "calibrate", "--wait", "--timeout", "60", "--json")
             assert done.code == DONE, done.err
             await asyncio.sleep(2.1)  # what a power cut may cost

@@ -20,7 +20,6 @@ from companion.storage.records import RecordStore
 from sim.devices import HMR3300
 from sim.motions import SlowTurn
 from tests.e2e.test_attitude_push import Firmware, Flight, Vision, flight
-from tests.support.virtual_time import run_virtual
 
 WITHIN_S = 3.0
 STARTS_S = 0.5
@@ -57,82 +56,73 @@ def begun(flying: Flight, since_s: float) -> list[str]:
 
 
 @pytest.mark.parametrize(("firmware", "own_imu"), [("ardupilot", False), ("px4", True)])
-def test_it_goes_on_within_three_seconds_in_a_turn(tmp_path: Path, firmware: Firmware, own_imu: bool) -> None:
+async def test_it_goes_on_within_three_seconds_in_a_turn(tmp_path: Path, firmware: Firmware, own_imu: bool) -> None:
     """By the truth, and nothing else is begun: no calibration, no write, no word of an arming that nobody saw."""
 
-    async def main() -> None:
-        options: dict[str, Any] = {"own_imu": own_imu, "imu_rate_hz": 50.0, "at_arm": "warn"}
-        async with flight(tmp_path, firmware=firmware, **options) as flying:
-            in_air(flying)
-            await flying.sleep(6.0)
-            armings, said = (tmp_path / "armings.json").read_bytes(), len(flying.rig.ground.texts())
-            killed_s = flying.rig.now_s
-            await flying.rig.restart()
-            await flying.pushing(WITHIN_S - STARTS_S)
-            await flying.sleep(5.0)
-            assert flying.attitude.health.pushing
-            assert worst_deg(flying, killed_s) < 2.0
-            headline = flying.rig.service.status()["headline"]
-            assert headline["word"] == "ARMED"
-            assert headline["reason"].startswith("companion started in flight: ")
-            assert begun(flying, killed_s) == []
-            assert flying.rig.service.calibrating.manager.job is None
-            texts = flying.rig.ground.texts()[said:]
-            assert "Attitude: heading pushed to the autopilot" in texts
-            assert not [text for text in texts if "rmed" in text or "alibrat" in text or "not pushed" in text]
-            assert (tmp_path / "armings.json").read_bytes() == armings
-
-    run_virtual(main())
+    options: dict[str, Any] = {"own_imu": own_imu, "imu_rate_hz": 50.0, "at_arm": "warn"}
+    async with flight(tmp_path, firmware=firmware, **options) as flying:
+        in_air(flying)
+        await flying.sleep(6.0)
+        armings, said = (tmp_path / "armings.json").read_bytes(), len(flying.rig.ground.texts())
+        killed_s = flying.rig.now_s
+        await flying.rig.restart()
+        await flying.pushing(WITHIN_S - STARTS_S)
+        await flying.sleep(5.0)
+        assert flying.attitude.health.pushing
+        assert worst_deg(flying, killed_s) < 2.0
+        headline = flying.rig.service.status()["headline"]
+        assert headline["word"] == "ARMED"
+        assert headline["reason"].startswith("companion started in flight: ")
+        assert begun(flying, killed_s) == []
+        assert flying.rig.service.calibrating.manager.job is None
+        texts = flying.rig.ground.texts()[said:]
+        assert "Attitude: heading pushed to the autopilot" in texts
+        assert not [text for text in texts if "rmed" in text or "alibrat" in text or "not pushed" in text]
+        assert (tmp_path / "armings.json").read_bytes() == armings
 
 
-def test_a_compass_that_lies_since_is_not_followed(tmp_path: Path) -> None:
+async def test_a_compass_that_lies_since_is_not_followed(tmp_path: Path) -> None:
     """By 40 degrees: nothing is pushed, and everybody is told why, until it is right again."""
 
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4") as flying:
-            rig = flying.rig
-            in_air(flying)
-            await flying.sleep(6.0)
-            compass = rig.devices["compass"]
-            assert isinstance(compass, HMR3300)
-            compass.heading_error_deg = 40.0
-            killed_s = rig.now_s
-            await rig.restart()
-            await flying.sleep(6.0)
-            # The last one from before the restart may still have been on its way.
-            assert not [m for m in flying.witness.of(Vision, killed_s) if m.usec * 1e-6 > killed_s]
-            assert flying.attitude.view()["why_not"] in DIFFERS
-            (text,) = [text for text in rig.ground.texts() if text.startswith("Attitude not pushed: ")]
-            assert text.removeprefix("Attitude not pushed: ") in DIFFERS
-            status = rig.service.status()
-            assert status["headline"]["reason"].startswith("attitude not pushed: heading differs by")
-            (line,) = [device for device in status["devices"] if device["kind"] == "attitude"]
-            assert not line["good"]
-            assert line["summary"].startswith("not pushed: heading differs by")
-            compass.heading_error_deg = 0.0
-            right_s = rig.now_s
-            await flying.pushing(5.0)
-            await flying.sleep(5.0)
-            assert worst_deg(flying, right_s) < 2.0
-
-    run_virtual(main())
+    async with flight(tmp_path, firmware="px4") as flying:
+        rig = flying.rig
+        in_air(flying)
+        await flying.sleep(6.0)
+        compass = rig.devices["compass"]
+        assert isinstance(compass, HMR3300)
+        compass.heading_error_deg = 40.0
+        killed_s = rig.now_s
+        await rig.restart()
+        await flying.sleep(6.0)
+        # The last one from before the restart may still have been on its way.
+        assert not [m for m in flying.witness.of(Vision, killed_s) if m.usec * 1e-6 > killed_s]
+        assert flying.attitude.view()["why_not"] in DIFFERS
+        (text,) = [text for text in rig.ground.texts() if text.startswith("Attitude not pushed: ")]
+        assert text.removeprefix("Attitude not pushed: ") in DIFFERS
+        status = rig.service.status()
+        assert status["headline"]["reason"].startswith("attitude not pushed: heading differs by")
+        (line,) = [device for device in status["devices"] if device["kind"] == "attitude"]
+        assert not line["good"]
+        assert line["summary"].startswith("not pushed: heading differs by")
+        compass.heading_error_deg = 0.0
+        right_s = rig.now_s
+        await flying.pushing(5.0)
+        await flying.sleep(5.0)
+        assert worst_deg(flying, right_s) < 2.0
 
 
-def test_who_may_be_armed_is_carried_as_in_flight(tmp_path: Path) -> None:
+async def test_who_may_be_armed_is_carried_as_in_flight(tmp_path: Path) -> None:
     """On the ground, its heartbeats lost: it may have armed, so that no stillness is believed until they are back."""
 
-    async def main() -> None:
-        async with flight(tmp_path) as flying:
-            rig, carrier = flying.rig, flying.attitude.carrier
-            await rig.until(lambda: (carrier.phase, carrier.still) == ("ground", True), 10.0)
-            rig.double.faults.heartbeat_off = True
-            await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.UNKNOWN, 10.0)
-            await flying.sleep(2.0)
-            assert (carrier.phase, carrier.still) == ("flight", False)
-            rig.double.faults.heartbeat_off = False
-            await rig.until(lambda: (carrier.phase, carrier.still) == ("ground", True), 10.0)
-
-    run_virtual(main())
+    async with flight(tmp_path) as flying:
+        rig, carrier = flying.rig, flying.attitude.carrier
+        await rig.until(lambda: (carrier.phase, carrier.still) == ("ground", True), 10.0)
+        rig.double.faults.heartbeat_off = True
+        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.UNKNOWN, 10.0)
+        await flying.sleep(2.0)
+        assert (carrier.phase, carrier.still) == ("flight", False)
+        rig.double.faults.heartbeat_off = False
+        await rig.until(lambda: (carrier.phase, carrier.still) == ("ground", True), 10.0)
 
 
 def exchanged_part(flying: Flight) -> None:
@@ -162,44 +152,39 @@ def undone(flying: Flight) -> None:
         (True, undone, "no calibration is in force"),
     ],
 )
-def test_biases_that_are_not_this_imus_now_are_not_used(
+async def test_biases_that_are_not_this_imus_now_are_not_used(
     tmp_path: Path, own_imu: bool, happens: Callable[[Flight], None], why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is pushed, it is said once, and the disk is not asked again and again."""
 
-    async def main() -> None:
-        async with flight(tmp_path, own_imu=own_imu, imu_rate_hz=50.0) as flying:
-            in_air(flying)
-            await flying.sleep(3.0)
-            happens(flying)
-            killed_s = flying.rig.now_s + flying.rig.wire.delay_s[1]  # one may be on its way
-            looks, history = Counter[str](), RecordStore.history
+    async with flight(tmp_path, own_imu=own_imu, imu_rate_hz=50.0) as flying:
+        in_air(flying)
+        await flying.sleep(3.0)
+        happens(flying)
+        killed_s = flying.rig.now_s + flying.rig.wire.delay_s[1]  # one may be on its way
+        looks, history = Counter[str](), RecordStore.history
 
-            def counted(store: RecordStore, limit: int | None = None) -> list[Record]:
-                looks["history"] += 1
-                return history(store, limit)
+        def counted(store: RecordStore, limit: int | None = None) -> list[Record]:
+            looks["history"] += 1
+            return history(store, limit)
 
-            monkeypatch.setattr(RecordStore, "history", counted)
-            await flying.rig.restart()
-            await flying.sleep(5.0)
-            assert looks["history"] == 2  # at the start, and here
-            assert not flying.witness.of(Vision, killed_s)
-            assert flying.attitude.view()["why_not"] == why
-            texts = [text for text in flying.rig.ground.texts() if "not pushed" in text]
-            assert texts == [f"Attitude not pushed: {why}"]
-
-    run_virtual(main())
+        monkeypatch.setattr(RecordStore, "history", counted)
+        await flying.rig.restart()
+        await flying.sleep(5.0)
+        assert looks["history"] == 2  # at the start, and here
+        # The last one from before the restart may still have been on its way.
+        assert not [m for m in flying.witness.of(Vision, killed_s) if m.usec * 1e-6 > killed_s]
+        assert flying.attitude.view()["why_not"] == why
+        texts = [text for text in flying.rig.ground.texts() if "not pushed" in text]
+        assert texts == [f"Attitude not pushed: {why}"]
 
 
-def test_an_autopilot_has_outlived_the_power_cut_of_our_board(tmp_path: Path) -> None:
+async def test_an_autopilot_has_outlived_the_power_cut_of_our_board(tmp_path: Path) -> None:
     """Its offsets are as they were, whatever our clock says now."""
 
-    async def main() -> None:
-        async with flight(tmp_path, own_imu=False, imu_rate_hz=50.0) as flying:
-            in_air(flying)
-            await flying.sleep(3.0)
-            of_another_power_up(flying)
-            await flying.rig.restart()
-            await flying.pushing(WITHIN_S - STARTS_S)
-
-    run_virtual(main())
+    async with flight(tmp_path, own_imu=False, imu_rate_hz=50.0) as flying:
+        in_air(flying)
+        await flying.sleep(3.0)
+        of_another_power_up(flying)
+        await flying.rig.restart()
+        await flying.pushing(WITHIN_S - STARTS_S)

@@ -12,12 +12,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config.sections import Imu
 from companion.estimation.request import What
-from sim.ardupilot.double import ArduPilotDouble, offset_names
+from sim.ardupilot.double import ArduPilotDouble
+from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H, MG, AxisNoise, ImuModel, ImuSpec
 from sim.px4.double import PX4Double
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
 FLOATS = "floats of the script"
@@ -55,77 +55,62 @@ def messages(rig: Rig) -> list[str | None]:
     return [None if imu.stream.kind is None else imu.stream.kind.name for imu in imus]
 
 
-def test_every_imu_is_calibrated_from_floats_without_a_write_before_the_result(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with three_imus(tmp_path, script=True).running() as rig:
-            await rig.until(lambda: messages(rig) == ["HIGHRES_IMU", FLOATS, FLOATS], 15.0)
-            _, record = await calibrated(rig, What.BOTH)
-            assert [imu.name for imu in record.imus] == ["fc1", "fc2", "fc3"]
-            for instance, imu in zip((2, 3), record.imus[1:], strict=True):
-                left = rig.double.residual(instance, rig.now_s)
-                assert np.abs(left.gyro_rad_s).max() / DEG_H < 4.0
-                assert np.abs(left.accel_m_s2).max() / MG < 0.15  # the gradienter of this rig is good to 0.1 mg
-                outcomes = {imu.written[name].outcome for name in offset_names(instance, "gyro")}
-                assert outcomes == {"verified"}
-            # Six offsets of each IMU, and the gyros' again over the firmware's own calibration.
-            assert len(rig.double.writes) == 3 * 9
-
-    run_virtual(main())
+async def test_every_imu_is_calibrated_from_floats_without_a_write_before_the_result(tmp_path: Path) -> None:
+    async with three_imus(tmp_path, script=True).running() as rig:
+        await rig.until(lambda: messages(rig) == ["HIGHRES_IMU", FLOATS, FLOATS], 15.0)
+        _, record = await calibrated(rig, What.BOTH)
+        assert [imu.name for imu in record.imus] == ["fc1", "fc2", "fc3"]
+        for instance, imu in zip((2, 3), record.imus[1:], strict=True):
+            left = rig.double.residual(instance, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() / DEG_H < 4.0
+            assert np.abs(left.accel_m_s2).max() / MG < 0.15  # the gradienter of this rig is good to 0.1 mg
+            outcomes = {imu.written[name].outcome for name in offset_names(instance, "gyro")}
+            assert outcomes == {"verified"}
+        # Six offsets of each IMU, and the gyros' again over the firmware's own calibration.
+        assert len(rig.double.writes) == 3 * 9
 
 
-def test_without_the_script_the_quiet_ones_are_left_alone_and_the_words_name_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with three_imus(tmp_path, script=False, max_s=12.0).running() as rig:
-            await rig.until(lambda: messages(rig) == ["HIGHRES_IMU", "SCALED_IMU2", "SCALED_IMU3"], 15.0)
-            _, record = await calibrated(rig, What.GYROS)
-            assert [imu.name for imu in record.imus if imu.gyro_bias_rad_s is not None] == ["fc1"]
-            for imu in record.imus[1:]:
-                assert "companion lua" in " ".join(imu.warnings), imu.warnings
-            written = {write.name for write in rig.double.writes}
-            assert not written & {*offset_names(2, "gyro"), *offset_names(3, "gyro")}
-
-    run_virtual(main())
+async def test_without_the_script_the_quiet_ones_are_left_alone_and_the_words_name_it(tmp_path: Path) -> None:
+    async with three_imus(tmp_path, script=False, max_s=12.0).running() as rig:
+        await rig.until(lambda: messages(rig) == ["HIGHRES_IMU", "SCALED_IMU2", "SCALED_IMU3"], 15.0)
+        _, record = await calibrated(rig, What.GYROS)
+        assert [imu.name for imu in record.imus if imu.gyro_bias_rad_s is not None] == ["fc1"]
+        for imu in record.imus[1:]:
+            assert "companion lua" in " ".join(imu.warnings), imu.warnings
+        written = {write.name for write in rig.double.writes}
+        assert not written & {*offset_names(2, "gyro"), *offset_names(3, "gyro")}
 
 
-def test_armed_it_is_quiet_and_the_integers_are_there_instead(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with three_imus(tmp_path, script=True).running() as rig:
-            await rig.until(lambda: messages(rig)[1:] == [FLOATS, FLOATS], 15.0)
-            rig.double.arm()
-            await rig.until(lambda: messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"], 10.0)
-            rig.double.disarm()
-            await rig.until(lambda: messages(rig)[1:] == [FLOATS, FLOATS], 10.0)
-
-    run_virtual(main())
+async def test_armed_it_is_quiet_and_the_integers_are_there_instead(tmp_path: Path) -> None:
+    async with three_imus(tmp_path, script=True).running() as rig:
+        await rig.until(lambda: messages(rig)[1:] == [FLOATS, FLOATS], 15.0)
+        rig.double.arm()
+        await rig.until(lambda: messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"], 10.0)
+        rig.double.disarm()
+        await rig.until(lambda: messages(rig)[1:] == [FLOATS, FLOATS], 10.0)
 
 
-def test_nothing_is_asked_of_the_script_for_an_imu_that_has_better(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = three_imus(tmp_path, script=True)
-        rig.config = msgspec.structs.replace(rig.config, imu=rig.config.imu[:1])
-        async with rig.running():
-            await rig.until(lambda: messages(rig) == ["HIGHRES_IMU"], 15.0)
-            asked = rig.double.channels[0].received["TUNNEL"]
-            await asyncio.sleep(10.0)
-            assert rig.double.channels[0].received["TUNNEL"] == asked
-
-    run_virtual(main())
+async def test_nothing_is_asked_of_the_script_for_an_imu_that_has_better(tmp_path: Path) -> None:
+    rig = three_imus(tmp_path, script=True)
+    rig.config = msgspec.structs.replace(rig.config, imu=rig.config.imu[:1])
+    async with rig.running():
+        await rig.until(lambda: messages(rig) == ["HIGHRES_IMU"], 15.0)
+        asked = rig.double.channels[0].received["TUNNEL"]
+        await asyncio.sleep(10.0)
+        assert rig.double.channels[0].received["TUNNEL"] == asked
 
 
 @pytest.mark.parametrize("name", [b"OTHERS", b"CMP_IMU"])
-def test_somebody_elses_float_arrays_are_no_samples(tmp_path: Path, name: bytes) -> None:
-    async def main() -> None:
-        async with three_imus(tmp_path, script=False).running() as rig:
-            await rig.until(lambda: messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"], 15.0)
-            version = 2 if name == b"CMP_IMU" else 1
-            for count in range(40):
-                values = [0.001 * count, *[float("nan")] * 20, *[1.0] * 37]
-                array = mavlink.MAVLink_debug_float_array_message(count * 50_000, name, version, values)
-                rig.double.channels[0].send(array)
-                await asyncio.sleep(0.05)
-            assert messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"]
-
-    run_virtual(main())
+async def test_somebody_elses_float_arrays_are_no_samples(tmp_path: Path, name: bytes) -> None:
+    async with three_imus(tmp_path, script=False).running() as rig:
+        await rig.until(lambda: messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"], 15.0)
+        version = 2 if name == b"CMP_IMU" else 1
+        for count in range(40):
+            values = [0.001 * count, *[float("nan")] * 20, *[1.0] * 37]
+            array = mavlink.MAVLink_debug_float_array_message(count * 50_000, name, version, values)
+            rig.double.channels[0].send(array)
+            await asyncio.sleep(0.05)
+        assert messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"]
 
 
 def px4(folder: Path, *, console: bool) -> Rig:
@@ -149,13 +134,10 @@ def px4(folder: Path, *, console: bool) -> Rig:
     return rig
 
 
-def test_px4s_console_tells_the_second_imu_without_a_write_before_the_result(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with px4(tmp_path, console=True).running() as rig:
-            await rig.until(lambda: messages(rig) == ["HIGHRES_IMU+bias", "SCALED_IMU2"], 30.0)
-            await calibrated(rig, What.BOTH)
-            left = rig.px4.residual(2, rig.now_s)
-            assert np.abs(left.gyro_rad_s).max() / DEG_H < 6.0
-            assert np.abs(left.accel_m_s2).max() / MG < 0.15
-
-    run_virtual(main())
+async def test_px4s_console_tells_the_second_imu_without_a_write_before_the_result(tmp_path: Path) -> None:
+    async with px4(tmp_path, console=True).running() as rig:
+        await rig.until(lambda: messages(rig) == ["HIGHRES_IMU+bias", "SCALED_IMU2"], 30.0)
+        await calibrated(rig, What.BOTH)
+        left = rig.px4.residual(2, rig.now_s)
+        assert np.abs(left.gyro_rad_s).max() / DEG_H < 6.0
+        assert np.abs(left.accel_m_s2).max() / MG < 0.15

@@ -17,7 +17,6 @@ from companion.daemon.job import Job
 from companion.estimation.request import What
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 BAUD = 57600
 OTHERS_BYTES = 60
@@ -66,28 +65,25 @@ async def other_traffic(rig: Rig) -> AsyncIterator[None]:
         await asyncio.gather(task, return_exceptions=True)
 
 
-def test_on_a_busy_57600_baud_line_a_calibration_is_right(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = Rig(
-            tmp_path,
-            firmware="px4",
-            baud=BAUD,
-            imus=1,
-            part="bmi088",
-            default_streams=False,
-            parameters={"IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0},
-        )
-        async with rig.running(), other_traffic(rig):
-            await rig.ready()
-            job = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
-            assert isinstance(job, Job)
-            result = await job.finished
-            assert result.outcome == "done", result
-            assert job.record is not None
-            left, sigma = rig.autopilot.residual(1, rig.now_s), np.array(job.record.imus[0].gyro_sigma_use_rad_s)
-            assert sigma.max() < 30 * DEG_H
-            assert (np.abs(left.gyro_rad_s) < 3.0 * sigma).all()
-            assert np.abs(left.accel_m_s2).max() < 0.5 * MG
-            assert rig.wire.dropped < 50, "we asked for more than the line carries"
-
-    run_virtual(main())
+async def test_on_a_busy_57600_baud_line_a_calibration_is_right(tmp_path: Path) -> None:
+    rig = Rig(
+        tmp_path,
+        firmware="px4",
+        baud=BAUD,
+        imus=1,
+        part="bmi088",
+        default_streams=False,
+        parameters={"IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0},
+    )
+    async with rig.running(), other_traffic(rig):
+        await rig.ready()
+        job = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
+        assert isinstance(job, Job)
+        result = await job.finished
+        assert result.outcome == "done", result
+        assert job.record is not None
+        left, sigma = rig.autopilot.residual(1, rig.now_s), np.array(job.record.imus[0].gyro_sigma_use_rad_s)
+        assert sigma.max() < 30 * DEG_H
+        assert (np.abs(left.gyro_rad_s) < 3.0 * sigma).all()
+        assert np.abs(left.accel_m_s2).max() < 0.5 * MG
+        assert rig.wire.dropped < 50, "we asked for more than the line carries"

@@ -114,33 +114,30 @@ def replayed_at_once(ground: Ground, message: mavlink.MAVLink_message) -> bytes:
 
 
 @pytest.mark.parametrize("attack", [unsigned, with_another_key, replayed, replayed_at_once])
-def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attack: Attack) -> None:
+async def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attack: Attack) -> None:
     """On the companion's own wire, behind the autopilot's back."""
 
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        rig.autopilot.require_signatures(KEY, now())
-        rig.ground.sign(KEY, now())
-        async with rig.running():
-            await rig.ready()
-            await asyncio.sleep(2.0)
-            parameters = rig.service.faces.component.parameters
-            push = parameters.get("CMP_PUSH")
-            for message in (
-                command_message(CALIBRATE, 0, target=(1, 191)),
-                command_message(CANCEL, target=(1, 191)),
-                mavlink.MAVLink_param_set_message(1, 191, b"CMP_PUSH", 1.0 - push, 9),
-            ):
-                data = attack(rig.ground, message)
-                await asyncio.sleep(0.1)
-                rig.wire.carry_from_other(data)
-                await asyncio.sleep(1.5)
-            assert rig.service.calibrating.manager.job is None
-            assert parameters.get("CMP_PUSH") == push
-            assert rig.ground.acks() == []
-            assert sum(rig.service.status()["vehicle"]["signing"]["doubted"].values()) == 3
-
-    run_virtual(main())
+    rig = signed_rig(tmp_path)
+    rig.autopilot.require_signatures(KEY, now())
+    rig.ground.sign(KEY, now())
+    async with rig.running():
+        await rig.ready()
+        await asyncio.sleep(2.0)
+        parameters = rig.service.faces.component.parameters
+        push = parameters.get("CMP_PUSH")
+        for message in (
+            command_message(CALIBRATE, 0, target=(1, 191)),
+            command_message(CANCEL, target=(1, 191)),
+            mavlink.MAVLink_param_set_message(1, 191, b"CMP_PUSH", 1.0 - push, 9),
+        ):
+            data = attack(rig.ground, message)
+            await asyncio.sleep(0.1)
+            rig.wire.carry_from_other(data)
+            await asyncio.sleep(1.5)
+        assert rig.service.calibrating.manager.job is None
+        assert parameters.get("CMP_PUSH") == push
+        assert rig.ground.acks() == []
+        assert sum(rig.service.status()["vehicle"]["signing"]["doubted"].values()) == 3
 
 
 @pytest.mark.parametrize(
@@ -150,39 +147,35 @@ def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attac
         (OTHER, "messages dropped: the autopilot signs with another key"),
     ],
 )
-def test_an_autopilot_that_is_not_believed_is_said_and_why(tmp_path: Path, theirs: bytes | None, words: str) -> None:
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        if theirs is not None:
-            rig.autopilot.require_signatures(theirs, now())
-        async with rig.running():
-            await asyncio.sleep(5.0)
-            assert rig.service.core.vehicle.system_id is None
-            assert words in words_of(rig)
-            assert words in rig.service.status()["headline"]["reason"]
-            assert not rig.service.status()["vehicle"]["signing"]["good"]
-            assert rig.service.core.collector.status(rig.now_s).still_s == 0.0
+async def test_an_autopilot_that_is_not_believed_is_said_and_why(
+    tmp_path: Path, theirs: bytes | None, words: str
+) -> None:
+    rig = signed_rig(tmp_path)
+    if theirs is not None:
+        rig.autopilot.require_signatures(theirs, now())
+    async with rig.running():
+        await asyncio.sleep(5.0)
+        assert rig.service.core.vehicle.system_id is None
+        assert words in words_of(rig)
+        assert words in rig.service.status()["headline"]["reason"]
+        assert not rig.service.status()["vehicle"]["signing"]["good"]
+        assert rig.service.core.collector.status(rig.now_s).still_s == 0.0
 
-    run_virtual(main())
 
-
-def test_sign_alone_is_for_the_way_there(tmp_path: Path) -> None:
+async def test_sign_alone_is_for_the_way_there(tmp_path: Path) -> None:
     """With "sign" the autopilot that wants signatures hears us, and a station that has no key yet is still answered."""
 
-    async def main() -> None:
-        rig = signed_rig(tmp_path, mode="sign")
-        async with rig.running():
-            await rig.ready()
-            rig.ground.command(CANCEL)
-            await asyncio.sleep(1.0)
-            assert rig.ground.finals(CANCEL) == [ACCEPTED]
-            signing = rig.service.status()["vehicle"]["signing"]
-            assert signing["good"]
-            assert "not signed with our key" in signing["summary"]
-            rig.autopilot.require_signatures(KEY, now())
-            verified = signing["verified"]
-            await asyncio.sleep(3.0)
-            assert rig.service.status()["vehicle"]["signing"]["verified"] > verified
-            assert rig.service.core.vehicle.alive
-
-    run_virtual(main())
+    rig = signed_rig(tmp_path, mode="sign")
+    async with rig.running():
+        await rig.ready()
+        rig.ground.command(CANCEL)
+        await asyncio.sleep(1.0)
+        assert rig.ground.finals(CANCEL) == [ACCEPTED]
+        signing = rig.service.status()["vehicle"]["signing"]
+        assert signing["good"]
+        assert "not signed with our key" in signing["summary"]
+        rig.autopilot.require_signatures(KEY, now())
+        verified = signing["verified"]
+        await asyncio.sleep(3.0)
+        assert rig.service.status()["vehicle"]["signing"]["verified"] > verified
+        assert rig.service.core.vehicle.alive

@@ -87,35 +87,29 @@ def test_an_announced_offset_that_is_not_in_force_disturbs_nothing(
         (0.5, (beat(armed=True), beat(armed=False)), "armed; nothing"),
     ],
 )
-def test_nothing_that_is_forged_again_and_again_holds_a_calibration_up_for_ever(
+async def test_nothing_that_is_forged_again_and_again_holds_a_calibration_up_for_ever(
     tmp_path: Path, every_s: float, what: tuple[Callable[[], Message], ...], words: str
 ) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.ready()
-            async with spoofed(rig, every_s, *what):
-                job = calibrate(rig)
-                async with asyncio.timeout(60.0):
-                    result = await job.finished
-            assert result.outcome == "failed"
-            assert words in result.reason
-            await asyncio.sleep(2.0)
-            assert any("Calibration failed" in text for text in rig.ground.texts())
-
-    run_virtual(main())
-
-
-def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.ready()
+    async with Rig(tmp_path, **QUICK).running() as rig:
+        await rig.ready()
+        async with spoofed(rig, every_s, *what):
             job = calibrate(rig)
-            await asyncio.sleep(3.05)
-            codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-            for armed in (True, False):
-                rig.link.receive(beat(armed=armed)().pack(codec), rig.now_s)
-            async with asyncio.timeout(5.0):
+            async with asyncio.timeout(60.0):
                 result = await job.finished
-            assert result.reason == "armed; nothing written"
+        assert result.outcome == "failed"
+        assert words in result.reason
+        await asyncio.sleep(2.0)
+        assert any("Calibration failed" in text for text in rig.ground.texts())
 
-    run_virtual(main())
+
+async def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> None:
+    async with Rig(tmp_path, **QUICK).running() as rig:
+        await rig.ready()
+        job = calibrate(rig)
+        await asyncio.sleep(3.05)
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        for armed in (True, False):
+            rig.link.receive(beat(armed=armed)().pack(codec), rig.now_s)
+        async with asyncio.timeout(5.0):
+            result = await job.finished
+        assert result.reason == "armed; nothing written"

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from companion.component.service import Refusal
 from companion.estimation.request import What
+from sim.station import End
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_faults import values
 from tests.e2e.test_undo import undone
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
-from tests.support.wire import End, Wire
+from tests.support.wire import Wire
 
 WORDS = "second companion (1/191) on this link writes: stop one of them"
 
@@ -78,52 +78,46 @@ async def two(folder: Path) -> AsyncIterator[tuple[Rig, Rig]]:
             await other._stop(feeding)
 
 
-def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with two(tmp_path) as both:
-            for rig in both:
-                await rig.ready()
-            await asyncio.sleep(8.0)
-            before = values(both[0].double)
-            refusing = [rig for rig in both if rig.service.offsets.companions.why_not() is not None]
-            (second,) = refusing
-            (writer,) = [rig for rig in both if rig is not second]
-            refusal = second.service.calibrating.manager.start_calibration(What.BOTH, "test")
-            assert isinstance(refusal, Refusal)
-            assert refusal.reason == WORDS
-            status = second.service.status()
-            assert (status["headline"]["word"], status["headline"]["reason"]) == ("TWO COMPANIONS", WORDS)
-            assert WORDS in status["warnings"]
-            assert WORDS.replace("writes", "waits") in writer.service.status()["warnings"]
-            said = {(rig.service.offsets.companions.warning or "").replace("second", "Second") for rig in both}
-            assert said <= set(both[0].ground.texts())
-            assert (await calibrated(writer))[0].outcome == "done"
-            assert values(writer.double) != before
-            undo = second.service.calibrating.manager.start_undo("test")
-            assert isinstance(undo, Refusal)
-            assert undo.reason == WORDS
-            assert (await undone(writer)).outcome == "done"
-            assert values(writer.double) == before
-
-    run_virtual(main())
+async def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tmp_path: Path) -> None:
+    async with two(tmp_path) as both:
+        for rig in both:
+            await rig.ready()
+        await asyncio.sleep(8.0)
+        before = values(both[0].double)
+        refusing = [rig for rig in both if rig.service.offsets.companions.why_not() is not None]
+        (second,) = refusing
+        (writer,) = [rig for rig in both if rig is not second]
+        refusal = second.service.calibrating.manager.start_calibration(What.BOTH, "test")
+        assert isinstance(refusal, Refusal)
+        assert refusal.reason == WORDS
+        status = second.service.status()
+        assert (status["headline"]["word"], status["headline"]["reason"]) == ("TWO COMPANIONS", WORDS)
+        assert WORDS in status["warnings"]
+        assert WORDS.replace("writes", "waits") in writer.service.status()["warnings"]
+        said = {(rig.service.offsets.companions.warning or "").replace("second", "Second") for rig in both}
+        assert said <= set(both[0].ground.texts())
+        assert (await calibrated(writer))[0].outcome == "done"
+        assert values(writer.double) != before
+        undo = second.service.calibrating.manager.start_undo("test")
+        assert isinstance(undo, Refusal)
+        assert undo.reason == WORDS
+        assert (await undone(writer)).outcome == "done"
+        assert values(writer.double) == before
 
 
-def test_a_write_that_the_second_has_begun_to_measure_for_is_not_done(tmp_path: Path) -> None:
+async def test_a_write_that_the_second_has_begun_to_measure_for_is_not_done(tmp_path: Path) -> None:
     """A request may come before the other companion is heard."""
 
-    async def main() -> None:
-        async with two(tmp_path) as both:
-            for rig in both:
-                await rig.ready()
-            before = values(both[0].double)
-            jobs = [rig.service.calibrating.manager.start_calibration(What.BOTH, "test") for rig in both]
-            results = [await job.finished for job in jobs if not isinstance(job, Refusal)]
-            reasons = [job.reason for job in jobs if isinstance(job, Refusal)]
-            reasons += [result.reason for result in results if result.outcome != "done"]
-            assert len(reasons) == 1
-            assert WORDS in reasons[0]
-            (writer,) = [rig for rig in both if rig.service.status()["undoable"]]
-            assert (await undone(writer)).outcome == "done"
-            assert values(writer.double) == before
-
-    run_virtual(main())
+    async with two(tmp_path) as both:
+        for rig in both:
+            await rig.ready()
+        before = values(both[0].double)
+        jobs = [rig.service.calibrating.manager.start_calibration(What.BOTH, "test") for rig in both]
+        results = [await job.finished for job in jobs if not isinstance(job, Refusal)]
+        reasons = [job.reason for job in jobs if isinstance(job, Refusal)]
+        reasons += [result.reason for result in results if result.outcome != "done"]
+        assert len(reasons) == 1
+        assert WORDS in reasons[0]
+        (writer,) = [rig for rig in both if rig.service.status()["undoable"]]
+        assert (await undone(writer)).outcome == "done"
+        assert values(writer.double) == before

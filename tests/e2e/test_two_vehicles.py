@@ -18,10 +18,10 @@ from sim.ardupilot.double import ArduPilotDouble
 from sim.firmware.double import AutopilotDouble
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double
+from sim.station import End
 from tests.support.component import CALIBRATE, UNDO
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
-from tests.support.wire import End, Wire
+from tests.support.wire import Wire
 
 Firmware = Literal["ardupilot", "px4"]
 OTHER_BIAS_DEG_H = (-300.0, 250.0, -400.0)
@@ -124,52 +124,46 @@ async def stage(
         ("px4", "ardupilot", 2, False, True),
     ],
 )
-def test_a_calibration_and_its_undo_leave_the_other_aircraft_alone(
+async def test_a_calibration_and_its_undo_leave_the_other_aircraft_alone(
     tmp_path: Path, ours: Firmware, others: Firmware, own_id: int, *, configured: bool, late: bool
 ) -> None:
-    async def main() -> None:
-        async with stage(tmp_path, ours, others, own_id=own_id, configured=configured, late=late) as it:
-            rig = it.rig
-            await rig.ready()
-            if late:
-                it.join()
-            await asyncio.sleep(3.0)
-            it.other.arm()  # theirs is in the air, ours is not
-            before = values(rig.autopilot)
-            rig.ground.command(CALIBRATE, target=(own_id, 191))
-            await rig.until(lambda: rig.ground.acks(CALIBRATE)[-1:] == [0], 90.0)
-            record = rig.service.calibrating.manager.last
-            assert record is not None
-            assert record.state == "done"
-            residual = rig.autopilot.residual(1, rig.now_s)
-            assert float(np.abs(residual.gyro_rad_s).max() / DEG_H) < 30.0
-            assert float(np.abs(residual.accel_m_s2).max() / MG) < 0.5
-            it.assert_untouched()
-            rig.ground.command(UNDO, target=(own_id, 191))
-            await rig.until(lambda: rig.ground.acks(UNDO)[-1:] == [0], 60.0)
-            imu = ("INS", "CAL")
-            now = values(rig.autopilot)
-            assert {n: v for n, v in now.items() if n.startswith(imu)} == {
-                n: v for n, v in before.items() if n.startswith(imu)
-            }
-            it.assert_untouched()
-
-    run_virtual(main())
+    async with stage(tmp_path, ours, others, own_id=own_id, configured=configured, late=late) as it:
+        rig = it.rig
+        await rig.ready()
+        if late:
+            it.join()
+        await asyncio.sleep(3.0)
+        it.other.arm()  # theirs is in the air, ours is not
+        before = values(rig.autopilot)
+        rig.ground.command(CALIBRATE, target=(own_id, 191))
+        await rig.until(lambda: rig.ground.acks(CALIBRATE)[-1:] == [0], 90.0)
+        record = rig.service.calibrating.manager.last
+        assert record is not None
+        assert record.state == "done"
+        residual = rig.autopilot.residual(1, rig.now_s)
+        assert float(np.abs(residual.gyro_rad_s).max() / DEG_H) < 30.0
+        assert float(np.abs(residual.accel_m_s2).max() / MG) < 0.5
+        it.assert_untouched()
+        rig.ground.command(UNDO, target=(own_id, 191))
+        await rig.until(lambda: rig.ground.acks(UNDO)[-1:] == [0], 60.0)
+        imu = ("INS", "CAL")
+        now = values(rig.autopilot)
+        assert {n: v for n, v in now.items() if n.startswith(imu)} == {
+            n: v for n, v in before.items() if n.startswith(imu)
+        }
+        it.assert_untouched()
 
 
-def test_ours_in_the_air_is_not_written_to_because_the_other_one_stands_disarmed(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with stage(tmp_path, "px4", "ardupilot", own_id=1, configured=True, late=False) as it:
-            rig = it.rig
-            await rig.ready()
-            before = values(rig.autopilot)
-            rig.autopilot.arm()
-            await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "ARMED", 5.0)
-            rig.ground.command(CALIBRATE, target=(1, 191))
-            await rig.until(lambda: rig.ground.acks(CALIBRATE) != [], 5.0)
-            await asyncio.sleep(20.0)
-            assert rig.ground.acks(CALIBRATE) == [mavlink.MAV_RESULT_DENIED]
-            assert values(rig.autopilot) == before
-            it.assert_untouched()
-
-    run_virtual(main())
+async def test_ours_in_the_air_is_not_written_to_because_the_other_one_stands_disarmed(tmp_path: Path) -> None:
+    async with stage(tmp_path, "px4", "ardupilot", own_id=1, configured=True, late=False) as it:
+        rig = it.rig
+        await rig.ready()
+        before = values(rig.autopilot)
+        rig.autopilot.arm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "ARMED", 5.0)
+        rig.ground.command(CALIBRATE, target=(1, 191))
+        await rig.until(lambda: rig.ground.acks(CALIBRATE) != [], 5.0)
+        await asyncio.sleep(20.0)
+        assert rig.ground.acks(CALIBRATE) == [mavlink.MAV_RESULT_DENIED]
+        assert values(rig.autopilot) == before
+        it.assert_untouched()

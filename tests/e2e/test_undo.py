@@ -14,7 +14,7 @@ from companion.autopilot.parameters.change import Change
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.storage.changes import MOST_STEPS, ChangeLog, ChangeSet, Origin, Undoable
-from sim.ardupilot.double import offset_names
+from sim.ardupilot.parameters import offset_names
 from tests.e2e.test_calibration import started
 from tests.support.component import ACCEPTED, DENIED, UNDO
 from tests.support.rig import Rig, inline
@@ -169,90 +169,81 @@ def mended(rig: Rig) -> None:
     ("fault", "why", "restart"),
     [(arms, "armed", True), (refuses, f"refuses {TRIM[0]}", False), (falls_silent, "no answer", False)],
 )
-def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
+async def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
     tmp_path: Path, fault: Callable[[Rig], None], why: str, restart: bool
 ) -> None:
     wanted = written(tmp_path)
     step_file = tmp_path / "undo-1.json"
 
-    async def main() -> None:
-        async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
+    async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
+        await rig.ready()
+        kept = step_file.read_bytes()
+        job = started(rig.service.calibrating.manager.start_undo("test"))
+        await rig.until((tmp_path / "journal.json").exists, 5.0)
+        assert read(rig) == wanted[0]
+        fault(rig)
+        failed = await job.finished
+        assert failed.outcome == "failed"
+        assert why in failed.reason
+        assert failed.reason.endswith("level stays in force: undo again")
+        assert "old values back" not in failed.reason
+        assert read(rig) == wanted[0]
+        assert step_file.read_bytes() == kept
+        assert not rig.service.offsets.ledger.pending
+        mended(rig)
+        if restart:
+            await rig.restart()
             await rig.ready()
-            kept = step_file.read_bytes()
-            job = started(rig.service.calibrating.manager.start_undo("test"))
-            await rig.until((tmp_path / "journal.json").exists, 5.0)
-            assert read(rig) == wanted[0]
-            fault(rig)
-            failed = await job.finished
-            assert failed.outcome == "failed"
-            assert why in failed.reason
-            assert failed.reason.endswith("level stays in force: undo again")
-            assert "old values back" not in failed.reason
-            assert read(rig) == wanted[0]
-            assert step_file.read_bytes() == kept
-            assert not rig.service.offsets.ledger.pending
-            mended(rig)
-            if restart:
-                await rig.restart()
-                await rig.ready()
-            await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "DISARMED", 30.0)
-            assert steps(rig) == list(STEPS)
-            assert (await undone(rig)).reason == "2 old values back: level"
-            assert read(rig) == wanted[1]
-
-    run_virtual(main())
+        await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "DISARMED", 30.0)
+        assert steps(rig) == list(STEPS)
+        assert (await undone(rig)).reason == "2 old values back: level"
+        assert read(rig) == wanted[1]
 
 
-def test_what_somebody_else_has_changed_stops_it_is_named_and_passed_over_by_force(tmp_path: Path) -> None:
+async def test_what_somebody_else_has_changed_stops_it_is_named_and_passed_over_by_force(tmp_path: Path) -> None:
     wanted = written(tmp_path)
 
-    async def main() -> None:
-        async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
-            await rig.ready()
-            await undone(rig)
-            for name in GYROS:
-                rig.double.write_as_another_station(name, 0.004)
-            now = read(rig)
-            refused = await undone(rig)
-            assert refused.outcome == "failed"
-            assert refused.reason.startswith("auto calibration: changed by somebody else or by a boot since")
-            assert f"{GYROS[0]} is 0.004, we had set 0.0025 (before: 0.001)" in refused.reason
-            assert refused.reason.endswith("companion undo --force leaves it so and comes to the one before")
-            assert read(rig) == now
-            assert steps(rig) == list(STEPS[1:])
-            forced = await undone(rig, force=True)
-            assert forced.reason == "0 old values back: auto calibration"
-            # The faces below it are untouched by that.
-            assert (await undone(rig)).reason == "6 old values back: faces"
-            assert read(rig) == wanted[3] | {name: now[name] for name in GYROS}
-
-    run_virtual(main())
+    async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
+        await rig.ready()
+        await undone(rig)
+        for name in GYROS:
+            rig.double.write_as_another_station(name, 0.004)
+        now = read(rig)
+        refused = await undone(rig)
+        assert refused.outcome == "failed"
+        assert refused.reason.startswith("auto calibration: changed by somebody else or by a boot since")
+        assert f"{GYROS[0]} is 0.004, we had set 0.0025 (before: 0.001)" in refused.reason
+        assert refused.reason.endswith("companion undo --force leaves it so and comes to the one before")
+        assert read(rig) == now
+        assert steps(rig) == list(STEPS[1:])
+        forced = await undone(rig, force=True)
+        assert forced.reason == "0 old values back: auto calibration"
+        # The faces below it are untouched by that.
+        assert (await undone(rig)).reason == "6 old values back: faces"
+        assert read(rig) == wanted[3] | {name: now[name] for name in GYROS}
 
 
-def test_right_after_the_start_it_waits_until_the_autopilot_is_heard(tmp_path: Path) -> None:
+async def test_right_after_the_start_it_waits_until_the_autopilot_is_heard(tmp_path: Path) -> None:
     wanted = written(tmp_path)
 
     async def asked(rig: Rig) -> dict[str, Any]:
         (reply,) = [each async for each in rig.service.faces.answer({"command": "undo"}, "test")]
         return dict(reply)
 
-    async def main() -> None:
-        rig = Rig(tmp_path, parameters=wanted[0])
-        rig.wire.cut = True
-        async with rig.running():
-            asked_s = rig.now_s
-            with pytest.raises(CalibrationRefusedError, match="no autopilot heard yet"):
-                await asked(rig)
-            assert 4.0 < rig.now_s - asked_s < 7.0
-            asking = asyncio.ensure_future(asked(rig))
-            await asyncio.sleep(1.0)
-            assert not asking.done()
-            rig.wire.cut = False
-            reply = await asking
-            assert (reply["state"], reply["reason"]) == ("done", "2 old values back: level")
-            assert [reply["undone"]["what"], *(each["what"] for each in reply["undoable"])] == list(STEPS)
-
-    run_virtual(main())
+    rig = Rig(tmp_path, parameters=wanted[0])
+    rig.wire.cut = True
+    async with rig.running():
+        asked_s = rig.now_s
+        with pytest.raises(CalibrationRefusedError, match="no autopilot heard yet"):
+            await asked(rig)
+        assert 4.0 < rig.now_s - asked_s < 7.0
+        asking = asyncio.ensure_future(asked(rig))
+        await asyncio.sleep(1.0)
+        assert not asking.done()
+        rig.wire.cut = False
+        reply = await asking
+        assert (reply["state"], reply["reason"]) == ("done", "2 old values back: level")
+        assert [reply["undone"]["what"], *(each["what"] for each in reply["undoable"])] == list(STEPS)
 
 
 def test_ten_steps_are_kept_and_the_oldest_makes_room() -> None:

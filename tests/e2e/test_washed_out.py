@@ -12,7 +12,6 @@ from companion.daemon.job import Job
 from companion.estimation.request import What
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, TEMPORARILY_REJECTED
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 
 def ask(rig: Rig, requester: str) -> Job | Refusal:
@@ -27,43 +26,37 @@ async def done(rig: Rig) -> None:
         assert result.outcome == "done", result
 
 
-def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            await done(rig)
-            folder = rig.service.calibrating.store.folder
-            before = [path.read_bytes() for path in folder.iterdir()]
-            for _ in range(1000):
-                rig.ground.command(CALIBRATE)
-                await asyncio.sleep(0.005)
-                rig.ground.command(CANCEL)
-                await asyncio.sleep(0.005)
-            # The last cancel is still on its way, and would cancel what comes next.
-            await rig.until(lambda: len(rig.ground.finals(CANCEL)) == 1000, 30.0)
-            await rig.until(lambda: not rig.service.calibrating.manager.state.busy, 30.0)
-            assert [path.read_bytes() for path in folder.iterdir()] == before
-            assert len(before) == 1
-            assert TEMPORARILY_REJECTED in rig.ground.finals(CALIBRATE)
-            assert set(rig.ground.finals(CANCEL)) == {ACCEPTED}
-            assert any("too many requests, wait" in text for text in rig.ground.texts())
-            await asyncio.sleep(1.0)
-            await done(rig)
-
-    run_virtual(main())
+async def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Path) -> None:
+    async with Rig(tmp_path).running() as rig:
+        await rig.ready()
+        await done(rig)
+        folder = rig.service.calibrating.store.folder
+        before = [path.read_bytes() for path in folder.iterdir()]
+        for _ in range(1000):
+            rig.ground.command(CALIBRATE)
+            await asyncio.sleep(0.005)
+            rig.ground.command(CANCEL)
+            await asyncio.sleep(0.005)
+        # The last cancel is still on its way, and would cancel what comes next.
+        await rig.until(lambda: len(rig.ground.finals(CANCEL)) == 1000, 30.0)
+        await rig.until(lambda: not rig.service.calibrating.manager.state.busy, 30.0)
+        assert [path.read_bytes() for path in folder.iterdir()] == before
+        assert len(before) == 1
+        assert TEMPORARILY_REJECTED in rig.ground.finals(CALIBRATE)
+        assert set(rig.ground.finals(CANCEL)) == {ACCEPTED}
+        assert any("too many requests, wait" in text for text in rig.ground.texts())
+        await asyncio.sleep(1.0)
+        await done(rig)
 
 
-def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-            for k in range(1200):
-                beat = mavlink.MAVLink_heartbeat_message(2, 3, 128 if k % 2 else 0, 0, 4, 3)
-                rig.wire.carry_from_other(beat.pack(codec))
-                codec.seq = (codec.seq + 1) % 256
-                await asyncio.sleep(0.05)
-            await asyncio.sleep(1.0)
-            assert len(rig.service.arming.armings.history()) == 1
-
-    run_virtual(main())
+async def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -> None:
+    async with Rig(tmp_path).running() as rig:
+        await rig.ready()
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        for k in range(1200):
+            beat = mavlink.MAVLink_heartbeat_message(2, 3, 128 if k % 2 else 0, 0, 4, 3)
+            rig.wire.carry_from_other(beat.pack(codec))
+            codec.seq = (codec.seq + 1) % 256
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(1.0)
+        assert len(rig.service.arming.armings.history()) == 1

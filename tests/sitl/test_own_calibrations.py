@@ -12,8 +12,6 @@ from sim.imu_model import DEG_H
 from tests.sitl.craft import Autopilot, Craft
 
 CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
-TILT_ERROR_MG = (87.2, 52.2, 5.7)
-"""g sin 5 deg, g sin 3 deg, and 1 - cos cos with 0.5 mg of local gravity (autopilots 9.3.1)."""
 
 
 @pytest.mark.only("ardupilot")

@@ -48,7 +48,7 @@ class PX4Stage:
         options = {"default_streams": False, **options}
         self.double = PX4Double(self.aircraft, options.pop("models", imus), parameters=parameters, **options)
         self.companion, self.ground = Station(1, 191), Station(255, 190)
-        self.companion_wire = Wire(self.companion, self.double, seed=1)
+        Wire(self.companion, self.double, seed=1)
         Wire(self.ground, self.double.ground, seed=2)
         self._tasks: list[asyncio.Task[None]] = []
 

@@ -5,19 +5,11 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import Callable
-from typing import Protocol
+
+from sim.station import End
 
 BUFFER_BYTES = 1024.0
 """Transmit buffer of a flight controller's UART."""
-
-
-class End(Protocol):
-    """What a wire can be plugged into: companion.links.mavlink.link.MavlinkLink and the simulator's autopilots."""
-
-    def attach(self, transmit: Callable[[bytes], None] | None) -> None: ...
-
-    def receive(self, data: bytes, t_s: float) -> None: ...
 
 
 class Wire:

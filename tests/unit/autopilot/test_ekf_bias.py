@@ -45,7 +45,7 @@ async def aboard(
     instance: int = 1,
     *,
     primary: int = 0,
-    rate_hz: float = 100.0,
+    rate_hz: float = 25.0,
     part: str = "white_only",
     loss: float = 0.0,
     **more: bool,
@@ -62,7 +62,7 @@ async def aboard(
         )
         for n, bias in enumerate(biases)
     ]
-    double = PX4Double(aircraft, models, parameters={"IMU_GYRO_CAL_EN": 0}, **more)
+    double = PX4Double(aircraft, models, parameters={"IMU_GYRO_CAL_EN": 0}, default_streams=False, **more)
     double.primary_imu = primary
     link = MavlinkLink()
     Wire(link, double, seed=1, loss=loss, duplicate=loss)
@@ -89,7 +89,7 @@ async def aboard(
 
 
 async def test_the_first_imu_comes_in_floats_and_is_right_to_two_deg_h() -> None:
-    async with aboard() as found:
+    async with aboard(rate_hz=100.0) as found:
         assert found.kinds[-1] == "HIGHRES_IMU+bias"
         assert found.stream.kind is not None
         assert not found.stream.kind.integers

@@ -12,7 +12,7 @@ import pytest
 
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
-from sim.accuracy import cli, deck, tables, turning, warmup
+from sim.accuracy import by_hand, cli, deck, tables, temperature, turning, warmup
 from sim.accuracy.experiments import predicted
 from sim.accuracy.figures import Claim, Figure, beside, covered, rms
 from sim.accuracy.stand import EXACT, POSTURES, biases, collected, samples, sites, solved, stand
@@ -21,8 +21,6 @@ from sim.aircraft import VirtualAircraft
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from tests.support.extent import extent
 from tests.support.namespaces import has_shared_memory, run_again_with_mounts
-
-FOUR = 4.0
 
 
 @pytest.mark.parametrize(
@@ -143,7 +141,14 @@ def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(deck, "SPANS_S", (120,))
     monkeypatch.setattr(deck, "STILL_S", (60,))
     monkeypatch.setattr(turning, "RATES_DEG_S", extent(whole=turning.RATES_DEG_S, a_slice=(0.0, 0.4)))
-    monkeypatch.setattr(warmup, "WARMING", extent(whole=warmup.WARMING, a_slice=warmup.WARMING[:1]))
+    for module, names in (
+        (warmup, ("WARMING", "RAMPS", "CURVES_S")),
+        (by_hand, ("BY_HAND",)),
+        (temperature, ("TRIED", "RATES_K_MIN")),
+    ):
+        for name in names:
+            whole = getattr(module, name)
+            monkeypatch.setattr(module, name, extent(whole=whole, a_slice=whole[:1]))
     said: list[str] = []
     found = report(2, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS

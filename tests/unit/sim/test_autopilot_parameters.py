@@ -10,7 +10,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import Pose, VirtualAircraft
-from sim.ardupilot.double import ArduPilotDouble, offset_names
+from sim.ardupilot.double import ArduPilotDouble
+from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import Handling
 from sim.station import Station

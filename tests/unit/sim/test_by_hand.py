@@ -10,7 +10,7 @@ from sim.accuracy.figures import rms
 from sim.imu_model import MG
 from tests.support.extent import extent
 
-EACH = extent(whole=60, a_slice=4)
+EACH = extent(whole=60, a_slice=2)
 
 
 @pytest.fixture(scope="module")

@@ -44,16 +44,6 @@ class Line:
             )
         )  # fmt: skip
 
-    def odometry(self, frame: int, child: int, q: tuple[float, ...], **fields: Any) -> None:
-        now_s = asyncio.get_running_loop().time()
-        x, y, z = fields.get("position", (0.0, 0.0, 0.0))
-        self.peer.send(
-            mavlink.MAVLink_odometry_message(
-                round(now_s * 1e6), frame, child, x, y, z, q, 0, 0, 0, 0, 0, 0,
-                [0.0] * 21, [0.0] * 21, 0, fields.get("kind", mavlink.MAV_ESTIMATOR_TYPE_VIO), 50,
-            )
-        )  # fmt: skip
-
     async def stream(self, yaw_deg: float, seconds: float, **fields: Any) -> None:
         """At 30 Hz."""
         for _ in range(round(seconds * 30)):
