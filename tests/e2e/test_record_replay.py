@@ -164,7 +164,10 @@ def test_integers_and_the_floats_in_their_place_are_replayed_as_such(
     tmp_path: Path, firmware: str, floats: bool
 ) -> None:
     async def main() -> list[Record]:
-        rig = three_imus(tmp_path, script=floats) if firmware == "ardupilot" else px4(tmp_path, console=floats)
+        if firmware == "ardupilot":
+            rig = three_imus(tmp_path, script=floats, max_s=20.0)
+        else:
+            rig = px4(tmp_path, console=floats, max_s=20.0)
         storage = msgspec.structs.replace(rig.config.storage, recordings_mb=64)
         rig.config = msgspec.structs.replace(rig.config, storage=storage)
         async with rig.running():

@@ -113,9 +113,9 @@ async def test_somebody_elses_float_arrays_are_no_samples(tmp_path: Path, name: 
         assert messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"]
 
 
-def px4(folder: Path, *, console: bool) -> Rig:
+def px4(folder: Path, *, console: bool, max_s: float = 60.0) -> Rig:
     """Make a PX4 with two quiet IMUs, of which the second is in integers only."""
-    rig = Rig(folder, firmware="px4", max_s=60.0, min_still_s=10.0, seed=3)
+    rig = Rig(folder, firmware="px4", max_s=max_s, min_still_s=10.0, seed=3)
     imus = [Imu(name=f"fc{k}", source="autopilot", instance=k, profile="icm42688p") for k in (1, 2)]
     rig.config = msgspec.structs.replace(rig.config, imu=imus)
     models = [
@@ -129,7 +129,9 @@ def px4(folder: Path, *, console: bool) -> Rig:
         for k, (gyro, accel) in enumerate(BIASES)
     ]
     parameters = {"MAV_1_FORWARD": 1.0, "IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0}
-    rig.autopilot = PX4Double(rig.aircraft, models, parameters=parameters, console=console, seed=3, up_s=3600.0)
+    rig.autopilot = PX4Double(
+        rig.aircraft, models, parameters=parameters, console=console, seed=3, up_s=3600.0, default_streams=False
+    )
     rig.wire, rig.radio = Wire(rig.link, rig.autopilot, seed=3), Wire(rig.ground, rig.autopilot.ground, seed=4)
     return rig
 

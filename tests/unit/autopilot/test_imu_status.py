@@ -39,7 +39,8 @@ async def aboard(wanted: tuple[int, ...] = (1, 2), *, slow: bool = False, **more
         )
         for n, gyro in enumerate(BIASES)
     ]  # fmt: skip
-    double = PX4Double(aircraft, models, parameters={"CAL_GYRO1_XOFF": 0.02, "SENS_BOARD_X_OFF": 3.0}, **more)
+    parameters = {"CAL_GYRO1_XOFF": 0.02, "SENS_BOARD_X_OFF": 3.0}
+    double = PX4Double(aircraft, models, parameters=parameters, default_streams=False, **more)
     link = MavlinkLink()
     Wire(link, double, seed=1)
     vehicle = Vehicle(link)
