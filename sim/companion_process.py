@@ -13,20 +13,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Self
 
-from companion.errors import DaemonUnreachableError
-from companion.links.system.control_client import ask
-
 READY_WITHIN_S: Final = 40.0
 POLL_S: Final = 0.1
+LINE_LIMIT: Final = 2**25
 
 Record = dict[str, Any]
 
 
 async def status_of(config: Path) -> Record | None:
     """The status of the daemon with this configuration, from its control socket; None while it does not answer."""
-    with contextlib.suppress(DaemonUnreachableError):
-        async for reply in ask(_socket_of(config), {"command": "status"}):
-            return reply.get("status")
+    with contextlib.suppress(OSError):
+        reader, writer = await asyncio.open_unix_connection(_socket_of(config), limit=LINE_LIMIT)
+        with contextlib.closing(writer):
+            writer.write(b'{"command": "status"}\n')
+            if line := await reader.readline():
+                status: Record | None = json.loads(line).get("status")
+                return status
     return None
 
 
