@@ -135,11 +135,22 @@ def test_named_make_targets_exist() -> None:
 
 
 def test_named_modules_exist() -> None:
-    """Documents name a module by its path, or by the end of its path."""
-    named = {name for path in DOCUMENTS for name in re.findall(r"`((?:[a-z0-9_]+/)*[a-z0-9_]+\.py)`", path.read_text())}
+    """Documents name a module by its path, or by the end of its path, and what it defines behind a colon."""
+    span = r"`((?:[a-z0-9_]+/)*[a-z0-9_]+\.py)(?::(\w+))?`"
+    named = {found for path in DOCUMENTS for found in re.findall(span, path.read_text())}
     assert len(named) > 25
-    here = [str(path) for folder in ("companion", "tests", "sim") for path in (ROOT / folder).rglob("*.py")]
-    assert [name for name in sorted(named) if not any(path.endswith(f"/{name}") for path in here)] == []
+    here = {
+        str(path): path.read_text()
+        for folder in ("companion", "tests", "sim")
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    wrong = []
+    for name, defined in sorted(named):
+        texts = [text for path, text in here.items() if path.endswith(f"/{name}")]
+        what = rf"^\s*(?:async )?(?:def|class) {defined}\b|^{defined}\b[^\n]* =" if defined else ""
+        if not any(re.search(what, text, flags=re.MULTILINE) for text in texts):
+            wrong.append(f"{name}:{defined}")
+    assert wrong == []
     for module in re.findall(r"python -m (tests\.[a-z_.]+)", "".join(path.read_text() for path in DOCUMENTS)):
         path = ROOT / module.rstrip(".").replace(".", "/")
         assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), module
