@@ -50,7 +50,7 @@ class Option(NamedTuple):
     flags: Mapping[str, str] = {}
     """Values that the command line takes as options of their own (--gyros), with their help."""
     positional: bool = False
-    """Whether the command line takes the value, where it is none of `flags`, without an option."""
+    """True: the command line takes a value that is none of `flags` without an option."""
     short: str = ""
     default: Any = None
     """The value for the command line where none is given."""
@@ -94,7 +94,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
     by: ClassVar[Interface] = _SHELL
     """The interfaces that may ask for it."""
     urgent: ClassVar[bool] = False
-    """Whether the control socket keeps places free for it."""
+    """True: the control socket keeps places free for it."""
 
     @classmethod
     def name(cls) -> str:

@@ -1,7 +1,6 @@
-"""Everything that can go wrong, named by its cause.
+"""The errors, one for each kind of cause, with one root: an interface catches that and shows one line.
 
-One root, so that a face (command line, ground station, MQTT) catches one type and shows one line. The text of
-an error is what a tired pilot reads: where, what was found, what is allowed.
+The text of an error is for a tired pilot: where, what was found, what is allowed.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ class DaemonDeniedError(DaemonUnreachableError):
 
 
 class NobodyHeardError(CompanionError):
-    """From the ground: no vehicle, or no companion, was heard or answers on the link."""
+    """No vehicle or no companion answers on a ground station's link."""
 
 
 class StorageError(CompanionError):

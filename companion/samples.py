@@ -18,7 +18,7 @@ TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
 
 def rows_of(triad: Triad) -> slice:
-    """Its rows of six."""
+    """Return the rows of a triad in a vector of six."""
     return slice(0, 3) if triad == "gyro" else slice(3, 6)
 
 
@@ -37,7 +37,7 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     t_device_s: float | None = None
     """The device's own clock, None where the protocol has none; unwrapped by `Decoder.receive`."""
     breaks: int = 0
-    """How often before the device had restarted or its clock had jumped: it may be another one, its biases new ones."""
+    """Number of restarts and clock jumps of the device so far; after each, its biases may be new ones."""
     shared_variance: tuple[float, ...] | None = None
     """(6,) of an error that it has in common with those around it, gyro then accelerometer; None: there is none."""
 
@@ -59,7 +59,7 @@ class CompassSample(msgspec.Struct, frozen=True, gc=False):
     pitch_deg: float | None = None
     roll_deg: float | None = None
     north: Literal["magnetic", "true"] | None = None
-    """Which north the device itself says that it means; None where it does not: then the configuration says it."""
+    """The north that the device states; None: the configuration says it."""
     temperature_degc: float | None = None
 
 

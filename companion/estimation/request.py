@@ -1,4 +1,4 @@
-"""What can be asked for."""
+"""The kinds of calibration that can be requested."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ LONGEST_S: Final = 1e6
 
 
 class What(enum.Enum):
-    """Which biases to calibrate; the numbers are param1 of MAV_CMD_USER_1."""
+    """The biases to calibrate; the numbers are param1 of MAV_CMD_USER_1."""
 
     BOTH = 0
     GYROS = 1
@@ -18,10 +18,10 @@ class What(enum.Enum):
 
     @property
     def gyros(self) -> bool:
-        """Whether gyro biases are asked for."""
+        """True: gyro biases are requested."""
         return self is not What.ACCELEROMETERS
 
     @property
     def accelerometers(self) -> bool:
-        """Whether accelerometer biases are asked for."""
+        """True: accelerometer biases are requested."""
         return self is not What.GYROS
