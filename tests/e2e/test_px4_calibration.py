@@ -11,6 +11,7 @@ import pytest
 
 from companion.estimation.request import What
 from companion.storage.changes import ChangeLog
+from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig
 
@@ -176,3 +177,17 @@ async def test_rivals_are_stopped_with_the_biases_and_the_undo_starts_them_again
         assert (await undo.finished).outcome == "done"
         assert [rig.px4.parameter(name) for name in rivals] == [1, 1]
         assert set(values(rig).values()) == {0.0}
+
+
+async def test_a_second_calibration_soon_after_a_write_reads_floats_too(tmp_path: Path) -> None:
+    """The EKF's bias is not read for a minute, so that the stream is integers: 9 deg/h without the console's means."""
+    rig = px4_rig(tmp_path, part="icm42688p", min_still_s=20.0, max_s=30.0, imu_rate_hz=100.0)
+    async with rig.running():
+        await rig.ready()
+        for pause_s in (0.0, 30.0):
+            await asyncio.sleep(pause_s)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            (fc,) = record.imus
+            assert fc.gyro_sigma_stat_rad_s is not None
+            assert max(fc.gyro_sigma_stat_rad_s) < 5.0 * DEG_H

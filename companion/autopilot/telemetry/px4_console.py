@@ -166,9 +166,13 @@ class EkfBias:
 
     @property
     def may_look(self) -> bool:
-        """The console may be used now."""
-        disarmed = self._vehicle.kind.tells_ekf_bias and self._vehicle.arm_state is ArmState.DISARMED
-        return disarmed and not self._held and asyncio.get_running_loop().time() >= self._from_s
+        """The console may be asked for the bias now."""
+        return self.may_ask and asyncio.get_running_loop().time() >= self._from_s
+
+    @property
+    def may_ask(self) -> bool:
+        """The console may be asked for what new offsets do not move."""
+        return self._vehicle.kind.tells_ekf_bias and self._vehicle.arm_state is ArmState.DISARMED and not self._held
 
     @property
     def _age_s(self) -> float:
@@ -290,7 +294,7 @@ class ImuStatus:
         """Ask until cancelled."""
         misses = 0
         while True:
-            wanted = list(self._wanted()) if self._ekf_bias.may_look else []
+            wanted = list(self._wanted()) if self._ekf_bias.may_ask else []
             for instance in wanted:
                 misses = 0 if await self._ask(instance) else misses + 1
                 await asyncio.sleep(self._pause_s if misses < _STATUS_MISSES else _STATUS_AGAIN_S)
@@ -302,7 +306,7 @@ class ImuStatus:
         if found is None:
             return False
         boot_us = int(found[1])
-        if not self._ekf_bias.may_look or self._seen.get(instance) == boot_us:
+        if not self._ekf_bias.may_ask or self._seen.get(instance) == boot_us:
             return True  # offsets are being written meanwhile, or it is the same again
         self._seen[instance] = boot_us
         ax, ay, az, gx, gy, gz = map(float, found.group(4, 5, 6, 7, 8, 9))

@@ -259,7 +259,9 @@ class GroundWindows(WindowSource):
         """Pack up the estimate of these seconds."""
         imus, sources, raw = zip(*self._imus.values(), strict=True) if self._imus else ((), (), ())
         batches = [[source.batches[slot] for slot in slots] for source in sources]
-        beside = [[source.batches[slot] for slot in slots if slot in source.batches] for source in raw]
+        # A window since some time shows whether new offsets are in use: raw readings would not.
+        with_raw = slots if since_s is None else ()
+        beside = [[source.batches[slot] for slot in with_raw if slot in source.batches] for source in raw]
         run = functools.partial(_estimates, slots, imus, batches, beside, self._horizon_s)
         return Work(slots, since_s, self.generation, run)
 

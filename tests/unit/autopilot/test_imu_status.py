@@ -120,6 +120,9 @@ def test_nothing_is_typed_while_armed_or_while_offsets_are_written() -> None:
                 heard = len(found.heard)
                 await asyncio.sleep(10.0)
             assert len(found.heard) == heard
+            # New offsets change nothing in raw readings: it goes on at once.
+            await asyncio.sleep(3.0)
+            assert len(found.heard) > heard
 
     run_virtual(main())
 

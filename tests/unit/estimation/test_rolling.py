@@ -156,6 +156,25 @@ def test_since_takes_only_whole_seconds_after_it() -> None:
     assert window.imus[0].duration_s == 6.0
 
 
+def test_a_window_since_new_offsets_shows_the_stream_and_no_raw_readings() -> None:
+    """Raw readings less the offsets of the parameters would show offsets in use that are not."""
+    feed = feeder(SILENT)
+    raw_rad_s = 100.0 * DEG_H
+
+    def noisy(_name: str, _t: Floats, rows: Floats) -> Floats:
+        return rows + feed.rng.normal(0.0, 0.01, rows.shape)
+
+    feed.change = noisy
+    for _ in range(25):
+        feed.collector.add_raw("fc", feed.now_s, (raw_rad_s, 0.0, 0.0, 0.0, 0.0, -9.81), None)
+        feed.run(1.0)
+    since_s = feed.now_s - 15.0
+    (whole,) = feed.collector.window(feed.now_s).imus
+    (since,) = feed.collector.window(feed.now_s, since_s=since_s).imus
+    assert whole.gyro_rad_s[0] == pytest.approx(raw_rad_s)
+    assert since.gyro_rad_s[0] == pytest.approx(BIAS[0], abs=4.0 * 0.01 / math.sqrt(15.0 * RATE_HZ))
+
+
 def test_reset_forgets_one_imu_or_all_and_the_stretch() -> None:
     feed = feeder(SILENT, "fc", "nose")
     feed.run(20.0)
