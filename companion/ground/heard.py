@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import GOES_ON, to_ascii
 from companion.links.system.listeners import Listeners
-from companion.protocols.heartbeat import FIRMWARES
+from companion.protocols.heartbeat import AUTOPILOT_NAMES
 
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
 FRESH_S: Final = 3.0
@@ -86,7 +86,7 @@ class GroundListener:
         armed: Literal["armed", "disarmed", "unknown"] = "unknown"
         if now_s - beat.at_s <= FRESH_S:
             armed = "armed" if beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED else "disarmed"
-        return AutopilotSeen(system_id, FIRMWARES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
+        return AutopilotSeen(system_id, AUTOPILOT_NAMES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
         """Return whether the companion is at work by a heartbeat later than `since_s`; None: there was none."""
@@ -114,7 +114,7 @@ class GroundListener:
         for (system, component), beat in sorted(self.heartbeats.items()):
             if component == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES:
                 vehicles.append(
-                    f"system {system} ({FIRMWARES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
+                    f"system {system} ({AUTOPILOT_NAMES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
                 )
             else:
                 station = " (a ground station)" if beat.kind == mavlink.MAV_TYPE_GCS else ""

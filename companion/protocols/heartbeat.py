@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-FIRMWARES: Final = {3: "ArduPilot", 12: "PX4"}
+AUTOPILOT_NAMES: Final = {3: "ArduPilot", 12: "PX4"}
 """MAV_AUTOPILOT of those that the companion can calibrate."""
 
 _FRAMES: Final = (
@@ -42,7 +42,7 @@ class Heartbeat:
     def __str__(self) -> str:
         """Format it as people say it: ArduPilot, system 1."""
         if self.is_autopilot:
-            who = FIRMWARES.get(self.autopilot, f"autopilot of kind {self.autopilot}")
+            who = AUTOPILOT_NAMES.get(self.autopilot, f"autopilot of kind {self.autopilot}")
         else:
             who = "ground station" if self.kind == _GROUND_STATION else f"MAVLink component {self.component_id}"
         return f"{who}, system {self.system_id}"

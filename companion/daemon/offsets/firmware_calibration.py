@@ -92,13 +92,13 @@ class FirmwareCalibration:
         now = {name: wanted.get(name, value) for name, value in before.items()}
         try:
             ours = [change for change in changes if change.parameter not in before]
-            await self._ledger.widen(ChangeSet.of(system_id, ours, before))
+            await self._ledger.update_pending(ChangeSet.of(system_id, ours, before))
             outcome, warning, coarse = await gyro_calibration.calibrate(self._parameters, now, go_on)
             go_on(f"writing {len(plan.gyros)} fine gyro offsets")
             fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
             others = gyro_calibration.changed(before, coarse).items()
             collateral = tuple(Change(name, old, new) for name, (old, new) in others if name not in wanted)
-            await self._ledger.widen(ChangeSet.of(system_id, (*changes, *collateral)))
+            await self._ledger.update_pending(ChangeSet.of(system_id, (*changes, *collateral)))
         except CompanionError as error:
             await self._restore(changes, before, boots, error)
             raise

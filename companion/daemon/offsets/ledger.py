@@ -115,7 +115,7 @@ class Ledger:
             raise AutopilotError("putting old values back first")
         if (why := self.why_yield()) is not None:
             raise AutopilotError(f"nothing is written: {why}")
-        await self.widen(changes)
+        await self.update_pending(changes)
         try:
             yield
         except (WriteFailedError, NothingWrittenError) as error:
@@ -130,7 +130,7 @@ class Ledger:
         if self._open is not None:
             self._orphaned.set()
 
-    async def widen(self, changes: ChangeSet) -> None:
+    async def update_pending(self, changes: ChangeSet) -> None:
         """Replace the kept changes of a transaction, before any of the new ones is made.
 
         Raises:

@@ -150,7 +150,7 @@ def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: 
         async with ledger.transaction(OLD):
             assert on_disk(tmp_path) == OLD
             assert not ledger.pending
-            await ledger.widen(WIDER)
+            await ledger.update_pending(WIDER)
             assert on_disk(tmp_path) == WIDER
             await ledger.done(WIDER)
         assert not ledger.pending
