@@ -184,7 +184,7 @@ def _json(value: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(value), status, media_type="application/json")
 
 
-def _refuse(_request: Request, error: Exception) -> Response:
+async def _refuse(_request: Request, error: Exception) -> Response:
     """Answer an error with its reason: a refusal of the companion is a conflict."""
     if not isinstance(error, HTTPException):
         return _json({"reason": str(error)}, 409)
