@@ -85,7 +85,7 @@ _STATIONARY: Final = 2.0
 
 
 class GateVerdict(msgspec.Struct, frozen=True):
-    """GateVerdict of one gate on one second; `words` name the device and are empty when still."""
+    """Verdict of one gate on one second; `words` name the device and are empty when still."""
 
     still: bool
     words: str = ""
