@@ -21,7 +21,7 @@ from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 NOT_YET = (
-    "aiomqtt", "anyio", "companion.mqtt", "companion.web", "h11", "starlette", "uvicorn",
+    "_ssl", "aiomqtt", "anyio", "companion.mqtt", "companion.web", "h11", "starlette", "uvicorn",
     "companion.daemon.heading.attitude_service",
     "companion.daemon.process.check", "companion.storage.fleet_items",
     "companion.cli.setup", "companion.ground", "companion.installation", "companion.setup",
