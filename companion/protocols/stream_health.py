@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.guess import likeliest, looks_garbled, strangers
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
@@ -26,17 +25,17 @@ NEAR_DEG: Final = 0.5
 
 _HARMLESS: Final = frozenset(
     {
-        reasons.CALIBRATING,
-        reasons.COMMAND_REFUSED,
-        reasons.NON_FINITE,
-        reasons.NOTHING_OF_USE,
-        reasons.OUT_OF_RANGE,
-        reasons.OVER_RANGE,
-        reasons.REPLY,
-        reasons.SINGLE_AXIS,
-        reasons.UNKNOWN_FIELD,
-        reasons.UNKNOWN_GROUP,
-        reasons.UNKNOWN_SENTENCE,
+        "calibrating",
+        "command refused",
+        "non-finite",
+        "nothing of use",
+        "out of range",
+        "over range",
+        "reply",
+        "single axis",
+        "unknown field",
+        "unknown group",
+        "unknown sentence",
     }
 )
 _DAMAGED_SHARE: Final = 0.1
@@ -174,11 +173,11 @@ def _named(counts: Counter[str]) -> str:
 def _valueless(lately: _Counts) -> Trouble | None:
     accepted, rejected = lately
     least = _DAMAGED_SHARE * max(accepted, 1)
-    if (count := rejected[reasons.NON_FINITE]) and count >= least:
+    if (count := rejected["non-finite"]) and count >= least:
         words = f"NaN in {count} whole frames: the device has no valid reading; switch its power off and on"
-        return Trouble(reasons.NON_FINITE, words)
-    if (count := rejected[reasons.OVER_RANGE]) and count >= least:
-        return Trouble(reasons.OVER_RANGE, f"{count} readings are over range: level it")
+        return Trouble("non-finite", words)
+    if (count := rejected["over range"]) and count >= least:
+        return Trouble("over range", f"{count} readings are over range: level it")
     return None
 
 

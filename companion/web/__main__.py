@@ -12,20 +12,13 @@ MEMORY_MIB: Final = 80
 
 def _page(settings: ChildSettings) -> ChildWork:
     # Imported here: by now the process is nice, so that the daemon's start does not wait for it.
-    from collections.abc import AsyncGenerator
-
-    from companion.formats import Object
     from companion.links.system.control_client import ask
     from companion.web.server import Page
 
     config = settings.config
     if config.web is None:
         raise ValueError("no [web] in the configuration")
-
-    def ask_daemon(request: Object) -> AsyncGenerator[Object, None]:
-        return ask(config.control.path, request | {"face": "page"})
-
-    return Page(config.web.bind, config.storage.path, ask_daemon)
+    return Page(config.web.bind, config.storage.path, lambda asked: ask(config.control.path, asked | {"face": "page"}))
 
 
 if __name__ == "__main__":

@@ -1,23 +1,57 @@
-"""The page at its address: opened, opened again, and its status. It holds no state but who looks."""
+"""The page at its address: its routes, the streams of those who look on, and its status."""
 
 from __future__ import annotations
 
+import asyncio
 import base64
+import contextlib
 import hashlib
+import logging
 import re
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
-from companion.errors import StorageError
-from companion.formats import Object
+import msgspec
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from companion import __version__
+from companion.commands import Interface, asked_by
+from companion.errors import CompanionError, StorageError
+from companion.formats import Object, parse_request
 from companion.links.system.connection import Backoff, Reconnection
-from companion.web.access import Access, is_loopback, kept_token, new_token, page_url, split_address
-from companion.web.app import PageRoutes
-from companion.web.listener import listening
-from companion.web.viewers import Ask, Viewers
+from companion.summary import rows
+from companion.web.access import TOKEN_HEADER, Access, is_loopback, kept_token, new_token, page_url, split_address
+from companion.web.listener import MAX_BODY_BYTES, Connection, listening
+
+logger = logging.getLogger(__name__)
+
+Ask = Callable[[Object], AsyncGenerator[Object, None]]
+"""Sends one request of the control socket and yields its replies."""
 
 WORTH_S: Final = 10.0
 """A page that was open for this long is opened again at once."""
+WRONG_TOKEN_S: Final = 2.0
+"""Delay of the answer to a wrong token."""
+MAX_WAITING: Final = 16
+"""The most answers to wrong tokens that are delayed at a time: each holds a connection."""
+ACTION_WITHIN_S: Final = 10.0
+RECORDS: Final = 10
+MAX_VIEWERS: Final = 16
+MAX_STRANGERS: Final = 4
+"""The most viewers of one address without the token; on the board itself all have the same address."""
+MAX_BEHIND: Final = 20
+"""Ten seconds of events: a viewer that has so many to read yet is dropped, and begins anew."""
+AGAIN_S: Final = 0.5
+"""Pause after which a companion that gave no status is asked again."""
+ACTIONS: Final = asked_by(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
 _STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
 _SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
@@ -37,10 +71,26 @@ class Page:
         self.problem: str | None = "not open yet"
         """Why nobody can look, in one line; None while the page is there."""
         self._html = _assembled()
-        self._viewers = Viewers(ask, local=self.local)
-        self._site: PageRoutes | None = None
+        self._tag = hashlib.sha256(self._html).hexdigest()[:16]
+        self._viewers: dict[Viewer, None] = {}
+        """The oldest first."""
+        self._looked_at = asyncio.Event()
+        self._delayed = self._wrong_tokens = 0
         self._reconnection = Reconnection(
             "page", Backoff(first_s=1.0, cap_s=30.0), worth_s=WORTH_S, on_state=self._on_state
+        )
+        self.app = Starlette(
+            routes=[
+                Route("/", self._page),
+                Route("/events", self._events),
+                Route("/records.json", self._last_records),
+                Route("/records/{name}", self._record),
+                Route("/temperature.html", self._temperature),
+                *(Route(f"/{command}", self._act, methods=["POST"]) for command in ACTIONS),
+            ],
+            middleware=[Middleware(_OwnNames, access=self.access)],
+            exception_handlers={HTTPException: _refuse, CompanionError: _refuse, ClientDisconnect: _refuse},
+            max_body_size=MAX_BODY_BYTES,
         )
 
     async def run(self) -> None:
@@ -50,12 +100,10 @@ class Page:
     async def _serve(self) -> str:
         try:
             if not self.local:
-                self.access = Access(kept_token(self._directory), handed_out=False)
-            self._site = PageRoutes(self.access, self._ask, self._viewers, self._html)
-            headers = _security_headers(self._html)
-            async with listening(self._site.app, self._host, self._port, *headers) as self._port:
+                self.access.token = kept_token(self._directory)
+            async with listening(self.app, self._host, self._port, *_security_headers(self._html)) as self._port:
                 self._reconnection.up(self.url)
-                await self._viewers.run()
+                await self._show_forever()
         except OSError as error:
             return f"{self._host}:{self._port}: {error.strerror or error}"
         except StorageError as error:
@@ -76,8 +124,217 @@ class Page:
             "summary": self.problem or self.url + ("" if self.local else " (buttons: companion web-token)"),
             "url": None if self.problem else self.url,
             "viewers": len(self._viewers),
-            "wrong_tokens": 0 if self._site is None else self._site.wrong_tokens,
+            "wrong_tokens": self._wrong_tokens,
         }
+
+    # --- requests
+
+    async def _page(self, _request: Request) -> Response:
+        return Response(self._html, media_type="text/html")
+
+    async def _events(self, request: Request) -> Response:
+        self._refuse_stranger(request)
+        peer, token = _peer(request), request.query_params.get("token", "")
+        # A browser's EventSource sends no header of ours.
+        has_token = self.access.refuses_token({TOKEN_HEADER: token}) is None
+        viewer = Viewer(request.state.connection, peer, has_token=has_token)
+        if (why := self._no_room_for(viewer)) is not None:
+            if token:
+                await self._delay_guess(peer)
+            # As an event: a browser does not show its page the body of an error.
+            return Response(event({"reason": why}, "refused"), media_type="text/event-stream")
+        token_for_page = self.access.token if self.access.handed_out else None
+        viewer.send(event({"version": __version__, "page": self._tag, "token": token_for_page}, "hello"))
+        self._viewers[viewer] = None
+        viewer.connection.keep_open(lambda: self._viewers.pop(viewer, None))
+        self._looked_at.set()
+        return StreamingResponse(viewer.events(), media_type="text/event-stream")
+
+    async def _last_records(self, request: Request) -> Response:
+        self._refuse_stranger(request)
+        return _json({"records": [{"file": file_name(one), "record": one} for one in await self._records()]})
+
+    async def _record(self, request: Request) -> Response:
+        self._refuse_stranger(request)
+        for record in await self._records():
+            if (name := file_name(record)) == request.path_params["name"]:
+                body = msgspec.json.format(msgspec.json.encode(record), indent=1)
+                headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+                return Response(body, headers=headers, media_type="application/json")
+        raise HTTPException(404, f"not among the last {RECORDS} records")
+
+    async def _temperature(self, request: Request) -> Response:
+        self._refuse_stranger(request)
+        reply = await self._result({"command": "temperature"})
+        return Response(await asyncio.to_thread(_plots, reply.get("imus", [])), media_type="text/html")
+
+    async def _act(self, request: Request) -> Response:
+        self._refuse_stranger(request)
+        if (why := self.access.refuses_token(request.headers)) is not None:
+            if request.headers.get(TOKEN_HEADER):
+                await self._delay_guess(_peer(request))
+            raise HTTPException(403, why)
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            raise HTTPException(415, "an action is asked for in application/json")
+        try:
+            wanted = parse_request(await request.body() or b"{}")
+        except ValueError as error:
+            raise HTTPException(400, f"not a JSON object: {error}") from None
+        command = request.url.path.removeprefix("/")
+        kind = ACTIONS[command]
+        asked: Object = {"command": command} | ({"wait": False} if "wait" in kind.fields() else {})
+        asked |= {key: wanted[key] for key in kind.fields(Interface.PAGE) if key in wanted}
+        try:
+            reply = await self._result(asked)
+        finally:
+            with contextlib.suppress(CompanionError):
+                await self._show({"command": "status"})  # which the action has changed
+        return _json({key: value for key, value in reply.items() if key != "kind"})
+
+    async def _result(self, asked: Object) -> Object:
+        """Return the last reply; an action that takes longer than a person waits goes on, and the events show it."""
+        try:
+            async with asyncio.timeout(ACTION_WITHIN_S):
+                async for reply in self._ask(asked):
+                    if reply.get("kind") == "error":
+                        raise HTTPException(409, str(reply["reason"]))
+                    if reply.get("kind") == "result":
+                        return reply
+        except TimeoutError:
+            pass
+        return {"kind": "result", "reason": "under way"}
+
+    async def _records(self) -> list[Object]:
+        reply = await self._result({"command": "history", "limit": RECORDS})
+        records: list[Object] = reply.get("records", [])
+        return records
+
+    def _refuse_stranger(self, request: Request) -> None:
+        if (why := self.access.refuses_stranger(request.headers)) is not None:
+            raise HTTPException(403, why)
+
+    async def _delay_guess(self, peer: str) -> None:
+        """Delay the answer to a wrong token; beyond some that wait, the others are not to suffer for it."""
+        if self.access.handed_out:
+            return  # the token of the page before a restart is no guess
+        self._wrong_tokens += 1
+        logger.warning("page: wrong token from %s", peer)
+        if self._delayed < MAX_WAITING:
+            self._delayed += 1
+            try:
+                await asyncio.sleep(WRONG_TOKEN_S)
+            finally:
+                self._delayed -= 1
+
+    # --- viewers
+
+    def _no_room_for(self, viewer: Viewer) -> str | None:
+        """Return why a viewer is refused, in one line; None: there is room. The token makes room."""
+        if not viewer.has_token:
+            if len(self._viewers) >= MAX_VIEWERS:
+                return f"{MAX_VIEWERS} are looking already; the token makes room: companion web-token, on the board"
+            alike = sum(other.peer == viewer.peer and not other.has_token for other in self._viewers)
+            if not self.local and alike >= MAX_STRANGERS:
+                return f"{MAX_STRANGERS} from this address are looking already without the token"
+        elif len(self._viewers) >= MAX_VIEWERS:
+            strangers = (other for other in self._viewers if not other.has_token)
+            oldest = next(strangers, next(iter(self._viewers)))
+            del self._viewers[oldest]
+            oldest.connection.abort()
+        return None
+
+    async def _show_forever(self) -> NoReturn:
+        """Show the status, twice a second while anybody looks."""
+        while True:
+            await self._looked_at.wait()
+            try:
+                await self._show({"command": "monitor"})
+            except CompanionError as error:
+                logger.debug("no status: %s", error)
+            if self._viewers:
+                await asyncio.sleep(AGAIN_S)
+            else:
+                self._looked_at.clear()
+
+    async def _show(self, request: Object) -> None:
+        async with contextlib.aclosing(self._ask(request)) as replies:
+            async for reply in replies:
+                if not self._viewers:
+                    return
+                if "status" in reply:
+                    status = reply["status"]
+                    # The first-run set-up has no vehicle, and no rows.
+                    data = event({**status, "rows": rows(status)} if "vehicle" in status else status)
+                    for viewer in tuple(self._viewers):
+                        viewer.send(data)
+
+
+class Viewer:
+    """One stream of events."""
+
+    def __init__(self, connection: Connection, peer: str, *, has_token: bool) -> None:
+        self.connection, self.peer, self.has_token = connection, peer, has_token
+        self._events: asyncio.Queue[bytes] = asyncio.Queue(MAX_BEHIND)
+
+    def send(self, event: bytes) -> None:
+        """Queue an event; drop the viewer when it reads too slowly."""
+        try:
+            self._events.put_nowait(event)
+        except asyncio.QueueFull:
+            self.connection.abort()
+
+    async def events(self) -> AsyncIterator[bytes]:
+        """Yield the events."""
+        while True:
+            yield await self._events.get()
+
+
+class _OwnNames:
+    """Refuses requests for another name than the board's: what DNS rebinding needs."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app, self._access = app, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        app = self._app
+        if (why := self._access.refuses_host(Headers(scope=scope))) is not None:
+            app = _json({"reason": why}, 421)
+        await app(scope, receive, send)
+
+
+def file_name(record: Object) -> str:
+    """Name the download of a record by its time, without characters that file systems dislike."""
+    return f"companion-{re.sub(r'[^0-9T]+', '-', str(record.get('started_at')))}.json"
+
+
+def _plots(imus: object) -> str:
+    from companion.estimation.solution.by_temperature import ByTemperature
+    from companion.report.by_temperature import biases_by_temperature
+
+    return biases_by_temperature(msgspec.convert(imus, list[ByTemperature]))
+
+
+def _json(value: object, status: int = 200) -> Response:
+    return Response(msgspec.json.encode(value), status, media_type="application/json")
+
+
+async def _refuse(_request: Request, error: Exception) -> Response:
+    """Answer an error with its reason: a refusal of the companion is a conflict."""
+    if not isinstance(error, HTTPException):
+        return _json({"reason": str(error)}, 409)
+    answer = _json({"reason": error.detail}, error.status_code)
+    answer.headers.update(error.headers or {})
+    return answer
+
+
+def _peer(request: Request) -> str:
+    return request.client.host if request.client is not None else "nobody"
+
+
+def event(value: object, name: str | None = None) -> bytes:
+    """Encode a server-sent event."""
+    head = f"event: {name}\n".encode() if name else b""
+    return head + b"data: " + msgspec.json.encode(value) + b"\n\n"
 
 
 def _assembled() -> bytes:

@@ -11,10 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from companion.errors import CalibrationRefusedError
-from companion.web.access import Access
-from companion.web.app import PageRoutes
-from companion.web.server import Page
-from companion.web.viewers import Ask, Viewers
+from companion.web.server import Ask, Page
 
 Object = dict[str, Any]
 RECORD: Object = {"started_at": "2026-11-21T18:40:00.123+00:00", "state": "done", "reason": "sigma 4 deg/h"}
@@ -188,8 +185,8 @@ async def until(condition: Callable[[], bool]) -> None:
 
 async def press(ask: Ask, button: str, **body: Any) -> tuple[int, str]:
     """What somebody is told who presses a button, without a server: on virtual time too."""
-    site = PageRoutes(Access("k7xm-p2qd-9rtw", handed_out=True), ask, Viewers(ask, local=True), b"")
-    headers = {"host": "127.0.0.1", "content-type": "application/json", "x-companion-token": "k7xm-p2qd-9rtw"}
+    site = Page("127.0.0.1:0", Path(), ask)
+    headers = {"host": "127.0.0.1", "content-type": "application/json", "x-companion-token": site.access.token}
     scope = {
         "type": "http",
         "method": "POST",

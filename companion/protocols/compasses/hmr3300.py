@@ -15,7 +15,6 @@ import functools
 import re
 from typing import ClassVar
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import DAMAGED, LineDecoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample
@@ -43,50 +42,50 @@ class Hmr3300Decoder(LineDecoder):
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
         follows_line_end, self._follows_line_end = self._follows_line_end, True
         if cut:
-            raise RejectedError(reasons.TOO_LONG)
+            raise RejectedError("too long")
         if not line.strip(b"\r"):
             # A bare line feed in mid-stream may have been a line's first digit; after a gap it is the end of the CR LF.
             self._follows_line_end = bool(line) or not follows_line_end
             return None
         if DAMAGED.search(line):
-            raise RejectedError(reasons.PARITY)
+            raise RejectedError("parity")
         text = line.removesuffix(b"\r")
         if text == line or b"\r" in text:
             # A digit damaged into a line end leaves a rest that looks whole.
             self._follows_line_end = _FRAGMENT.fullmatch(line) is None
-            raise RejectedError(reasons.LINE_END)
+            raise RejectedError("line end")
         if not follows_line_end:
-            raise RejectedError(reasons.CUT_SHORT)
+            raise RejectedError("cut short")
         return self._measurement(text, t_s)
 
     def _measurement(self, text: bytes, t_s: float) -> Sample:
         if text.startswith(b"#"):
-            raise RejectedError(reasons.COMMAND_REFUSED)
+            raise RejectedError("command refused")
         fields = [field.strip(b" ") for field in text.split(b",")]
         if len(fields) == 4 and fields[3] == b"C":
-            raise RejectedError(reasons.CALIBRATING)
+            raise RejectedError("calibrating")
         degrees = all(map(_DEGREES.fullmatch, fields))
         if not degrees and not all(map(_COUNTS.fullmatch, fields)):
-            raise RejectedError(reasons.NOT_A_MEASUREMENT)  # the banner after power-on, or damage
+            raise RejectedError("not a measurement")  # the banner after power-on, or damage
         if len(fields) != 3 and not (degrees and len(fields) == 1):
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         if degrees:
             return self._heading([float(field) for field in fields], t_s)
         x, y, z = (int(field) for field in fields)
         if max(abs(x), abs(y), abs(z)) > _COUNTS_LIMIT:
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         return MagSample(t_s, counts=(x, y, z))
 
     def _heading(self, values: list[float], t_s: float) -> CompassSample:
         heading_deg, *tilt_deg = values
         if not 0.0 <= heading_deg < 360.0 or any(abs(angle) > 90.0 for angle in tilt_deg):
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         if tilt_deg:
             self._triples, self._singles = min(self._triples + 1, _SURE), 0
             return CompassSample(t_s, heading_deg, tilt_deg[0], tilt_deg[1])
         self._singles = min(self._singles + 1, _SURE)
         if self._triples == _SURE and self._singles < _SURE:
-            raise RejectedError(reasons.SHAPE_CHANGED)
+            raise RejectedError("shape changed")
         self._triples = 0
         return CompassSample(t_s, heading_deg)
 

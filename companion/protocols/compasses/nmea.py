@@ -23,7 +23,6 @@ import functools
 import math
 from typing import Final, Literal
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import RejectedError, SentenceDecoder, check_vector, full_circle, out_of_range
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
@@ -78,16 +77,16 @@ class NmeaDecoder(SentenceDecoder):
         if head[2:] == b"XDR" and len(head) == 5:
             return self._xdr(fields, t_s)
         if plain is None or len(head) != 5:
-            raise RejectedError(reasons.UNKNOWN_SENTENCE)
+            raise RejectedError("unknown sentence")
         rank, size, marks, north = plain
         if len(fields) != size:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         heading_deg = float(fields[1])
         if marks is None:
             if fields[2] and 0.0 <= heading_deg <= 360.0:
                 heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
         elif fields[2] not in marks:
-            raise RejectedError(reasons.NOT_A_MEASUREMENT if rank == _THS else reasons.UNKNOWN_FIELD)
+            raise RejectedError("not a measurement" if rank == _THS else "unknown field")
         heading_deg = full_circle(heading_deg)
         self._claim_heading(rank, t_s)
         return [CompassSample(t_s, heading_deg, None, None, north)]
@@ -96,14 +95,14 @@ class NmeaDecoder(SentenceDecoder):
         leader = self._heading_from
         if sentence < leader:
             if _NORTHS[sentence] != _NORTHS[leader]:
-                raise RejectedError(reasons.OTHER_NORTH)
+                raise RejectedError("other north")
             if t_s - self._heading_s <= HOLD_S:
-                raise RejectedError(reasons.DUPLICATE)
+                raise RejectedError("duplicate")
         self._heading_from, self._heading_s = sentence, t_s
 
     def _hpr(self, fields: list[bytes], t_s: float) -> Sample:
         if len(fields) != 7:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         _, heading, magnetic, pitch, pitch_status, roll, roll_status = fields
         # Even an alarm keeps the precedence: then the device says that it has no heading, whatever else it sends.
         self._heading_from, self._heading_s = _HPR, t_s
@@ -126,15 +125,15 @@ class NmeaDecoder(SentenceDecoder):
 
     def _ccd(self, fields: list[bytes], t_s: float) -> Sample:
         if len(fields) != 8:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         pitch_deg, roll_deg = (math.degrees(math.atan(float(field) / _CCD_SCALE)) for field in fields[1:3])
         if not math.isfinite(pitch_deg + roll_deg):
-            raise RejectedError(reasons.NON_FINITE)
+            raise RejectedError("non-finite")
         heading_deg = float(fields[7])
         if b"." not in fields[7]:
             heading_deg *= _DEGREES_PER_MIL
         if self._tilt_from > _TILT_CCD and t_s - self._tilt_s <= HOLD_S:
-            raise RejectedError(reasons.DUPLICATE)  # of HPR, whose heading comes first too
+            raise RejectedError("duplicate")  # of HPR, whose heading comes first too
         self._tilt_from, self._tilt_s = _TILT_CCD, t_s
         try:
             self._claim_heading(_CCD, t_s)
@@ -144,14 +143,14 @@ class NmeaDecoder(SentenceDecoder):
 
     def _xdr(self, fields: list[bytes], t_s: float) -> list[Sample]:
         if len(fields) % 4 != 1:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         angles_deg: dict[bytes, float] = {}
         field_mg: dict[bytes, float] = {}
         for at in range(1, len(fields), 4):
             kind, value, unit, name = fields[at : at + 4]
             if kind == b"A" and name in _ANGLES:
                 if unit != b"D":
-                    raise RejectedError(reasons.UNKNOWN_FIELD)
+                    raise RejectedError("unknown field")
                 angles_deg[_ANGLES[name]] = _tilt(value)
             elif kind == b"G" and name in _FIELDS and value:
                 field_mg[name] = float(value)
@@ -164,17 +163,17 @@ class NmeaDecoder(SentenceDecoder):
             check_vector((x, y, z))
             found.append(MagSample(t_s, (x, y, z)))
         if not found:
-            raise RejectedError(reasons.DUPLICATE if len(angles_deg) == 2 else reasons.NOTHING_OF_USE)
+            raise RejectedError("duplicate" if len(angles_deg) == 2 else "nothing of use")
         return found
 
 
 def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
     if not _STATUSES.issuperset(statuses):
-        raise RejectedError(reasons.NOT_A_MEASUREMENT)
+        raise RejectedError("not a measurement")
     if b"C" in statuses:
-        raise RejectedError(reasons.CALIBRATING)
+        raise RejectedError("calibrating")
     if not _ALARMS.isdisjoint(statuses[1:]):
-        raise RejectedError(reasons.ALARM)
+        raise RejectedError("alarm")
 
 
 def _easting(field: bytes, side: bytes) -> float:
@@ -184,13 +183,13 @@ def _easting(field: bytes, side: bytes) -> float:
     if side == b"E":
         return value
     if side != b"W":
-        raise RejectedError(reasons.UNKNOWN_FIELD)
+        raise RejectedError("unknown field")
     return -value
 
 
 def _tilt(field: bytes) -> float:
     if not field:
-        raise RejectedError(reasons.OVER_RANGE)
+        raise RejectedError("over range")
     value = float(field)
     if not -90.0 <= value <= 90.0:
         raise out_of_range(value)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, RejectedError, SentenceDecoder, full_circle
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
@@ -34,23 +33,23 @@ class Os5000Decoder(SentenceDecoder):
     def _read(self, body: bytes, t_s: float) -> list[Sample]:
         match = _TAGS.fullmatch(body)
         if match is None:
-            raise RejectedError(reasons.NOT_A_MEASUREMENT if body[:1] == b"C" else reasons.UNKNOWN_SENTENCE)
+            raise RejectedError("not a measurement" if body[:1] == b"C" else "unknown sentence")
         heading, pitch, roll, temperature, more, _ = match.groups()
         samples: list[Sample]
         temperature_degc = None if temperature is None else float(temperature)
         if temperature_degc is not None and not -TEMPERATURE_LIMIT_DEGC <= temperature_degc <= TEMPERATURE_LIMIT_DEGC:
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         if pitch is None or roll is None:
             if heading is None:
-                raise RejectedError(reasons.NOTHING_OF_USE)
+                raise RejectedError("nothing of use")
             samples = [CompassSample(t_s, full_circle(float(heading)), None, None, None, temperature_degc)]
         else:
             pitch_deg, roll_deg = float(pitch), float(roll)
             if not (-90.0 <= pitch_deg <= 90.0 and -180.0 <= roll_deg <= 180.0):
-                raise RejectedError(reasons.OUT_OF_RANGE)
+                raise RejectedError("out of range")
             if heading is None:
                 if abs(roll_deg) > 90.0:  # upside down: no gradienter
-                    raise RejectedError(reasons.OUT_OF_RANGE)
+                    raise RejectedError("out of range")
                 samples = [TiltSample(t_s, roll_deg, pitch_deg, temperature_degc)]
             else:
                 heading_deg = full_circle(float(heading))

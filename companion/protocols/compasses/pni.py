@@ -21,7 +21,6 @@ import re
 import struct
 from typing import Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import ECHO, NO_FRAME, WAIT, Decoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
@@ -87,17 +86,17 @@ class PniDecoder(Decoder):
         if available < size:
             return WAIT
         if binascii.crc_hqx(frame, 0) != 0:
-            raise RejectedError(reasons.CHECKSUM)
+            raise RejectedError("checksum")
         return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[2] != _DATA:
-            raise RejectedError(ECHO if frame[2] in _COMMANDS else reasons.REPLY)
+            raise RejectedError(ECHO if frame[2] in _COMMANDS else "reply")
         parts = _components(frame, len(frame))
         flags = {part: frame[place] for part, place in parts if part in _BYTES}
         values = self._values(frame, [(part, place) for part, place in parts if part not in _BYTES])
         if flags.get(_DISTORTION, 0) > 1 or flags.get(_CALIBRATED, 0) > 1:
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         if flags.get(_DISTORTION):
             raise RejectedError(DISTORTION)
         if flags.get(_HEADING_STATUS) == 3:
@@ -105,7 +104,7 @@ class PniDecoder(Decoder):
         samples: list[Sample] = []
         heading_deg, pitch_deg, roll_deg = (values.get(part) for part in (_HEADING, _PITCH, _ROLL))
         if roll_deg is not None and abs(roll_deg) > 90.0:
-            raise RejectedError(reasons.OUT_OF_RANGE)  # upside down, where its heading is not specified
+            raise RejectedError("out of range")  # upside down, where its heading is not specified
         if heading_deg is not None:
             samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
         elif pitch_deg is not None and roll_deg is not None:
@@ -114,7 +113,7 @@ class PniDecoder(Decoder):
             x, y, z = (values[part] / _UT_PER_GAUSS for part in _MAG)
             samples.append(MagSample(t_s, (x, y, z)))
         if not samples:
-            raise RejectedError(reasons.NOTHING_OF_USE)
+            raise RejectedError("nothing of use")
         if flags.get(_CALIBRATED) == 0:
             self.warned[NOT_CALIBRATED] += 1
         return samples
@@ -126,7 +125,7 @@ class PniDecoder(Decoder):
         possible = _possible(names, little), _possible(names, big)
         if not any(possible):
             finite = all(map(math.isfinite, little if self._little else big))
-            raise RejectedError(reasons.OUT_OF_RANGE if finite else reasons.NON_FINITE)
+            raise RejectedError("out of range" if finite else "non-finite")
         if not possible[not self._little]:
             self._contrary += 1
             if self._contrary < 2:
@@ -150,16 +149,16 @@ def _components(frame: bytes, size: int) -> list[tuple[int, int]]:
     parts: list[tuple[int, int]] = []
     for _ in range(frame[3] if len(frame) > 3 else 0):
         if here >= last:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         if here >= len(frame):
             return parts
         part = frame[here]
         if part not in _SIZES:
-            raise RejectedError(reasons.UNKNOWN_FIELD)
+            raise RejectedError("unknown field")
         parts.append((part, here + 1))
         here += 1 + _SIZES[part]
     if here != last and len(frame) > 3:
-        raise RejectedError(reasons.FIELD_COUNT)
+        raise RejectedError("field count")
     return parts
 
 

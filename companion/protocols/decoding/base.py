@@ -15,7 +15,6 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from typing import ClassVar, Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
@@ -112,7 +111,7 @@ class Decoder(ABC):
     def interrupted(self) -> None:
         """Forget the frame under way: bytes are missing before the next ones (the port was opened again)."""
         if self._buffer:
-            self.rejected[reasons.CUT_SHORT] += 1
+            self.rejected["cut short"] += 1
         self._buffer = b""
         self._chunks.clear()
 
@@ -166,13 +165,13 @@ def body_of_sentence(sentence: bytes) -> bytes:
     """Return the body of `$body*hh`, or of VectorNav's CRC-16/XMODEM `*hhhh` (UM001, 3.8); raise RejectedError."""
     body, _, digits = sentence[1:].rpartition(b"*")
     if len(digits) not in (2, 4) or sentence[-1 - len(digits)] != ord("*"):
-        raise RejectedError(reasons.NO_CHECKSUM)
+        raise RejectedError("no checksum")
     try:
         expected = int.from_bytes(binascii.unhexlify(digits))
     except ValueError:
-        raise RejectedError(reasons.NO_CHECKSUM) from None
+        raise RejectedError("no checksum") from None
     if (xor_checksum(body) if len(digits) == 2 else binascii.crc_hqx(body, 0)) != expected:
-        raise RejectedError(reasons.CHECKSUM)
+        raise RejectedError("checksum")
     return body
 
 
@@ -189,10 +188,10 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
     """Raise RejectedError where a value of an IMU is not finite, or beyond what any IMU can measure."""
     temperature = temperature_degc or 0.0
     if not math.isfinite(sum(gyro_rad_s) + sum(accel_m_s2) + temperature):
-        raise RejectedError(reasons.NON_FINITE)
+        raise RejectedError("non-finite")
     rate, force = max(map(abs, gyro_rad_s)), max(map(abs, accel_m_s2))
     if rate > GYRO_LIMIT_RAD_S or force > ACCEL_LIMIT_M_S2 or abs(temperature) > ANY_TEMPERATURE:
-        raise RejectedError(reasons.OUT_OF_RANGE)
+        raise RejectedError("out of range")
 
 
 DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
@@ -201,7 +200,7 @@ DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
 
 def out_of_range(value: float) -> RejectedError:
     """For a value that is beyond its range, or no number."""
-    return RejectedError(reasons.OUT_OF_RANGE if math.isfinite(value) else reasons.NON_FINITE)
+    return RejectedError("out of range" if math.isfinite(value) else "non-finite")
 
 
 def full_circle(heading_deg: float) -> float:
@@ -216,7 +215,7 @@ def full_circle(heading_deg: float) -> float:
 def check_vector(vector: Vector) -> None:
     """Raise RejectedError where a component is not finite."""
     if not math.isfinite(sum(vector)):
-        raise RejectedError(reasons.NON_FINITE)
+        raise RejectedError("non-finite")
 
 
 class LineDecoder(Decoder):
@@ -270,16 +269,16 @@ class SentenceDecoder(Decoder):
         if match is None:
             if len(buffer) < limit:
                 return WAIT
-            raise RejectedError(reasons.TOO_LONG)
+            raise RejectedError("too long")
         if match[0] not in b"\r\n":
-            raise RejectedError(reasons.CUT_SHORT)
+            raise RejectedError("cut short")
         return match.end() - at
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         try:
             return self._read(body_of_sentence(frame[:-1]), t_s)
         except ValueError:
-            raise RejectedError(reasons.NOT_A_NUMBER) from None
+            raise RejectedError("not a number") from None
 
     @abstractmethod
     def _read(self, body: bytes, t_s: float) -> list[Sample]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import RejectedError, SentenceDecoder, check_imu
 from companion.samples import ImuSample, Sample
 
@@ -23,14 +22,14 @@ class ImuLineDecoder(SentenceDecoder):
 
     def _read(self, body: bytes, t_s: float) -> list[Sample]:
         if not body.startswith(b"IMU,"):
-            raise RejectedError(reasons.UNKNOWN_SENTENCE)
+            raise RejectedError("unknown sentence")
         fields = body.split(b",")
         if len(fields) != 10:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         sequence, t_us, (gx, gy, gz, ax, ay, az) = int(fields[1]), int(fields[2]), map(float, fields[3:9])
         temperature_degc = float(fields[9]) if fields[9] else None
         if not (0 <= sequence <= 0xFFFF and 0 <= t_us <= 0xFFFFFFFF):
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
         check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
         return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, sequence, t_us / 1e6)]

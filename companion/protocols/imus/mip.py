@@ -17,7 +17,6 @@ from itertools import accumulate
 from typing import ClassVar, Final
 
 from companion.physics.units import G
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import WAIT, Decoder, RejectedError, check_imu, check_vector
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
@@ -43,23 +42,23 @@ class MipDecoder(Decoder):
         if len(buffer) < at + size:
             return WAIT
         if fletcher(buffer[at : at + size - 2]) != buffer[at + size - 2 : at + size]:
-            raise RejectedError(reasons.CHECKSUM)
+            raise RejectedError("checksum")
         return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[2] != _SENSOR_DATA:
-            raise RejectedError(reasons.REPLY if frame[2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
+            raise RejectedError("reply" if frame[2] < _SENSOR_DATA else "nothing of use")
         found: dict[int, Vector] = {}
         t_device_s: float | None = None
         field, stop = 4, len(frame) - 2
         while field < stop:
             length = frame[field]
             if length < 2 or field + length > stop:
-                raise RejectedError(reasons.FIELD_COUNT)
+                raise RejectedError("field count")
             kind = frame[field + 1]
             if kind in {_ACCEL, _GYRO, _GPS_TIME}:
                 if length != 14:
-                    raise RejectedError(reasons.FIELD_COUNT)
+                    raise RejectedError("field count")
                 if kind == _GPS_TIME:
                     t_device_s, _week, _flags = _TIME.unpack_from(frame, field + 2)
                     check_vector((t_device_s, 0.0, 0.0))
@@ -70,7 +69,7 @@ class MipDecoder(Decoder):
         gyro_rad_s, accel_m_s2 = found.get(_GYRO, _ABSENT), (x * G, y * G, z * G)
         check_imu(gyro_rad_s, accel_m_s2, None)
         if len(found) < 2:
-            raise RejectedError(reasons.NOTHING_OF_USE)
+            raise RejectedError("nothing of use")
         return [ImuSample(t_s, gyro_rad_s, accel_m_s2, None, None, t_device_s)]
 
 

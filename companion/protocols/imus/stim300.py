@@ -30,7 +30,6 @@ import zlib
 from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import NO_FRAME, WAIT, Decoder, RejectedError, check_imu
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
@@ -149,7 +148,7 @@ class Stim300Decoder(Decoder):
             return WAIT
         was_in_step, self._in_step = self._in_step, is_whole(frame)
         if was_in_step and not self._in_step:
-            raise RejectedError(reasons.CHECKSUM)
+            raise RejectedError("checksum")
         return size if self._in_step else NO_FRAME
 
     def _configure(self, frame: bytes) -> None:
@@ -166,7 +165,7 @@ class Stim300Decoder(Decoder):
         if frame[0] in CONFIGURATION:
             self._configure(frame)
         if frame[0] in SPECIAL_BYTES:
-            raise RejectedError(reasons.REPLY)
+            raise RejectedError("reply")
         layout, places = NORMAL_MODE[frame[0]]
         values = layout.unpack_from(frame)
         counter, latency_us = values[places["counter"] :]
@@ -186,7 +185,7 @@ class Stim300Decoder(Decoder):
                     self.rejected[error.reason] += 1
                 refused = refused or error
         if not samples:
-            raise refused or RejectedError(reasons.NOTHING_OF_USE)
+            raise refused or RejectedError("nothing of use")
         return samples
 
     def _imu(self, places: dict[str, int], values: tuple[int, ...], counter: int, t_s: float) -> ImuSample:
@@ -228,9 +227,9 @@ class Stim300Decoder(Decoder):
         x, y, z = _int24(values, inclination)
         gravity = math.hypot(x, y, z)
         if not 0.5 < gravity / 2**22 < 1.75:
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         if abs(z) < 0.5 * gravity:
-            raise RejectedError(reasons.OVER_RANGE)
+            raise RejectedError("over range")
         right_down = math.asin(y / gravity) / DEG
         nose_up = math.asin(x / gravity) / DEG
         temperature_degc = _temperature(values, places.get("inclination_temperature"))
@@ -258,6 +257,6 @@ def _check_status(status: int) -> None:
     if status & (_SYSTEM | _CHANNEL):
         raise RejectedError(FAULT)
     if status & _OVERLOAD:
-        raise RejectedError(reasons.OVER_RANGE)
+        raise RejectedError("over range")
     if status & _CONDITIONS:
         raise RejectedError(OUTSIDE_CONDITIONS)

@@ -22,7 +22,6 @@ import re
 import struct
 from typing import ClassVar, Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import WAIT, RejectedError, SentenceDecoder, check_imu, xor_checksum
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
@@ -75,7 +74,7 @@ def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
         mask = next(masks)
         fields = formats.split()
         if mask == 0 or mask >> len(fields):
-            raise RejectedError(reasons.UNKNOWN_FIELD)
+            raise RejectedError("unknown field")
         for bit, field in enumerate(fields):
             if mask & 1 << bit:
                 places.update({part: count + offset for part, offset in used.get(bit, {}).items()})
@@ -126,7 +125,7 @@ class VectorNavDecoder(SentenceDecoder):
         if available < size:
             return WAIT
         if binascii.crc_hqx(buffer[at + 1 : at + size], 0) != 0:
-            raise RejectedError(reasons.CHECKSUM)
+            raise RejectedError("checksum")
         return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
@@ -134,7 +133,7 @@ class VectorNavDecoder(SentenceDecoder):
             return super()._decode(frame, t_s)
         layout, places = self._layout
         if "gyro" not in places:
-            raise RejectedError(reasons.NOTHING_OF_USE)
+            raise RejectedError("nothing of use")
         values, gyro, accel = layout.unpack_from(frame), places["gyro"], places["accel"]
         gyro_rad_s: Vector = values[gyro : gyro + 3]
         accel_m_s2: Vector = values[accel : accel + 3]
@@ -148,13 +147,13 @@ class VectorNavDecoder(SentenceDecoder):
         if head == b"VNERR":
             raise RejectedError("VNERR")
         if head not in _SENTENCES:
-            raise RejectedError(reasons.REPLY if head in _REPLIES else reasons.UNKNOWN_SENTENCE)
+            raise RejectedError("reply" if head in _REPLIES else "unknown sentence")
         count, vectors, temperature = _SENTENCES[head]
         if len(fields) != count:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         values = [float(field) for field in fields]
         if not math.isfinite(sum(values)):
-            raise RejectedError(reasons.NON_FINITE)
+            raise RejectedError("non-finite")
         ax, ay, az, gx, gy, gz = values[vectors]
         gyro_rad_s, accel_m_s2, temperature_degc = (gx, gy, gz), (ax, ay, az), next(iter(values[temperature]), None)
         check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
@@ -163,7 +162,7 @@ class VectorNavDecoder(SentenceDecoder):
 
 def _header_bytes(groups: int) -> int:
     if groups == 0 or groups & ~_KNOWN_GROUPS:
-        raise RejectedError(reasons.UNKNOWN_GROUP)
+        raise RejectedError("unknown group")
     return 2 + 2 * groups.bit_count()
 
 

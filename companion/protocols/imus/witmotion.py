@@ -25,7 +25,6 @@ import struct
 from typing import Final
 
 from companion.physics.units import DEG, MG
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import NO_FRAME, WAIT, Decoder, RejectedError
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
@@ -84,13 +83,13 @@ class WitMotionDecoder(Decoder):
         x, y, z, last = _NUMBERS.unpack_from(frame, 2)
         if kind == _ANGLE:
             if max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
-                raise RejectedError(reasons.OUT_OF_RANGE)
+                raise RejectedError("out of range")
             return [TiltSample(t_s, x * _ANGLE_SCALE, -y * _ANGLE_SCALE)]
         self._accel = None
         if kind == _GYRO and accel is None:
-            raise RejectedError(reasons.ORPHAN)
+            raise RejectedError("orphan")
         if max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
-            raise RejectedError(reasons.OVER_RANGE)
+            raise RejectedError("over range")
         if accel is not None:
             gyro_rad_s = (x * _GYRO_SCALE, y * _GYRO_SCALE, z * _GYRO_SCALE)
             return [ImuSample(t_s, gyro_rad_s, accel[1], accel[2])]
@@ -99,7 +98,7 @@ class WitMotionDecoder(Decoder):
 
     def _drop_accel(self) -> None:
         if self._accel is not None:
-            self.rejected[reasons.ORPHAN] += 1
+            self.rejected["orphan"] += 1
             self._accel = None
 
 
@@ -118,5 +117,5 @@ def _good(buffer: bytes, at: int) -> int:
         return WAIT
     last = at + FRAME_BYTES - 1
     if sum(buffer[at:last]) & 0xFF != buffer[last]:
-        raise RejectedError(reasons.CHECKSUM)
+        raise RejectedError("checksum")
     return FRAME_BYTES

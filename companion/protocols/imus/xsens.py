@@ -18,7 +18,6 @@ import re
 import struct
 from typing import ClassVar, Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import WAIT, Decoder, RejectedError, check_imu
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
@@ -62,28 +61,28 @@ class XsensDecoder(Decoder):
                 return WAIT
             length = int.from_bytes(buffer[at + 4 : at + 6], "big")
             if length > MAX_DATA_BYTES:
-                raise RejectedError(reasons.TOO_LONG)
+                raise RejectedError("too long")
             size = 6 + length + 1
         if available < size:
             return WAIT
         if sum(buffer[at + 1 : at + size]) & 0xFF:
-            raise RejectedError(reasons.CHECKSUM)
+            raise RejectedError("checksum")
         return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[2] != _MT_DATA_2:
-            raise RejectedError(reasons.REPLY)
+            raise RejectedError("reply")
         field, stop = 6 if frame[3] == _EXTENDED else 4, len(frame) - 1
         vectors: dict[int, Vector] = {}
         counter: int | None = None
         t_device_s: float | None = None
         while field < stop:
             if stop - field < 3:
-                raise RejectedError(reasons.FIELD_COUNT)
+                raise RejectedError("field count")
             kind, size = _HEAD.unpack_from(frame, field)
             field += 3
             if field + size > stop:
-                raise RejectedError(reasons.FIELD_COUNT)
+                raise RejectedError("field count")
             if kind & 0xFFF0 in _VECTORS:
                 if size == 12 and not kind & 0x0F:
                     vectors[kind] = _FLOAT32.unpack_from(frame, field)
@@ -96,7 +95,7 @@ class XsensDecoder(Decoder):
                 t_device_s = _unsigned(frame[field : field + size], 4) / _TICKS_A_SECOND
             elif kind == _STATUS:
                 if _unsigned(frame[field : field + size], 4) & _CLIPPED:
-                    raise RejectedError(reasons.OVER_RANGE)
+                    raise RejectedError("over range")
             elif kind & 0xFFF0 == _TEMPERATURE:
                 (temperature_degc,) = _numbers(frame[field : field + size], kind & 0x0F, 1)
                 check_imu(_ABSENT, _ABSENT, temperature_degc)
@@ -113,28 +112,28 @@ class XsensDecoder(Decoder):
             accel_m_s2 = accel_m_s2 or vectors.get(_ACCEL_HR)
         check_imu(gyro_rad_s or _ABSENT, accel_m_s2 or _ABSENT, None)
         if gyro_rad_s is None or accel_m_s2 is None:
-            raise RejectedError(reasons.NOTHING_OF_USE)
+            raise RejectedError("nothing of use")
         return [ImuSample(t_s, gyro_rad_s, accel_m_s2, self._temperature_degc, counter, t_device_s)]
 
 
 def _unsigned(data: bytes, size: int) -> int:
     if len(data) != size:
-        raise RejectedError(reasons.FIELD_COUNT)
+        raise RejectedError("field count")
     return int.from_bytes(data, "big")
 
 
 def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
     if number_format == 2:
         if len(data) != 6 * count:
-            raise RejectedError(reasons.FIELD_COUNT)
+            raise RejectedError("field count")
         parts = struct.unpack(">" + "Ih" * count, data)
         return [whole + fraction / 2**32 for fraction, whole in zip(parts[::2], parts[1::2], strict=True)]
     code = {0: "f", 1: "i", 3: "d"}.get(number_format)
     if code is None:
-        raise RejectedError(reasons.UNKNOWN_FIELD)
+        raise RejectedError("unknown field")
     unpacker = struct.Struct(f">{count}{code}")
     if len(data) != unpacker.size:
-        raise RejectedError(reasons.FIELD_COUNT)
+        raise RejectedError("field count")
     numbers = unpacker.unpack(data)
     return [number / 2**20 for number in numbers] if code == "i" else list(numbers)
 

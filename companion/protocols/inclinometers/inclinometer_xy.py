@@ -14,7 +14,6 @@ import functools
 import re
 from typing import ClassVar, Literal
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import DAMAGED, LineDecoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import TiltSample
@@ -44,7 +43,7 @@ class InclinometerXyDecoder(LineDecoder):
 
     def _drop_x(self) -> None:
         if isinstance(self._x_deg, float):
-            self.rejected[reasons.ORPHAN] += 1
+            self.rejected["orphan"] += 1
         self._x_deg = None
 
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> TiltSample | None:
@@ -66,15 +65,15 @@ class InclinometerXyDecoder(LineDecoder):
 
     def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
         if DAMAGED.search(line):
-            return reasons.PARITY
+            return "parity"
         if cut:
-            return reasons.TOO_LONG
-        return reasons.SINGLE_AXIS if _SINGLE_AXIS.fullmatch(line.strip(b"\r")) else reasons.NOT_A_MEASUREMENT
+            return "too long"
+        return "single axis" if _SINGLE_AXIS.fullmatch(line.strip(b"\r")) else "not a measurement"
 
     def _pass_over(self, before: bytes, *, cut: bool) -> None:
         if not cut and _ECHO.fullmatch(before):
             return
-        self.rejected[reasons.PARITY if DAMAGED.search(before) else reasons.TOO_LONG if cut else reasons.CUT_SHORT] += 1
+        self.rejected["parity" if DAMAGED.search(before) else "too long" if cut else "cut short"] += 1
         self._drop_x()
 
     def _x(self, text: bytes) -> None:
@@ -91,24 +90,24 @@ class InclinometerXyDecoder(LineDecoder):
             return None  # the pair has been counted with its X
         y_deg = self._degrees(text)
         if not isinstance(x_deg, float):
-            raise RejectedError(reasons.ORPHAN)
+            raise RejectedError("orphan")
         return TiltSample(t_s, x_deg, y_deg)
 
     def _degrees(self, text: bytes) -> float:
         if DAMAGED.search(text):
-            raise RejectedError(reasons.PARITY)
+            raise RejectedError("parity")
         value = text.removesuffix(b"\r")
         if value == text:
-            raise RejectedError(reasons.LINE_END)
+            raise RejectedError("line end")
         if _SENTINEL.fullmatch(value):
-            raise RejectedError(reasons.OVER_RANGE)
+            raise RejectedError("over range")
         match = _DEGREES.fullmatch(value)
         if match is None:
-            raise RejectedError(reasons.NOT_A_MEASUREMENT)
+            raise RejectedError("not a measurement")
         self._check_decimals(len(match[1]))
         degrees = float(value)
         if abs(degrees) > 90.0:
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         return degrees
 
     def _check_decimals(self, decimals: int) -> None:
@@ -116,7 +115,7 @@ class InclinometerXyDecoder(LineDecoder):
         if decimals < self._decimals:
             self._fewer_running += 1
             if self._fewer_running < _SURE:
-                raise RejectedError(reasons.SHAPE_CHANGED)
+                raise RejectedError("shape changed")
         self._decimals, self._fewer_running = decimals, 0
 
 

@@ -19,7 +19,6 @@ import math
 import re
 from typing import ClassVar, Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import (
     DAMAGED,
     TEMPERATURE_LIMIT_DEGC,
@@ -66,19 +65,19 @@ class JewellDecoder(LineDecoder):
 
 def _why(text: bytes, *, cut: bool) -> str:
     if DAMAGED.search(text):
-        return reasons.PARITY
+        return "parity"
     if cut:
-        return reasons.TOO_LONG
+        return "too long"
     if text.startswith(b"ERR "):
-        return reasons.COMMAND_REFUSED
-    return reasons.CUT_SHORT if text.startswith(b"$") else reasons.NOT_A_MEASUREMENT
+        return "command refused"
+    return "cut short" if text.startswith(b"$") else "not a measurement"
 
 
 def _reading(text: bytes, t_s: float) -> TiltSample:
     if DAMAGED.search(text):
-        raise RejectedError(reasons.PARITY)
+        raise RejectedError("parity")
     if b"\r" in text:
-        raise RejectedError(reasons.LINE_END)
+        raise RejectedError("line end")
     if b",A," not in text and (match := _SIM[0].fullmatch(text) or _SIM[1].fullmatch(text)):
         x, y, temperature = match.groups()
         return _sample(t_s, float(x), float(y), float(temperature))
@@ -87,23 +86,23 @@ def _reading(text: bytes, t_s: float) -> TiltSample:
         if head == b"YXXDR":
             body_of_sentence(text)
         elif b"*" in text:
-            raise RejectedError(reasons.NOT_A_MEASUREMENT)
+            raise RejectedError("not a measurement")
         return _sample(t_s, _degrees(x, x_unit), _degrees(y, y_unit), float(temperature))
     if match := _TCM.fullmatch(text):
         body_of_sentence(text)
         return _sample(t_s, float(match[2]), float(match[1]), None)
-    raise RejectedError(reasons.NOT_A_MEASUREMENT)
+    raise RejectedError("not a measurement")
 
 
 def _degrees(field: bytes, unit: bytes) -> float:
     if _TILTS[unit].fullmatch(field) is None:
-        raise RejectedError(reasons.NOT_A_MEASUREMENT)
+        raise RejectedError("not a measurement")
     return float(field) if unit == b"D" else math.degrees(float(field) * 1e-6)
 
 
 def _sample(t_s: float, x_deg: float, y_deg: float, temperature_degc: float | None) -> TiltSample:
     if max(abs(x_deg), abs(y_deg)) > 90.0 or abs(temperature_degc or 0.0) > TEMPERATURE_LIMIT_DEGC:
-        raise RejectedError(reasons.OUT_OF_RANGE)
+        raise RejectedError("out of range")
     return TiltSample(t_s, x_deg, y_deg, temperature_degc)
 
 

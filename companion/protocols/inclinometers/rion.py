@@ -18,7 +18,6 @@ import functools
 import re
 from typing import Final
 
-from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import ECHO, NO_FRAME, WAIT, Decoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, Sample, TiltSample
@@ -53,14 +52,14 @@ class RionDecoder(Decoder):
             return WAIT
         frame = buffer[at : at + 1 + length]
         if sum(frame[1:-1]) & 0xFF != frame[-1]:
-            raise RejectedError(reasons.CHECKSUM)
+            raise RejectedError("checksum")
         if frame[3] == _ANSWER:
             _measurement(frame, 0.0)  # without angles it is rather no frame, with a sum that is right by chance
         return 1 + length
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[3] != _ANSWER:
-            raise RejectedError(reasons.REPLY if frame[3] & _REPLY_BIT else ECHO)
+            raise RejectedError("reply" if frame[3] & _REPLY_BIT else ECHO)
         return [_measurement(frame, t_s)]
 
 
@@ -69,18 +68,18 @@ def _measurement(frame: bytes, t_s: float) -> Sample:
     if len(data) == 9:
         pitch_deg, roll_deg, heading_deg = (_degrees(data[at : at + 3], 100) for at in (0, 3, 6))
         if not 0.0 <= heading_deg < 360.0 or max(abs(pitch_deg), abs(roll_deg)) > 90.0:
-            raise RejectedError(reasons.OUT_OF_RANGE)
+            raise RejectedError("out of range")
         return CompassSample(t_s, heading_deg, pitch_deg, roll_deg)
     x_deg, y_deg = _degrees(data[0:4], 10_000), _degrees(data[4:8], 10_000)
     if max(abs(x_deg), abs(y_deg)) > 90.0:
-        raise RejectedError(reasons.OUT_OF_RANGE)
+        raise RejectedError("out of range")
     return TiltSample(t_s, x_deg, y_deg)
 
 
 def _degrees(digits: bytes, per_degree: int) -> float:
     text = digits.hex()
     if not text.isdecimal() or text[0] not in "01":
-        raise RejectedError(reasons.NOT_A_NUMBER)
+        raise RejectedError("not a number")
     value = int(text[1:]) / per_degree
     return -value if text[0] == "1" else value
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from companion.protocols.decoding import reasons
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.stream_health import SILENT_AFTER_S, StreamHealth
@@ -85,7 +84,7 @@ def test_silence_beats_everything_that_was_said_before() -> None:
     health = StreamHealth("imu_line", decoder)
     frame = imu_frame(1, rate="nan")
     health.took(frame, decoder.feed(frame, 0.0), 0.0)
-    assert decoder.rejected[reasons.NON_FINITE] == 1
+    assert decoder.rejected["non-finite"] == 1
     found = health.trouble(SILENT_AFTER_S + 0.1)
     assert found is not None
     assert found.key == "silent"

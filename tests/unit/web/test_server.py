@@ -21,7 +21,7 @@ import zxingcpp
 
 from companion.cli import main as companion
 from companion.errors import StorageError
-from companion.web import access, app, listener, viewers
+from companion.web import access, listener, server
 from tests.support.page import RECORD, Answer, Object, Viewer, Visit, page, parsed, until
 
 
@@ -329,8 +329,8 @@ def test_a_foreign_site_is_told_no_token(tmp_path: Path) -> None:
 
 
 def test_the_token_makes_room_among_viewers_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewers, "MAX_VIEWERS", 3)
-    monkeypatch.setattr(app, "WRONG_TOKEN_S", 0.0)
+    monkeypatch.setattr(server, "MAX_VIEWERS", 3)
+    monkeypatch.setattr(server, "WRONG_TOKEN_S", 0.0)
 
     async def visitor(visit: Visit) -> None:
         async def looks(query: str = "") -> Viewer:
@@ -339,7 +339,7 @@ def test_the_token_makes_room_among_viewers_without_it(tmp_path: Path, monkeypat
             return viewer
 
         token = f"?token={visit.page.access.token}"
-        strangers = [await looks() for _ in range(viewers.MAX_VIEWERS)]
+        strangers = [await looks() for _ in range(server.MAX_VIEWERS)]
         assert "3 are looking already" in await visit.refusal("?token=222222222222")
         pilots = []
         for displaced in strangers:
@@ -352,12 +352,12 @@ def test_the_token_makes_room_among_viewers_without_it(tmp_path: Path, monkeypat
         for pilot in pilots[1:]:
             await pilot.event()
             await pilot.event()
-        assert visit.page.status()["viewers"] == viewers.MAX_VIEWERS
+        assert visit.page.status()["viewers"] == server.MAX_VIEWERS
 
     run(tmp_path, visitor, bind="0.0.0.0:0")
 
 
-@pytest.mark.parametrize(("bind", "room"), [("0.0.0.0:0", viewers.MAX_STRANGERS), ("127.0.0.1:0", viewers.MAX_VIEWERS)])
+@pytest.mark.parametrize(("bind", "room"), [("0.0.0.0:0", server.MAX_STRANGERS), ("127.0.0.1:0", server.MAX_VIEWERS)])
 def test_one_address_does_not_take_all_room_for_viewers(tmp_path: Path, bind: str, room: int) -> None:
     async def visitor(visit: Visit) -> None:
         for _ in range(room):
@@ -496,7 +496,7 @@ def seen(lines: list[str], size: int = 4) -> npt.NDArray[np.uint8]:
 def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(app, "WRONG_TOKEN_S", 3600.0)
+    monkeypatch.setattr(server, "WRONG_TOKEN_S", 3600.0)
 
     async def visitor(visit: Visit) -> None:
         def guess() -> asyncio.Task[Answer]:
@@ -505,7 +505,7 @@ def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
 
         # From one after the other that waits, so many are held back; the next is answered at once.
         waiting = []
-        for held in range(1, app.MAX_WAITING + 1):
+        for held in range(1, server.MAX_WAITING + 1):
             waiting.append(guess())
             while visit.page.status()["wrong_tokens"] < held:
                 await asyncio.sleep(0)
@@ -516,13 +516,13 @@ def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
         right = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers)
         assert right.status == 200
         assert visit.companion.asked[-1] == {"command": "cancel"}
-        assert visit.page.status()["wrong_tokens"] == app.MAX_WAITING + 1
+        assert visit.page.status()["wrong_tokens"] == server.MAX_WAITING + 1
         for task in waiting:
             task.cancel()
         await asyncio.gather(*waiting, return_exceptions=True)
 
     run(tmp_path, visitor, bind="0.0.0.0:0")
-    assert caplog.text.count("wrong token from 127.0.0.1") == app.MAX_WAITING + 1
+    assert caplog.text.count("wrong token from 127.0.0.1") == server.MAX_WAITING + 1
     assert "2" * 12 not in caplog.text
 
 
