@@ -10,9 +10,9 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from companion.errors import ConfigError
-from companion.fleet.contract import AIRCRAFT_ID
 
 COLLECTOR: Final = "collector"
+AIRCRAFT_ID: Final = re.compile(r"[0-9a-f]{16}|[0-9a-f]{36}")
 _USER: Final = re.compile(r"[A-Za-z0-9._@-]{1,64}")
 _WRITES: Final = (
     "fleet/{id}/hello",

@@ -1,6 +1,6 @@
 """Parser of the aircraft's payloads (docs/fleet/asyncapi.yaml): from bytes to rows of the tables.
 
-Bytes of any content raise nothing but `NotTakenError`.
+The tables of schema.py say what fits. Bytes of any content raise nothing but `NotTakenError`.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ import datetime
 import hashlib
 import re
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
+import sqlalchemy as sa
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.estimation.records.flight_record import KeptFlight
+from companion.fleet import schema
+from companion.fleet.acl import AIRCRAFT_ID
 from companion.samples import TRIADS
 
 FORMAT_VERSION: Final = 1
@@ -22,23 +25,22 @@ MOST_RANGES: Final = 256
 """Most ranges of sequences in one message to an aircraft."""
 MOST_SEQUENCE: Final = 2**53
 MOST_BYTES: Final = 256 * 1024
-AIRCRAFT_ID: Final = re.compile(r"[0-9a-f]{16}|[0-9a-f]{36}")
 _AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
 _EARLIEST: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _LATEST: Final = datetime.datetime(2200, 1, 1, tzinfo=datetime.UTC)
 """Latest time that is accepted; the earliest is that of a clock without a battery."""
+_STATES: Final = ("done", "failed", "cancelled")
+_KEY: Final = ("aircraft", "epoch", "sequence")
+_TRIADS: Final = [name for name, _ in schema.biases.c.items() if name.endswith(("_rad_s", "_m_s2"))]
 
 _Aircraft = Annotated[str, msgspec.Meta(pattern=f"^({AIRCRAFT_ID.pattern})$")]
 _Epoch = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
 _Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
-_Number = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
-_Axes = tuple[_Number, _Number, _Number] | None
-_Device = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None
-_Word = Annotated[str, msgspec.Meta(max_length=16)]
-
-_Kind = TypeVar("_Kind")
-_Keyed = TypeVar("_Keyed", "Hello", "ItemKey")
+_Object = dict[str, Any]
+_Imus = Annotated[list[_Object], msgspec.Meta(max_length=64)]
+_Words = list[Annotated[str, msgspec.Meta(max_length=16)]]
+_Keyed = TypeVar("_Keyed", "Hello", "Item")
 
 Row = dict[str, Any]
 Rows = dict[str, list[Row]]
@@ -61,150 +63,108 @@ class Hello(msgspec.Struct, frozen=True):
     at: str = ""
 
 
-class ItemKey(msgspec.Struct, frozen=True):
-    """Key of an item; a newer format may change everything else."""
+class Item(msgspec.Struct, frozen=True):
+    """Item of an aircraft; a newer format may change everything but its key."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
     aircraft: _Aircraft
     epoch: _Epoch
     sequence: _Sequence
+    kind: Any = None
+    at: Any = None
+    clock: Any = None
+    body: msgspec.Raw = msgspec.Raw(b"null")
 
     @property
     def key(self) -> Row:
         """Columns of the primary key."""
-        return {"aircraft": self.aircraft, "epoch": self.epoch, "sequence": self.sequence}
+        return {name: getattr(self, name) for name in _KEY}
 
 
-class _Told(msgspec.Struct, frozen=True):
-    kind: str
-    at: str
-    clock: str
-    body: msgspec.Raw
+def _row(table: sa.Table, told: _Object) -> Row:
+    """Make a row of values by the names of its columns, without the item's key."""
+    return {name: _fitting(column, told.get(name)) for name, column in table.c.items() if name not in _KEY}
 
 
-class _Found(msgspec.Struct, frozen=True):
-    measured_rad_s: _Axes = None
-    measured_m_s2: _Axes = None
-
-
-class _Imu(msgspec.Struct, frozen=True):
-    name: Annotated[str, msgspec.Meta(max_length=64)]
-    samples: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)] | None = None
-    prior: dict[str, _Found | None] | None = None
-    written: dict[str, msgspec.Raw] = {}
-    temperature_degc: _Number | None = None
-    held_back: list[_Word] = []
-    gyro_id: _Device = None
-    accel_id: _Device = None
-    gyro_bias_rad_s: _Axes = None
-    gyro_sigma_stat_rad_s: _Axes = None
-    gyro_sigma_use_rad_s: _Axes = None
-    accel_bias_m_s2: _Axes = None
-    accel_sigma_stat_m_s2: _Axes = None
-    accel_sigma_use_m_s2: _Axes = None
-
-
-class _Magnetic(msgspec.Struct, frozen=True):
-    heading_bound_deg: _Number | None = None
-
-
-class _Zero(msgspec.Struct, frozen=True):
-    measured_at: str
-    offset_deg: tuple[_Number, _Number]
-    sigma_deg: _Number
-
-
-class _Calibration(msgspec.Struct, frozen=True):
-    state: Literal["done", "failed", "cancelled"]
-    reason: str
-    started_at: str
-    duration_s: _Number
-    imus: Annotated[list[_Imu], msgspec.Meta(max_length=64)]
-    undone_at: str | None = None
-    magnetic: _Magnetic | None = None
-    alignment: _Zero | None = None
-
-
-_ABOUT: Final = ("gyro_id", "accel_id", "temperature_degc", "samples")
-_TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
+def _fitting(column: sa.Column[Any], value: object) -> Any:
+    """Return a value as a column keeps it; raise NotTakenError where it does not fit."""
+    kind = column.type
+    if value is None and column.nullable:
+        return None
+    if isinstance(kind, schema.UtcTime):
+        allowed = "a time"
+        if isinstance(value, str):
+            return moment(value)
+    elif isinstance(kind, sa.Double):
+        allowed = f"a number up to {_MOST:g}"
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST:
+            return float(value)
+    elif isinstance(kind, sa.BigInteger):
+        allowed = "a whole number of 64 bits"
+        if isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63:
+            return value
+    else:
+        most = getattr(kind, "length", None)
+        allowed = f"a text of up to {most} characters" if most else "a text"
+        if isinstance(value, str) and len(value) <= (most or MOST_BYTES):
+            return value
+    raise NotTakenError(f"{column.name}: found {str(value)[:40]}; allowed: {allowed}")
 
 
 def _calibration(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Calibration)
+    told = msgspec.json.decode(body, type=_Object)
+    if told.get("state") not in _STATES:
+        raise NotTakenError(f"state: found {str(told.get('state'))[:40]}; allowed: {', '.join(_STATES)}")
     biases: list[Row] = []
-    for imu in {imu.name: imu for imu in told.imus}.values():
-        about = {"imu": imu.name} | {name: getattr(imu, name) for name in _ABOUT}
+    held: list[str] = []
+    written: set[str] = set()
+    imus = msgspec.convert(told.get("imus"), _Imus)
+    for name, imu in {_fitting(schema.biases.c.imu, imu.get("name")): imu for imu in imus}.items():
+        held += [f"{name} {triad}" for triad in msgspec.convert(imu.get("held_back", []), _Words)]
+        written |= msgspec.convert(imu.get("written", {}), _Object).keys()
         # Biases before earlier power-ups were weighed in; None: none were.
-        gyro, accel = ((imu.prior or {}).get(triad) or _Found() for triad in TRIADS)
-        triads = {name: getattr(imu, name) for name in _TRIADS}
-        triads |= {"gyro_read_rad_s": gyro.measured_rad_s, "accel_read_m_s2": accel.measured_m_s2}
+        prior = msgspec.convert(imu.get("prior"), dict[str, _Object | None] | None) or {}
+        gyro, accel = (prior.get(triad) or {} for triad in TRIADS)
+        read = {"gyro_read_rad_s": gyro.get("measured_rad_s"), "accel_read_m_s2": accel.get("measured_m_s2")}
+        triads = {key: msgspec.convert((imu | read).get(key), tuple[Any, Any, Any] | None) for key in _TRIADS}
         for number, axis in enumerate("xyz"):
-            figures = {name: value and value[number] for name, value in triads.items()}
-            biases.append({**about, "axis": axis, **figures})
-    held = [f"{imu.name} {triad}" for imu in told.imus for triad in imu.held_back]
-    written = {name for imu in told.imus for name in imu.written}
-    zero = told.alignment
-    row = {
-        "started_at": moment(told.started_at),
-        "duration_s": told.duration_s,
-        "state": told.state,
-        "reason": told.reason,
+            figures = {key: value and value[number] for key, value in triads.items()}
+            biases.append(_row(schema.biases, {**imu, **figures, "imu": name, "axis": axis}))
+    zero = msgspec.convert(told.get("alignment"), _Object | None)
+    magnetic = msgspec.convert(told.get("magnetic"), _Object | None) or {}
+    zeros: _Object = {"zero_at": None, "zero_x_deg": None, "zero_y_deg": None, "zero_sigma_deg": None}
+    if zero is not None:
+        x_deg, y_deg = msgspec.convert(zero.get("offset_deg"), tuple[float, float])
+        zeros = dict(zip(zeros, (zero.get("measured_at"), x_deg, y_deg, zero.get("sigma_deg")), strict=True))
+        if None in zeros.values():
+            raise NotTakenError("alignment: wanted: measured_at, offset_deg and sigma_deg")
+    found = {
+        **told,
+        **zeros,
         "held_back": ", ".join(held),
-        "undone_at": _at(told.undone_at),
         "firmware": next((firmware for firmware, ranges in CALIBRATION.items() if written & ranges.keys()), None),
-        "heading_bound_deg": told.magnetic and told.magnetic.heading_bound_deg,
-        "zero_at": zero and moment(zero.measured_at),
-        "zero_x_deg": zero and zero.offset_deg[0],
-        "zero_y_deg": zero and zero.offset_deg[1],
-        "zero_sigma_deg": zero and zero.sigma_deg,
+        "heading_bound_deg": magnetic.get("heading_bound_deg"),
     }
-    return {"calibrations": [row], "biases": biases}
-
-
-class _Arming(msgspec.Struct, frozen=True):
-    armed_at: str
-    state: _Word
-    reason: str
-    calibration: str | None
-    gyro_sigma_use_rad_s: _Number | None = None
-    accel_sigma_use_m_s2: _Number | None = None
+    return {"calibrations": [_row(schema.calibrations, found)], "biases": biases}
 
 
 def _arming(body: bytes) -> Rows:
-    row = msgspec.structs.asdict(msgspec.json.decode(body, type=_Arming))
-    of = row.pop("calibration")
-    return {"armings": [{**row, "armed_at": moment(row["armed_at"]), "calibration_at": _at(of)}]}
-
-
-class _Undo(msgspec.Struct, frozen=True):
-    what: str
-    of: str
-    undone_at: str
+    told = msgspec.json.decode(body, type=_Object)
+    return {"armings": [_row(schema.armings, told | {"calibration_at": told.get("calibration")})]}
 
 
 def _undo(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Undo)
-    return {"undos": [{"what": told.what, "of_at": moment(told.of), "undone_at": moment(told.undone_at)}]}
-
-
-class _Alignment(msgspec.Struct, frozen=True):
-    what: str
-    state: _Word
-    measured_at: str
-    reason: str
+    told = msgspec.json.decode(body, type=_Object)
+    return {"undos": [_row(schema.undos, told | {"of_at": told.get("of")})]}
 
 
 def _alignment(body: bytes) -> Rows:
-    row = msgspec.structs.asdict(msgspec.json.decode(body, type=_Alignment))
-    return {"alignments": [{**row, "measured_at": moment(row["measured_at"])}]}
-
-
-class _Event(msgspec.Struct, frozen=True):
-    what: str
+    return {"alignments": [_row(schema.alignments, msgspec.json.decode(body, type=_Object))]}
 
 
 def _event(body: bytes) -> Rows:
-    return {"events": [{"what": msgspec.json.decode(body, type=_Event).what, "body": body.decode()}]}
+    told = msgspec.json.decode(body, type=_Object)
+    return {"events": [_row(schema.events, {"what": told.get("what"), "body": body.decode()})]}
 
 
 def _flight(body: bytes) -> Rows:
@@ -214,11 +174,11 @@ def _flight(body: bytes) -> Rows:
         flown = min(imu.drift.get("flown", ()), key=lambda each: abs(each.seconds - 30.0), default=None)
         which = {
             "flight": flight.key,
-            "began_at": _at(flight.began_at),
+            "began_at": flight.began_at,
             "instance": imu.imu,
             "gyro_id": imu.gyro_id,
             "accel_id": imu.accel_id,
-            "calibration_at": _at(imu.calibration),
+            "calibration_at": imu.calibration,
             "drift_s": flown and flown.seconds,
             "drift_m": flown and flown.median_m,
         }
@@ -228,16 +188,12 @@ def _flight(body: bytes) -> Rows:
             for name in ("in_flight", "turn_on", "motors"):
                 term = getattr(split, name)
                 row |= {name: term and term.value, f"{name}_sigma": term and term.sigma}
-            rows.append(row)
-    # The type of a flight has no limits of its own.
-    for name, value in (each for row in rows for each in row.items()):
-        if isinstance(value, int | float) and abs(value) > _MOST:
-            raise NotTakenError(f"{name}: found {value:g}; allowed: up to {_MOST:g}")
+            rows.append(_row(schema.flights, row))
     return {"flights": rows}
 
 
 def _kept_raw(body: bytes) -> Rows:
-    msgspec.json.decode(body, type=dict[str, Any])
+    msgspec.json.decode(body, type=_Object)
     return {}
 
 
@@ -270,10 +226,6 @@ def moment(words: str) -> datetime.datetime:
     return found
 
 
-def _at(words: str | None) -> datetime.datetime | None:
-    return None if words is None else moment(words)
-
-
 def addressed(topic: str) -> tuple[str, str] | None:
     """Give the aircraft of a topic and "hello" or "item"; None: it is another topic."""
     match = _AIRCRAFT.fullmatch(topic)
@@ -286,10 +238,10 @@ def read_hello(aircraft: str, payload: bytes) -> Hello:
     Raises:
         NotTakenError: it is none, names another aircraft, or has a newer format.
     """
-    return _of(aircraft, _decode(payload, Hello))
+    return _decode(aircraft, payload, Hello)
 
 
-def read_key(aircraft: str, payload: bytes) -> ItemKey:
+def read_item(aircraft: str, payload: bytes) -> Item:
     """Parse the key of an item on that aircraft's topic, of any format.
 
     Raises:
@@ -297,10 +249,10 @@ def read_key(aircraft: str, payload: bytes) -> ItemKey:
     """
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
-    return _of(aircraft, _decode(payload, ItemKey))
+    return _decode(aircraft, payload, Item)
 
 
-def read_item(item: ItemKey, payload: bytes) -> tuple[Row, Rows]:
+def rows_of(item: Item) -> tuple[Row, Rows]:
     """Parse an item into its own columns and rows of other tables; `state` "unknown": a newer kind or format.
 
     Raises:
@@ -308,17 +260,17 @@ def read_item(item: ItemKey, payload: bytes) -> tuple[Row, Rows]:
     """
     if item.format_version != FORMAT_VERSION:
         return {"state": "unknown", "kind": None, "at": None, "clock": None, "same": None}, {}
-    told = _decode(payload, _Told)
-    columns: Row = {"kind": told.kind[:64], "at": moment(told.at), "clock": told.clock[:16], "same": None}
-    if told.kind not in KINDS:
-        return {**columns, "state": "unknown"}, {}
     try:
-        rows = KINDS[told.kind](bytes(told.body))
+        kind, at, clock = (msgspec.convert(value, str) for value in (item.kind, item.at, item.clock))
+        columns: Row = {"kind": kind[:64], "at": moment(at), "clock": clock[:16], "same": None}
+        if kind not in KINDS:
+            return {**columns, "state": "unknown"}, {}
+        rows = KINDS[kind](bytes(item.body))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise NotTakenError(f"{told.kind}: {error}") from None
+        raise NotTakenError(f"{str(item.kind)[:64]}: {error}") from None
     for row in rows.get("events", ()):
         row["at"] = columns["at"]
-    columns["same"] = _same(told, rows)
+    columns["same"] = _same(item, rows)
     return {**columns, "state": "taken"}, {table: [{**item.key, **row} for row in of] for table, of in rows.items()}
 
 
@@ -343,23 +295,20 @@ def answers(epoch: str, found: list[list[int]]) -> list[bytes]:
     ]
 
 
-def _decode(payload: bytes, kind: type[_Kind]) -> _Kind:
+def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
     try:
-        return msgspec.json.decode(payload, type=kind)
+        told = msgspec.json.decode(payload, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise NotTakenError(str(error)) from None
-
-
-def _of(aircraft: str, told: _Keyed) -> _Keyed:
     if told.aircraft != aircraft:
         raise NotTakenError(f"says that it is {told.aircraft}, on the topic of {aircraft}")
     return told
 
 
-def _same(told: _Told, rows: Rows) -> str:
+def _same(item: Item, rows: Rows) -> str:
     """Hash everything that stays the same when an item is sent again under another epoch, so not `undone_at`."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
     if not rows:
-        content = msgspec.json.decode(told.body)
-    told_again = msgspec.json.encode((told.kind, told.at, content), order="deterministic")
+        content = msgspec.json.decode(item.body)
+    told_again = msgspec.json.encode((item.kind, item.at, content), order="deterministic")
     return hashlib.sha256(told_again).hexdigest()[:32]

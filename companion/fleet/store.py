@@ -20,7 +20,7 @@ from companion.fleet.contract import (
     FORMAT_VERSION,
     KINDS,
     Hello,
-    ItemKey,
+    Item,
     NotTakenError,
     Row,
     Rows,
@@ -28,7 +28,7 @@ from companion.fleet.contract import (
     moment,
     read_hello,
     read_item,
-    read_key,
+    rows_of,
 )
 from companion.fleet.judgement import judged
 from companion.fleet.schema import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
@@ -158,14 +158,14 @@ class Store:
                     hello = read_hello(to[0], message.payload)
                     hellos[to[0], hello.epoch] = hello, message.retained
                     continue
-                item = read_key(to[0], message.payload)
+                item = read_item(to[0], message.payload)
             except NotTakenError as error:
                 outcome.rejected.append((message, str(error)))
                 continue
             outcome.confirmed.setdefault((item.aircraft, item.epoch), []).append(item.sequence)
             heard.add(item.aircraft)
             try:
-                columns, made = read_item(item, message.payload)
+                columns, made = rows_of(item)
             except NotTakenError as error:
                 outcome.rejected.append((message, str(error)))
                 columns, made = _REJECTED, {}
@@ -266,7 +266,7 @@ class Store:
         to = addressed(message.topic)
         item = None
         with contextlib.suppress(NotTakenError):
-            item = read_key(to[0], message.payload) if to is not None and to[1] == "item" else None
+            item = read_item(to[0], message.payload) if to is not None and to[1] == "item" else None
         with self._link_errors(), self._engine.begin() as connection:
             self._keep_aside(connection, outcome.rejected, now)
             if item is not None:
@@ -284,12 +284,11 @@ class Store:
         with self._engine.begin() as connection:
             found = connection.execute(known.limit(_AGAIN)).all()
             for row in found:
-                item = ItemKey(row.format_version, row.aircraft, row.epoch, row.sequence)
                 message = Incoming(f"fleet/{row.aircraft}/item", row.payload.encode())
-                update = sa.update(items).where(*(each[key] == value for key, value in item.key.items()))
+                update = sa.update(items).where(*(column == getattr(row, column.name) for column in items.primary_key))
                 try:
                     with connection.begin_nested():
-                        columns, made = read_item(item, message.payload)
+                        columns, made = rows_of(read_item(row.aircraft, message.payload))
                         connection.execute(update.values(columns))
                         self._put_made(connection, made)
                 except (NotTakenError, *OF_THE_ITEM) as error:
@@ -304,7 +303,7 @@ def _refusal(error: sa.exc.SQLAlchemyError) -> str:
     return f"the database refuses it: {why(error)}"
 
 
-def _raw(item: ItemKey, message: Incoming) -> Row:
+def _raw(item: Item, message: Incoming) -> Row:
     return {"format_version": item.format_version, "payload": message.payload.decode(errors="replace")}
 
 

@@ -95,7 +95,7 @@ def test_no_bytes_raise(data: st.DataObject) -> None:
     with contextlib.suppress(contract.NotTakenError):
         contract.read_hello(one.id, payload)
     with contextlib.suppress(contract.NotTakenError):
-        contract.read_item(contract.read_key(one.id, payload), payload)
+        contract.rows_of(contract.read_item(one.id, payload))
 
 
 # --- what is taken
