@@ -1,4 +1,4 @@
-"""Connection to an MQTT broker: made again after every loss, fed from an outbox.
+"""Connection to an MQTT broker: made again after every loss, fed from an outbox that is bounded whatever it does.
 
 aiomqtt 2 speaks MQTT 3.1.1 and 5. Only this module knows it, as its version 3 will be another library. MQTT 5 is tried
 first: only there can a message say that it was published to be retained, and only there is the broker told how long a
@@ -13,14 +13,14 @@ import datetime
 import importlib
 import logging
 import ssl
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from companion.config.sections import Mqtt
 from companion.links.system.connection import Backoff, Reconnection
 from companion.links.system.waiting import comes
 from companion.mqtt.broker import causes, explain, is_of_protocol, is_open_to_all, read_password, tls_context
-from companion.mqtt.outbox import Outbox
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -41,12 +41,18 @@ WORTH_S: Final = 10.0
 MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
+_PROTOCOLS: Final = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}
 MAX_PACKET_BYTES: Final = 64 * 1024
 """The longest message that the broker may send us (MQTT 5)."""
 MAX_WAITING: Final = 1000
 """The most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
 than it empties it: a flood of some hundred requests has to fit. With 64 KiB each they fit the process's memory."""
 _REFUSED: Final = 128
+MAX_ANSWERS: Final = 64
+LONG_BYTES: Final = 1024
+"""A message that is longer may be too long for a broker."""
+MOST_TRIES: Final = 3
+"""Connections that may end while one long message is being sent, before it is given up."""
 
 
 class Incoming(NamedTuple):
@@ -56,6 +62,117 @@ class Incoming(NamedTuple):
     payload: bytes
     retained: bool = False
     """Kept by the broker from earlier, or (seen in MQTT 5 only) published now to be kept."""
+
+
+class Parcel(NamedTuple):
+    """Message on its way; telemetry passes without the broker's receipt."""
+
+    kind: Literal["kept", "answer", "passing"]
+    topic: str
+    payload: bytes
+    droppable: bool = False
+
+
+class Outbox:
+    """Three kinds of messages, each with its own way of staying small.
+
+    - kept: retained at the broker. Of each topic only the latest value counts; it is remembered after it was sent,
+      as a broker that has restarted may have lost it. Their topics are few and our own.
+    - answers: each is sent, in order, also after the connection was lost in between. At most 64: then the oldest that
+      may be dropped (a refusal) goes, and where none may, the oldest of all.
+    - passing: telemetry. Of each topic only the latest value, and none without a connection.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, bytes] = {}
+        self._unsent: dict[str, None] = {}
+        self._answers: deque[Parcel] = deque()
+        self._passing: dict[str, bytes] = {}
+        self._filled = asyncio.Event()
+        self.emptied = asyncio.Event()
+        """Set while nothing waits."""
+        self.emptied.set()
+        self._open = False
+        self._given_up: set[str] = set()
+        """Topics whose kept value the broker does not take."""
+        self.dropped = 0
+        """Answers that were dropped."""
+
+    def __len__(self) -> int:
+        return len(self._unsent) + len(self._answers) + len(self._passing)
+
+    def keep(self, topic: str, payload: bytes, *, again: bool = False) -> None:
+        """Have the broker keep a payload; an empty one has it forget the topic. `again`: send it though it is kept."""
+        if again or self._kept.get(topic) != payload:
+            self._kept[topic] = payload
+            self._unsent[topic] = None
+            self._given_up.discard(topic)
+            self._tell()
+
+    def kept(self, topic: str) -> bytes | None:
+        """Return the payload that the broker keeps under a topic."""
+        return self._kept.get(topic)
+
+    def answer(self, topic: str, payload: bytes, *, droppable: bool) -> None:
+        """Send an answer once."""
+        if len(self._answers) >= MAX_ANSWERS:
+            self.dropped += 1
+            oldest = next((index for index, old in enumerate(self._answers) if old.droppable), None)
+            if oldest is None and droppable:
+                return
+            del self._answers[oldest or 0]
+        self._answers.append(Parcel("answer", topic, payload, droppable))
+        self._tell()
+
+    def pass_on(self, topic: str, payload: bytes) -> None:
+        """Send telemetry if there is a connection."""
+        if self._open:
+            self._passing[topic] = payload
+            self._tell()
+
+    def opened(self) -> None:
+        """Start a connection: send all kept payloads again."""
+        self._open = True
+        self._unsent = {topic: None for topic in self._kept if topic not in self._given_up}
+        self._tell()
+
+    def closed(self) -> None:
+        """End a connection, and drop telemetry."""
+        self._open = False
+        self._passing.clear()
+        self._tell()
+
+    async def next(self) -> Parcel:
+        """Return the next parcel; it stays (telemetry apart) until `sent`."""
+        while True:
+            if self._unsent:
+                topic = next(iter(self._unsent))
+                return Parcel("kept", topic, self._kept[topic])
+            if self._answers:
+                return self._answers[0]
+            if self._passing:
+                topic = next(iter(self._passing))
+                return Parcel("passing", topic, self._passing.pop(topic))
+            self._filled.clear()
+            await self._filled.wait()
+
+    def sent(self, parcel: Parcel, *, given_up: bool = False) -> None:
+        """Remove a parcel that the broker has, or never takes."""
+        if parcel.kind == "kept":
+            if given_up:
+                self._given_up.add(parcel.topic)
+            if self._kept[parcel.topic] == parcel.payload:
+                self._unsent.pop(parcel.topic, None)
+        elif parcel.kind == "answer" and self._answers and self._answers[0] is parcel:
+            self._answers.popleft()
+        self._tell()
+
+    def _tell(self) -> None:
+        if len(self):
+            self._filled.set()
+            self.emptied.clear()
+        else:
+            self.emptied.set()
 
 
 class MqttLink:
@@ -87,54 +204,42 @@ class MqttLink:
         self._refused: list[str] = []
         self._warned_open = False
         self._echoed = will is None
+        self._trying = ""
+        """Topic of the message under way."""
+        self._tries = 0
+        self.where = f"{settings.host}:{settings.broker_port}"
 
     @property
     def connected(self) -> bool:
         """True while the broker accepts us."""
         return self._connected_s is not None
 
-    @property
-    def last_error(self) -> str | None:
-        """Why there is, or last was, no connection; one line for people."""
-        return self._reconnection.last_error or None
-
-    @property
-    def where(self) -> str:
-        """The broker's address."""
-        return f"{self.settings.host}:{self.settings.broker_port}"
-
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""
-        now_s = asyncio.get_running_loop().time()
-        since_s = None if self._connected_s is None else now_s - self._connected_s
-        next_s = self._reconnection.retry_s
-        retry_s = None if next_s is None else max(0.0, next_s - now_s)
-        refused_now = [*self._refused]
-        if since_s is not None and since_s > ANSWER_DEADLINE_S and not self._echoed:
-            # Few brokers tell a client that they let it neither speak nor hear.
-            refused_now.append("our own messages do not come back (the broker's access list?)")
-        if since_s is not None:
-            words = f"connected to {self.where} since {self._since:%H:%M:%S} UTC"
-            words += "".join(f"; {refused}" for refused in refused_now)
+        now_s, faults = asyncio.get_running_loop().time(), [*self._refused]
+        if self._connected_s is not None:
+            if now_s - self._connected_s > ANSWER_DEADLINE_S and not self._echoed:
+                # Few brokers tell a client that they let it neither speak nor hear.
+                faults.append("our own messages do not come back (the broker's access list?)")
+            words = "; ".join((f"connected to {self.where} since {self._since:%H:%M:%S} UTC", *faults))
         else:
-            words = self.last_error or f"{self.where}: not connected yet"
-            words += "" if retry_s is None else f"; next attempt in {retry_s:.0f} s"
+            words = self._reconnection.last_error or f"{self.where}: not connected yet"
+            if (retry_s := self._reconnection.retry_s) is not None:
+                words += f"; next attempt in {max(0.0, retry_s - now_s):.0f} s"
         if self.outbox.dropped:
             words += f"; {self.outbox.dropped} answers dropped in a flood of requests"
         return {
-            "good": since_s is not None and not refused_now,
+            "good": self.connected and not faults,
             "summary": words,
-            "connected": since_s is not None,
-            "last_error": self.last_error,
+            "connected": self.connected,
+            "last_error": self._reconnection.last_error or None,
         }
 
     async def run(self) -> None:
         """Keep the connection until cancelled; a loss is an event to report, never an exception."""
-        loop = asyncio.get_running_loop()
-        problem = await asyncio.to_thread(_load_library)
-        if problem is not None:
+        if (problem := await asyncio.to_thread(_load_library)) is not None:
             self._reconnection.down(problem)
-            await loop.create_future()
+            await asyncio.get_running_loop().create_future()
         await self._reconnection.keep(self._once)
 
     async def _once(self) -> str:
@@ -198,10 +303,36 @@ class MqttLink:
         )
 
     async def _speak(self, client: aiomqtt.Client) -> None:
-        await self._subscribe(client)
+        self._refused = []
+        # One that is added meanwhile takes part.
+        for topic in self._subscriptions:
+            await self._subscribe(client, topic)
         self._spoken_to = client
-        self._up()
-        await self._send(client)
+        self._connected_s = asyncio.get_running_loop().time()
+        self._since = datetime.datetime.now(tz=datetime.UTC)
+        self._echoed = self._will is None
+        self.connections += 1
+        self.outbox.opened()
+        self._reconnection.up(f"connected to {self.where} ({_PROTOCOLS[self._protocol]})")
+        while True:
+            await self._send(client, await self.outbox.next())
+
+    async def _send(self, client: aiomqtt.Client, parcel: Parcel) -> None:
+        """Send a parcel, or give it up: a broker that ends the connection over it would do so at every connection."""
+        self._tries = self._tries + 1 if parcel.topic == self._trying else 1
+        self._trying = parcel.topic
+        if self._tries > MOST_TRIES and len(parcel.payload) > LONG_BYTES:
+            logger.warning(
+                "mqtt: %s: given up: %d bytes at %s, over which the connection ended %d times; allow longer messages"
+                " in the broker's configuration",
+                *(self.where, len(parcel.payload), parcel.topic, MOST_TRIES),
+            )
+            self.outbox.sent(parcel, given_up=True)
+        else:
+            qos, retain = 0 if parcel.kind == "passing" else 1, parcel.kind == "kept"
+            await client.publish(parcel.topic, parcel.payload, qos=qos, retain=retain, timeout=ANSWER_DEADLINE_S)
+            self.outbox.sent(parcel)
+        self._trying = ""
 
     async def hear(self, topic: str) -> None:
         """Subscribe to one more topic, now and at every connection."""
@@ -213,15 +344,9 @@ class MqttLink:
         if self._spoken_to is not None:
             # A connection that is lost over it brings the next one.
             with contextlib.suppress(aiomqtt.MqttError):
-                await self._ask_for(self._spoken_to, topic)
+                await self._subscribe(self._spoken_to, topic)
 
-    async def _subscribe(self, client: aiomqtt.Client) -> None:
-        self._refused = []
-        # One that is added meanwhile takes part.
-        for topic in self._subscriptions:
-            await self._ask_for(client, topic)
-
-    async def _ask_for(self, client: aiomqtt.Client, topic: str) -> None:
+    async def _subscribe(self, client: aiomqtt.Client, topic: str) -> None:
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
         if self._protocol == MQTT_5:
@@ -233,35 +358,15 @@ class MqttLink:
             self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
             logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
-    async def _send(self, client: aiomqtt.Client) -> None:
-        while True:
-            parcel = await self.outbox.next()
-            await client.publish(
-                parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
-            )
-            self.outbox.sent(parcel)
-
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Handle messages until the connection ends, which raises."""
         async for message in client.messages:
-            self._deliver(message)
-
-    def _deliver(self, message: aiomqtt.Message) -> None:
-        topic = message.topic.value
-        self._echoed |= self._will is not None and topic == self._will[0]
-        try:
-            self._on_message(Incoming(topic, message.payload, bool(message.retain)))
-        except Exception:
-            logger.exception("an MQTT message could not be dealt with")
-
-    def _up(self) -> None:
-        self._connected_s = asyncio.get_running_loop().time()
-        self._since = datetime.datetime.now(tz=datetime.UTC)
-        self._echoed = self._will is None
-        self.connections += 1
-        self.outbox.opened()
-        protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
-        self._reconnection.up(f"connected to {self.where} ({protocol})")
+            topic = message.topic.value
+            self._echoed |= self._will is not None and topic == self._will[0]
+            try:
+                self._on_message(Incoming(topic, message.payload, bool(message.retain)))
+            except Exception:
+                logger.exception("an MQTT message could not be dealt with")
 
 
 def make_client(settings: Mqtt, protocol: int, most_bytes: int, **more: Any) -> aiomqtt.Client:

@@ -247,7 +247,11 @@ class AircraftFleet:
     async def _heed(self, aircraft: str, said: Said, *, confirmed: bool) -> None:
         if confirmed:
             if await self._offload(self._items.confirm, aircraft, said.epoch, said.sequences, utc(utc_now())):
-                self._under_way = {one for one in self._under_way if one[0] != aircraft or not said.names(one[1])}
+                self._under_way -= {
+                    (of, sequence)
+                    for of, sequence in self._under_way
+                    if of == aircraft and any(first <= sequence <= last for first, last in said.sequences)
+                }
                 if self._wait_s > CONFIRMED_WITHIN_S:
                     self._begin_again()  # somebody is there again: in order, from the first
         elif await self._offload(self._items.want, aircraft, said.epoch, said.sequences) and said.sequences:
@@ -331,10 +335,6 @@ class Said(msgspec.Struct, frozen=True):
 
     epoch: str
     sequences: Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
-
-    def names(self, sequence: int) -> bool:
-        """Return whether a sequence is among them."""
-        return any(first <= sequence <= last for first, last in self.sequences)
 
 
 def parse(payload: bytes) -> Said | None:

@@ -32,19 +32,13 @@ Told = tuple[str, list[Item]]
 """The value of the mark, and the items."""
 
 
-class _Imu(msgspec.Struct, frozen=True):
-    name: str = ""
-    gyro_id: int | None = None
-    accel_id: int | None = None
-
-
 class _Keys(msgspec.Struct, frozen=True):
     """Keys that are needed here, of a file or an entry of any kind."""
 
     system_id: int | None = None
     undone_at: str | None = None
     started_at: str = ""
-    imus: list[_Imu] = []
+    imus: list[dict[str, Any]] = []
     what: str = ""
     state: str = ""
     measured_at: str = ""
@@ -164,13 +158,13 @@ class Sources:
             items = []
             if began != record.started_at:
                 for imu in record.imus:
-                    ids = {"gyro_id": imu.gyro_id, "accel_id": imu.accel_id}
-                    if (imu.gyro_id, imu.accel_id) == (None, None):
+                    name, ids = imu.get("name", ""), {key: imu.get(key) for key in ("gyro_id", "accel_id")}
+                    if ids == {"gyro_id": None, "accel_id": None}:
                         continue
-                    key, now = f"{IMU}{look.aircraft}/{imu.name}", msgspec.json.encode(ids).decode()
+                    key, now = f"{IMU}{look.aircraft}/{name}", msgspec.json.encode(ids).decode()
                     if parts.get(key, now) != now:
                         earlier = msgspec.json.decode(parts[key])
-                        event = {"what": "imu exchanged", "imu": imu.name, "before": earlier, "now": ids}
+                        event = {"what": "imu exchanged", "imu": name, "before": earlier, "now": ids}
                         items.append(look.item("event", record.started_at, event))
                     parts[key], changed[key] = now, Mark("", now)
                 items.append(look.item("calibration", record.started_at, body))

@@ -17,9 +17,8 @@ from companion.links.system.child import ChildSettings
 from companion.links.system.control_client import ask
 from companion.links.system.waiting import comes
 from companion.mqtt.client import Incoming, MqttLink
-from companion.mqtt.daemon import Ask, Daemon
+from companion.mqtt.daemon import Ask, Daemon, Requests
 from companion.mqtt.fleet import AircraftFleet
-from companion.mqtt.requests import Requests
 
 logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
@@ -65,12 +64,8 @@ class MqttProcess:
         if self._only_listening and self._has_fleet:
             fleet = {"good": True, "summary": "not looked at in a check: companion status, once the daemon runs"}
         if self.link is None or self.topics is None:
-            return {
-                "good": False,
-                "summary": "waiting for the autopilot's system id",
-                "connected": False,
-                "fleet": fleet,
-            }
+            waiting = "waiting for the autopilot's system id"
+            return {"good": False, "summary": waiting, "connected": False, "fleet": fleet}
         return {**self.link.status(), "base_topic": self.topics.base, "fleet": fleet}
 
     async def run(self) -> None:
@@ -215,13 +210,8 @@ def summary(status: Object) -> Object:
         "vehicle": {key: status["vehicle"][key] for key in _VEHICLE},
         "arming": {key: status["arming"][key] for key in _ARMING},
         "devices": [
-            {
-                "name": device["name"],
-                "kind": device["kind"],
-                "good": device["good"],
-                "problem": None if device["good"] else device["summary"],
-            }
-            for device in status["devices"]
+            {key: one[key] for key in ("name", "kind", "good")} | {"problem": None if one["good"] else one["summary"]}
+            for one in status["devices"]
         ],
     }
 
@@ -261,12 +251,9 @@ class Topics:
 
     def __init__(self, base: str) -> None:
         self.base = base
-        self.status = f"{base}/status"
-        self.state = f"{base}/state"
-        self.record = f"{base}/calibration/state"
-        self.progress = f"{base}/calibration/progress"
-        self.attitude = f"{base}/attitude"
+        self.status, self.state, self.record = f"{base}/status", f"{base}/state", f"{base}/calibration/state"
         self.kept = (self.status, self.state, self.record)
         """Topics that the broker keeps."""
+        self.progress, self.attitude = f"{base}/calibration/progress", f"{base}/attitude"
         self.request, self.response = f"{base}/request/", f"{base}/response/"
         """Topics of a request and its response, without the name of the command."""

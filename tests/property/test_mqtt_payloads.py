@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.commands import Interface
-from companion.mqtt.requests import KNOWN, MAX_PAYLOAD_BYTES, parse
+from companion.mqtt.daemon import KNOWN, MAX_PAYLOAD_BYTES, parse
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),

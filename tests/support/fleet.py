@@ -17,10 +17,9 @@ import yaml
 
 from companion.config.sections import Fleet, Location
 from companion.formats import Object
-from companion.mqtt.client import Incoming, MqttLink
+from companion.mqtt.client import Incoming, MqttLink, Outbox
 from companion.mqtt.daemon import CLOCKS_AGREE_S, Daemon
 from companion.mqtt.fleet import AircraftFleet
-from companion.mqtt.outbox import Outbox
 
 ASYNCAPI = Path(__file__).parents[2] / "docs" / "fleet" / "asyncapi.yaml"
 CONTRACT: Any = yaml.safe_load(ASYNCAPI.read_text(encoding="utf-8"))

@@ -10,9 +10,9 @@ import pytest
 
 from companion.commands import Interface
 from companion.config import parse
+from companion.mqtt.daemon import KNOWN, Request
+from companion.mqtt.daemon import parse as parse_request
 from companion.mqtt.process import Topics
-from companion.mqtt.requests import KNOWN, Request
-from companion.mqtt.requests import parse as parse_request
 
 DOCS = (Path(__file__).parents[3] / "docs" / "mqtt.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `([a-z/]+)` \|(.*)\|$", DOCS, re.MULTILINE))

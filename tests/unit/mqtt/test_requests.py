@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from companion.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Request, Requests, parse
+from companion.mqtt.daemon import MAX_PENDING, REMEMBER_S, REMEMBERED, Request, Requests, parse
 from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]
