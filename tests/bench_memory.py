@@ -39,6 +39,7 @@ max_s = 8
 at_arm = "gate"
 [web]
 bind = "127.0.0.1:0"
+[fleet]
 """
 CHILDREN: Final = {"page": "companion.web", "MQTT": "companion.mqtt"}
 PEERS: Final = {

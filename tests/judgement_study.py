@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from companion.fleet.judgement import PartHistory, columns_of, compass_column, counts
-from companion.fleet.sequential import Alarm, Columns, Scatter, scatter_of_model, scatter_of_part, watch
+from companion.fleet.sequential import Alarm, Columns, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
 
@@ -91,7 +91,7 @@ def alarms_of(parts: Sequence[Columns]) -> Iterator[tuple[int, Alarm]]:
             yield part, one
 
 
-def model_by(histories: Sequence[PartHistory]) -> Scatter | None:
+def model_by(histories: Sequence[PartHistory]) -> Floats | None:
     """Of all of them."""
     return scatter_of_model([scatter_of_part(each.biases, each.temperature_degc) for each in histories])
 

@@ -35,15 +35,12 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 BATCH: Final = 500
-"""Most messages in one transaction."""
 GATHER_S: Final = 0.1
-"""Time to wait for more messages of a batch."""
 ASK_AFTER: Final = 50
 """Factor on `GATHER_S` for hellos: items sent with a hello have arrived by then, perhaps at another collector."""
 WAITING: Final = 20 * BATCH
 """Most messages that wait to be written; more are dropped, and sent again by their aircraft."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
-"""Most bytes of waiting messages."""
 BATCH_BYTES: Final = 4 * 1024 * 1024
 """Most bytes of a batch; a database makes several copies of it."""
 AT_ONCE: Final = 50
@@ -51,11 +48,9 @@ AT_ONCE: Final = 50
 SWEEP_S: Final = 5.0
 """Time to receive the retained hellos, which shared subscriptions do not deliver."""
 JUDGE_S: Final = 2.0
-"""Interval at which the collector looks for aircraft to judge."""
 REST: Final = 4.0
 """Pause after a judgement, as a multiple of its duration: collecting goes first."""
 ANSWER_S: Final = 10.0
-"""Timeout of the broker's answers."""
 STOP_AGAIN_S: Final = 0.5
 _HELLO: Final = "fleet/+/hello"
 _ITEM: Final = "fleet/+/item"
@@ -154,7 +149,6 @@ class Collector:
         await self._reconnection.keep(self._once)
 
     async def _once(self) -> str:
-        """Connect to broker and database, serve until one of them fails, and return the reason."""
         import aiomqtt
 
         await asyncio.to_thread(self.store.prepare)

@@ -44,7 +44,6 @@ _Keyed = TypeVar("_Keyed", "Hello", "Item")
 
 Row = dict[str, Any]
 Rows = dict[str, list[Row]]
-"""Rows by table."""
 
 
 class NotTakenError(Exception):

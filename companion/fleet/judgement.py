@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from companion.fleet import schema
 from companion.fleet.contract import Row
 from companion.fleet.schema import UtcTime
-from companion.fleet.sequential import Alarm, Columns, Scatter, middle_of, scatter_of_model, scatter_of_part, watch
+from companion.fleet.sequential import Alarm, Columns, middle_of, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
@@ -32,15 +32,12 @@ _OF_MODEL, _OF_OWN = 1.5, 3.0
 WANDER: Final = (0.03, 0.3)
 """Least and largest wander of a bias from one power-up to the next, in scatters."""
 LEAST_SIZE: Final = 1.8
-"""Least size of a finding, in scatters."""
 LEAST_TIMES: Final = 1.4
-"""Least factor by which a noise has grown in a finding."""
 _FEW_TELL: Final = 1.2
 """Factor on the scatter of a part's first power-ups, which may be too small."""
 _LEAST_NOISE: Final = 0.08
 """Least scatter of the logarithm of a noise that is measured over some ten seconds."""
 _BOUND_DEG: Final = 5.0
-"""Least bound of the heading's error in a finding."""
 _DRIFT_AFTER: Final = 8
 """Power-ups until an alarm; a level that takes longer has drifted."""
 SHOWN: Final = 30
@@ -58,7 +55,6 @@ MOST_DEGC: Final = 150.0
 """Limit of a believable temperature, to catch kelvins that were not turned into degrees."""
 _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
-"""Parts of one model that are compared."""
 _TOGETHER: Final = 10
 """Most power-ups between moves of accelerometers that count as one move of the gradienter."""
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
@@ -89,7 +85,6 @@ class PartFinding(NamedTuple):
     axis: int
     """0 to 5; -1: none."""
     since: int
-    """Index of the power-up."""
     size: float
     """Multiple of what is usual."""
     words: str
@@ -97,15 +92,15 @@ class PartFinding(NamedTuple):
     """Move of a level, rad/s or m/s^2."""
 
 
-def columns_of(history: PartHistory, model: Scatter | None) -> Columns:
+def columns_of(history: PartHistory, model: Floats | None) -> Columns:
     """Make the columns of the biases, (n, 6), and of their noise, (n, 6); `model`: scatter of the other parts."""
-    own = scatter_of_part(history.biases[:LEARNS], history.temperature_degc[:LEARNS])
-    turn_on, wander = _FEW_TELL * own.turn_on, np.full(6, WANDER[0])
+    turn_on = _FEW_TELL * scatter_of_part(history.biases[:LEARNS], history.temperature_degc[:LEARNS])[0]
+    wander = np.full(6, WANDER[0])
     first, most_own = np.full(12, LEARNS), np.full(12, _OF_OWN)
     if model is not None:
-        known = np.isfinite(model.turn_on)
-        turn_on = np.where(known, model.turn_on, turn_on)
-        wander = np.clip(np.nan_to_num(model.wander / turn_on), *WANDER)
+        known = np.isfinite(model[0])
+        turn_on = np.where(known, model[0], turn_on)
+        wander = np.clip(np.nan_to_num(model[1] / turn_on), *WANDER)
         first[:6][known], most_own[:6][known] = _WITH_MODEL, _OF_MODEL
     unit = np.where(turn_on > 0.0, turn_on, np.nan)
     use = np.square(history.sigma_use)
@@ -116,7 +111,7 @@ def columns_of(history: PartHistory, model: Scatter | None) -> Columns:
     # At the end of a warm-up the sigma is that of a fitted line, which does not tell the noise.
     share = np.sqrt(use) / history.white
     noise = np.where(share > 3.0 * np.array([middle_of(column) for column in share.T]), np.nan, noise)
-    of_noise = scatter_of_part(noise[:LEARNS], history.temperature_degc[:LEARNS]).turn_on
+    of_noise = scatter_of_part(noise[:LEARNS], history.temperature_degc[:LEARNS])[0]
     of_noise = np.fmax(of_noise, np.where(np.isfinite(of_noise), _LEAST_NOISE, np.nan))
     values = np.hstack([history.biases / unit, noise / of_noise])
     n = len(values)
@@ -140,7 +135,7 @@ def counts(alarm: Alarm) -> bool:
     return alarm.column < 6 or (alarm.kind == "level" and alarm.size > 0.0)
 
 
-def judge(history: PartHistory, model: Scatter | None) -> list[PartFinding]:
+def judge(history: PartHistory, model: Floats | None) -> list[PartFinding]:
     """List the findings against one IMU as of its latest power-up, the worst first."""
     columns = columns_of(history, model)
     n = len(history.biases)
@@ -196,7 +191,7 @@ def compass_column(heading_bound_deg: Floats) -> Columns:
     bound = np.log(np.where(heading_bound_deg > 0.0, heading_bound_deg, np.nan))[:, None]
     n, nowhere = len(bound), np.full((len(bound), 1), np.nan)
     six = np.repeat(bound[:LEARNS], 6, axis=1)
-    unit = np.fmax(scatter_of_part(six, nowhere[:LEARNS, 0]).turn_on[:1], _LEAST_NOISE)
+    unit = np.fmax(scatter_of_part(six, nowhere[:LEARNS, 0])[0, :1], _LEAST_NOISE)
     return Columns(
         values=bound / unit,
         variance=np.zeros((n, 1)),
@@ -253,7 +248,12 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
         history = _history(_power_ups(calibrations))
         ids = calibrations[-1].axes[0]
         model = model_of(firmware, ids.gyro_id, ids.accel_id)
-        parts += _part(aircraft, imu, model, scatter_of_part(history.biases, history.temperature_degc))
+        about = {"aircraft": aircraft, "imu": imu, "model": model, "power_ups": len(history.at)}
+        scatter = scatter_of_part(history.biases, history.temperature_degc)
+        for place, name in enumerate(_AXES):
+            triad, axis = name.split()
+            turn_on, wander = (float(each) if np.isfinite(each) else None for each in scatter[:, place])
+            parts.append({**about, "triad": triad, "axis": axis, "turn_on": turn_on, "wander": wander})
         others = None if model is None else _others(connection, model, aircraft)
         found += [(imu, history.at, each) for each in judge(history, others)]
     found = _of_the_gradienter(found, len(imus))
@@ -268,15 +268,14 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
     return parts, [_row(aircraft, place, *each) for place, each in enumerate(worst)]
 
 
-def _others(connection: sa.Connection, model: str, aircraft: str) -> Scatter | None:
+def _others(connection: sa.Connection, model: str, aircraft: str) -> Floats | None:
     """Read the scatter of a model, by the parts that are in other aircraft now."""
     query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != aircraft)
-    found: dict[tuple[str, str], Scatter] = {}
+    found: dict[tuple[str, str], Floats] = {}
     for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
-        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, *np.full((2, 6), np.nan)))
-        place = _AXES.index(f"{row.triad} {row.axis}")
-        for name in ("turn_on", "wander"):
-            getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value
+        one = found.setdefault((row.aircraft, row.imu), np.full((2, 6), np.nan))
+        figures = [np.nan if value is None else value for value in (row.turn_on, row.wander)]
+        one[:, _AXES.index(f"{row.triad} {row.axis}")] = figures
     return scatter_of_model(list(found.values()))
 
 
@@ -349,16 +348,6 @@ def _history(calibrations: Sequence[_Calibration]) -> PartHistory:
         white=sigma_stat * np.sqrt(samples / rate)[:, None],
         new_zero=np.array([False, *(a != b for a, b in pairwise(zeros))]),
     )
-
-
-def _part(aircraft: str, imu: str, model: str | None, scatter: Scatter) -> list[Row]:
-    figures = {name: getattr(scatter, name).tolist() for name in ("turn_on", "wander")}
-    about = {"aircraft": aircraft, "imu": imu, "model": model, "power_ups": scatter.power_ups}
-    return [
-        {**about, "triad": triad, "axis": axis}
-        | {name: values[place] if np.isfinite(values[place]) else None for name, values in figures.items()}
-        for place, (triad, axis) in enumerate(each.split() for each in _AXES)
-    ]
 
 
 _Found = list[tuple[str | None, Sequence[datetime.datetime], PartFinding]]

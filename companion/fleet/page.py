@@ -16,16 +16,13 @@ from companion.report.page import NAMES, PlotPoint, arming_items, card, drift, p
 from companion.samples import TRIADS, Triad, Vector
 
 STALE: Final = datetime.timedelta(days=30)
-"""A calibration that is older is shown as stale."""
 SILENT: Final = datetime.timedelta(days=7)
 MOST_AIRCRAFT: Final = 500
 """Most aircraft on the page, of some 90 kB; the views have all."""
 MOST_CALIBRATIONS: Final = 120
-"""Most calibrations of one IMU in a plot, the latest ones."""
 MOST_LISTED: Final = 25
 MOST_REFUSED: Final = 5
 MOST_FINDINGS: Final = 8
-"""Most findings in the card, the worst ones."""
 
 
 _CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
@@ -97,7 +94,6 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
 
 
 def _line(one: Any, now: datetime.datetime) -> Markup:
-    """Make the row of one aircraft in the table of the fleet."""
     kind, word, why = standing(one)
     calibrated = "" if one.calibrated_at is None else _ago(one.calibrated_at, now)
     return row(
@@ -208,7 +204,6 @@ def _armings(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _notes(connection: sa.Connection, which: str) -> list[Child]:
-    """List failed calibrations, undos, events and flights."""
     query = """
         SELECT started_at AS at, 'calibration ' || state AS what, reason AS more FROM calibrations
         WHERE aircraft = :which AND state <> 'done'

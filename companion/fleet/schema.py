@@ -24,7 +24,6 @@ _BUSY_S: Final = 10.0
 OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
 """Errors of a database that cannot be reached, is full or broken."""
 OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
-"""Errors of a row that the database refuses."""
 
 
 class UtcTime(sa.types.TypeDecorator[datetime.datetime]):

@@ -22,9 +22,7 @@ from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
 
 LEAST_POWER_UPS: Final = 8
-"""Least power-ups for the scatter of a part."""
 LEAST_PARTS: Final = 4
-"""Least parts for the scatter of a model."""
 WANDER_LAG: Final = 30
 """Power-ups between the two levels that tell the wander."""
 _FOR_A_TERM: Final = 24
@@ -58,35 +56,25 @@ _BASE: Final = 20
 """Power-ups before a move that the level is compared with."""
 
 
-class Scatter(NamedTuple):
-    """Scatter of one part, or of a model; (6,) each, NaN where not known."""
-
-    power_ups: int
-    turn_on: Floats
-    """One sigma from one power-up to another at one temperature, errors of the calibrations included."""
-    wander: Floats
-    """One sigma of the step that stays, from one power-up to the next."""
-
-
-def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Scatter:
+def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Floats:
     """Estimate the scatter of a part from its power-ups in order, (n, 6) and (n,); NaN: not measured.
 
-    Steps between successive power-ups, less the part that follows the temperature, are the input: neither ageing nor a
-    single move makes them larger.
+    Rows of the result, (2, 6): one sigma from one power-up to another at one temperature, errors of the calibrations
+    included; one sigma of the step that stays. Steps between successive power-ups, less the part that follows the
+    temperature, are the input: neither ageing nor a single move makes them larger.
     """
-    return Scatter(len(biases), *np.array([_column(column, temperature_degc) for column in biases.T]).T)
+    return np.array([_column(column, temperature_degc) for column in biases.T]).T
 
 
-def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
-    """Give the median scatter of the parts; None: fewer than `LEAST_PARTS` have one."""
-    telling = [part for part in parts if np.isfinite(part.turn_on).any()]
+def scatter_of_model(parts: Sequence[Floats]) -> Floats | None:
+    """Give the median scatter of the parts, (2, 6); None: fewer than `LEAST_PARTS` have one."""
+    telling = [part for part in parts if np.isfinite(part[0]).any()]
     if len(telling) < LEAST_PARTS:
         return None
-    figures = np.array([part[1:] for part in telling])
-    middle = np.empty((2, 6))
+    figures, middle = np.array(telling), np.empty((2, 6))
     for group in _GROUPS:
         middle[:, group] = [[middle_of(each)] for each in np.moveaxis(figures[:, :, group], 1, 0)]
-    return Scatter(sum(part.power_ups for part in telling), *middle)
+    return middle
 
 
 def middle_of(values: Floats) -> float:

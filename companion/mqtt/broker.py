@@ -63,26 +63,16 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
         context = ssl.create_default_context(cafile=settings.ca_file)
         if settings.cert_file is not None and settings.key_file is not None:
             where = Path(settings.key_file)
-            load_pair(context, Path(settings.cert_file), where)
-    except OSError as error:
-        raise unusable(error, where) from None
-    return context
-
-
-def load_pair(context: ssl.SSLContext, cert: Path, key: Path) -> None:
-    """Load a certificate and its key; raises OSError, which `unusable` turns into a line."""
-    for file in (cert, key):
-        file.open("rb").close()  # OpenSSL does not say which of them it cannot read
-    # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
-    context.load_cert_chain(cert, key, password=lambda: "")
-
-
-def unusable(error: OSError, where: Path) -> LinkError:
-    """Turn the error of a file of certificates or keys into one line that names it."""
-    if isinstance(error, ssl.SSLError):
+            for file in (settings.cert_file, settings.key_file):
+                Path(file).open("rb").close()  # OpenSSL does not say which of them it cannot read
+            # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
+            context.load_cert_chain(settings.cert_file, settings.key_file, password=lambda: "")
+    except ssl.SSLError as error:
         what = (error.reason or str(error)).lower().replace("_", " ")
-        return LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)")
-    return LinkError(f"{error.filename or where}: {_why(error)}")
+        raise LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)") from None
+    except OSError as error:
+        raise LinkError(f"{error.filename or where}: {_why(error)}") from None
+    return context
 
 
 def _why(error: OSError) -> str:

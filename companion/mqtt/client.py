@@ -40,7 +40,6 @@ WORTH_S: Final = 10.0
 """Least duration of a connection after which the next attempts begin with short waits again."""
 MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
-"""The numbers of the two protocols on the wire."""
 _PROTOCOLS: Final = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}
 MAX_PACKET_BYTES: Final = 64 * 1024
 """The longest message that the broker may send us (MQTT 5)."""
@@ -90,13 +89,11 @@ class Outbox:
         self._passing: dict[str, bytes] = {}
         self._filled = asyncio.Event()
         self.emptied = asyncio.Event()
-        """Set while nothing waits."""
         self.emptied.set()
         self._open = False
         self._given_up: set[str] = set()
         """Topics whose kept value the broker does not take."""
         self.dropped = 0
-        """Answers that were dropped."""
 
     def __len__(self) -> int:
         return len(self._unsent) + len(self._answers) + len(self._passing)
@@ -205,7 +202,6 @@ class MqttLink:
         self._warned_open = False
         self._echoed = will is None
         self._trying = ""
-        """Topic of the message under way."""
         self._tries = 0
         self.where = f"{settings.host}:{settings.broker_port}"
 
@@ -359,7 +355,6 @@ class MqttLink:
             logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
     async def _receive(self, client: aiomqtt.Client) -> None:
-        """Handle messages until the connection ends, which raises."""
         async for message in client.messages:
             topic = message.topic.value
             self._echoed |= self._will is not None and topic == self._will[0]

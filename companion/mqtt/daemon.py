@@ -39,7 +39,6 @@ MONITOR: Final[Object] = {"command": "monitor", "pose": True}
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
 """Sends a request to the control socket and yields the replies."""
 Respond = Callable[[str, Object], None]
-"""Sends the response to a command."""
 Transaction = str | int | None
 
 MAX_PAYLOAD_BYTES: Final = 4096
@@ -60,12 +59,10 @@ class Daemon:
     def __init__(self, ask: Ask) -> None:
         self.ask = ask
         self.status: Object | None = None
-        """The latest status; None before the first."""
         self.pose: Object | None = None
         self.record: Object | None = None
         """The last calibration's record."""
         self.alive = False
-        """True while replies come."""
         self.news = asyncio.Event()
         """Set at every reply, and when the stream ends."""
         self.clock_agrees = False
@@ -142,7 +139,6 @@ class Request(msgspec.Struct):
     command: str
     transaction: Transaction = None
     content: Object = {}
-    """Everything but the transaction."""
     problem: str = ""
     """Why it cannot be asked of the daemon, in one line; empty: it can."""
     at_s: float = 0.0

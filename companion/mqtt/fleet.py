@@ -92,7 +92,6 @@ class AircraftFleet:
         self._woken = asyncio.Event()
         self._kept: list[Kept] = []
         self._of: str | None = None
-        """Aircraft that new items belong to."""
         self._news = True
         self._caught_up = False
         """True once files of earlier runs were read."""
@@ -104,7 +103,6 @@ class AircraftFleet:
         self._hello_s = 0.0
         self._under_way: set[tuple[str, int]] = set()
         self._sent = 0
-        """The number of the last one under way."""
         self._expires_s = 0.0
         self._wait_s = CONFIRMED_WITHIN_S
         self._problem: str | None = None
@@ -323,7 +321,6 @@ class AircraftFleet:
 
 
 def _heard(aircraft: str) -> tuple[str, str]:
-    """Return the topics on which a collector answers an aircraft."""
     return f"fleet/{aircraft}/confirmed", f"fleet/{aircraft}/wanted"
 
 

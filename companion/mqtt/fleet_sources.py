@@ -19,14 +19,12 @@ from companion.storage.fleet_items import Clock, FleetItems, Item, Mark, SourceI
 from companion.storage.state import BoundedList, StateFile, named_in
 
 RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/", "profile/", "flight/", "imu/"
-"""Prefixes of marks."""
 TOLD: Final = "told"
 _WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles", "flights")
 _NAME: Final = re.compile(r"([a-z0-9][a-z0-9._-]*)\.json")
 _LISTED: Final = 200
 """Most entries of a list; the daemon keeps no more."""
 FORMAT_VERSION: Final = 1
-"""Newest format of the files."""
 
 Told = tuple[str, list[Item]]
 """The value of the mark, and the items."""
@@ -51,7 +49,6 @@ class _Keys(msgspec.Struct, frozen=True):
 
 
 _Found = tuple[_Keys, Object]
-"""The keys, and the whole."""
 
 
 def utc(at: str) -> str:
@@ -131,7 +128,6 @@ class Sources:
         return {name: _stamp(path / f"{name}.json") for name in named_in(path, _NAME)}
 
     def _read(self, name: str) -> _Found | None:
-        """Return the content of a file; None: there is none that can be read."""
         try:
             body = StateFile[Object](self._directory / name, dict[str, Any], newest=FORMAT_VERSION).read()
             return None if body is None else (msgspec.convert(body, _Keys), body)

@@ -153,7 +153,6 @@ class MqttProcess:
             await asyncio.wait([running], timeout=FLUSH_S)
 
     def _publish(self, link: MqttLink, topics: Topics) -> None:
-        """Put into the outbox what has changed since the last call."""
         daemon, outbox = self.daemon, link.outbox
         outbox.keep(topics.status, ONLINE if daemon.alive else OFFLINE)
         if daemon.status is None:
@@ -253,7 +252,6 @@ class Topics:
         self.base = base
         self.status, self.state, self.record = f"{base}/status", f"{base}/state", f"{base}/calibration/state"
         self.kept = (self.status, self.state, self.record)
-        """Topics that the broker keeps."""
         self.progress, self.attitude = f"{base}/calibration/progress", f"{base}/attitude"
         self.request, self.response = f"{base}/request/", f"{base}/response/"
         """Topics of a request and its response, without the name of the command."""

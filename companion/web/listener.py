@@ -24,7 +24,6 @@ HEADERS: Final = (
     ("Cross-Origin-Resource-Policy", "same-origin"),
     ("Cache-Control", "no-store"),
 )
-"""Headers of every answer."""
 
 ANSWERED_WITHIN_S: Final = 20.0
 """Request, work and answer together; an action takes 10 s at most."""

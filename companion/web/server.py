@@ -34,12 +34,10 @@ from companion.web.listener import MAX_BODY_BYTES, Connection, listening
 logger = logging.getLogger(__name__)
 
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
-"""Sends one request of the control socket and yields its replies."""
 
 WORTH_S: Final = 10.0
 """A page that was open for this long is opened again at once."""
 WRONG_TOKEN_S: Final = 2.0
-"""Delay of the answer to a wrong token."""
 MAX_WAITING: Final = 16
 """The most answers to wrong tokens that are delayed at a time: each holds a connection."""
 ACTION_WITHIN_S: Final = 10.0

@@ -50,7 +50,6 @@ class PortSettings:
         return self.url.startswith("tcp://")
 
     def __str__(self) -> str:
-        """Format it for people."""
         return self.url if self.is_tcp else f"{self.url} at {self.baud} baud, parity {self.parity}"
 
     @property
@@ -96,7 +95,6 @@ class ByteLink:
         self.bytes_received = 0
         self.reconnects = 0
         self.turns = 0
-        self.last_byte_s: float | None = None
         self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
         self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
         self._descriptor: int | None = None
@@ -229,7 +227,6 @@ class ByteLink:
             self._lose(self._explain(None))
             return False
         self.bytes_received += len(data)
-        self.last_byte_s = now_s
         if self.budget is not None and not self.budget.spend(len(data), now_s):
             self._pause()
         self._on_bytes(data, now_s)
@@ -253,7 +250,6 @@ class ByteLink:
                 if not data:
                     break  # the reader will find it, and what it means
                 self.bytes_received += len(data)
-                self.last_byte_s = loop.time()
         except OSError:
             pass  # empty, or gone: the reader will find it
         self._on_gap()

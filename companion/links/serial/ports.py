@@ -67,31 +67,27 @@ def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     return tuple(_holders_by_device(root).get(resolve(root, device), ()))
 
 
-def _under(folder: str, links: list[str]) -> tuple[str, ...]:
-    return tuple(link for link in links if link.startswith(folder))
-
-
-def _best_first(by_id: tuple[str, ...], by_path: tuple[str, ...], serial_number: str | None) -> tuple[str, ...]:
-    """Chips without a serial number (CH340, PL2303) of one kind all claim the same by-id name; the last one gets it."""
-    return by_id + by_path if serial_number else by_path + by_id
-
-
 def _describe(
     root: Path, entry: Path, links: list[str], holders: tuple[Holder, ...], *, is_console: bool
 ) -> SerialPort:
     hardware = (entry / "device").resolve()
     usb = _node_with(root, hardware, "idVendor")
     serial_number = read_attribute(usb / "serial") if usb else None
-    by_id, by_path = _under(_BY_ID, links), _under(_BY_PATH, links)
-    names = _best_first(by_id, by_path, serial_number)
+    by_id, by_path = (tuple(link for link in links if link.startswith(folder)) for folder in (_BY_ID, _BY_PATH))
+    # Chips without a serial number (CH340, PL2303) of one kind all claim the same by-id name; the last one gets it.
+    names = by_id + by_path if serial_number else by_path + by_id
     driver = _driver(hardware)
+    description = f"on-board port ({driver})" if driver else "on-board port"
+    if usb:
+        words = [read_attribute(usb / "manufacturer"), read_attribute(usb / "product")]
+        description = " ".join(word for word in words if word) or "USB device"
     return SerialPort(
         device=f"/dev/{entry.name}",
         stable_name=names[0] if names else None if usb else f"/dev/{entry.name}",
         by_id=by_id,
         by_path=by_path,
         aliases=tuple(link for link in links if not link.startswith("/dev/serial/")),
-        description=_usb_description(usb) if usb else f"on-board port ({driver})" if driver else "on-board port",
+        description=description,
         driver=driver,
         vendor_id=_number(usb / "idVendor", 16) if usb else None,
         product_id=_number(usb / "idProduct", 16) if usb else None,
@@ -123,12 +119,6 @@ def _node_with(root: Path, hardware: Path, attribute: str) -> Path | None:
         if (node / attribute).exists():
             return node
     return None
-
-
-def _usb_description(usb: Path) -> str:
-    words = [read_attribute(usb / "manufacturer"), read_attribute(usb / "product")]
-    found = " ".join(word for word in words if word)
-    return found or "USB device"
 
 
 def _links_by_device(root: Path) -> dict[str, list[str]]:

@@ -6,11 +6,11 @@ Each place of the program has so many lines a minute, as others can cause them a
 from __future__ import annotations
 
 import copy
-import dataclasses
 import logging
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Final, TextIO
 
@@ -24,32 +24,28 @@ LINES_PER_S: Final = 0.1
 BURST: Final = 10.0
 
 
-@dataclasses.dataclass(slots=True)
-class _Place:
-    budget: Budget = dataclasses.field(default_factory=lambda: Budget(LINES_PER_S, BURST))
-    left_out: int = 0
-
-
 class LimitedHandler(logging.StreamHandler[TextIO]):
     """Writes what the budgets allow; the clock is in seconds and never goes back."""
 
     def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(stream)
         self._clock = clock
-        self._places: dict[tuple[str, int, int], _Place] = {}
+        self._budgets: dict[tuple[str, int, int], Budget] = {}
+        self._left_out: Counter[tuple[str, int, int]] = Counter()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record with the count of those left out before it, or count it."""
         now_s = self._clock()
-        place = self._places.setdefault((record.pathname, record.lineno, record.levelno), _Place())
-        if place.budget.left(now_s) < 1.0:
-            place.left_out += 1
+        place = record.pathname, record.lineno, record.levelno
+        budget = self._budgets.setdefault(place, Budget(LINES_PER_S, BURST))
+        if budget.left(now_s) < 1.0:
+            self._left_out[place] += 1
             return
-        place.budget.spend(1, now_s)
-        if place.left_out:
+        budget.spend(1, now_s)
+        if left_out := self._left_out.pop(place, 0):
             record = copy.copy(record)
-            record.msg = f"{record.getMessage()} (after {place.left_out} more like this, left out)"
-            record.args, place.left_out = (), 0
+            record.msg = f"{record.getMessage()} (after {left_out} more like this, left out)"
+            record.args = ()
         super().emit(record)
 
 

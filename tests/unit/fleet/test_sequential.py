@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware.firmwares import model_of
-from companion.fleet.sequential import LEAST_PARTS, Scatter, scatter_of_model, scatter_of_part
+from companion.fleet.sequential import LEAST_PARTS, scatter_of_model, scatter_of_part
 from companion.physics.frames import Floats
 
 TRUE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 5.0])
@@ -25,14 +25,14 @@ def test_scatter_is_that_of_the_draws_whatever_the_temperature_and_a_step() -> N
     biases[300:] += 40.0 * TRUE
     biases[::50] += 100.0
     found = scatter_of_part(biases, degc)
-    assert found.turn_on == pytest.approx(TRUE, rel=0.12)
+    assert found[0] == pytest.approx(TRUE, rel=0.12)
 
 
 def test_too_few_tell_nothing() -> None:
-    assert np.isnan(scatter_of_part(*drawn(7, 1)).turn_on).all()
+    assert np.isnan(scatter_of_part(*drawn(7, 1))[0]).all()
     few = [scatter_of_part(*drawn(60, seed)) for seed in range(LEAST_PARTS - 1)]
     assert scatter_of_model(few) is None
-    empty = Scatter(0, *np.full((2, 6), np.nan))
+    empty = np.full((2, 6), np.nan)
     assert scatter_of_model([*few, empty]) is None
 
 
