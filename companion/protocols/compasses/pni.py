@@ -21,7 +21,7 @@ import re
 import struct
 from typing import Final
 
-from companion.protocols.decoding.base import ECHO, NO_FRAME, WAIT, Decoder, RejectedError
+from companion.protocols.decoding.base import ECHO, NO_FRAME, Decoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
@@ -72,22 +72,16 @@ class PniDecoder(Decoder):
     START = re.compile(b"\0")
 
     def _size(self, buffer: bytes, at: int) -> int:
-        available = len(buffer) - at
-        if available < 2:
-            return WAIT
         size = buffer[at + 1]
-        if not SHORTEST <= size <= LONGEST or (available >= 3 and buffer[at + 2] not in _KNOWN):
+        if not SHORTEST <= size <= LONGEST or buffer[at + 2] not in _KNOWN:
             return NO_FRAME
-        if available < 3:
-            return WAIT
-        frame = buffer[at : at + size]
-        if frame[2] == _DATA:
-            _components(frame, size)
-        if available < size:
-            return WAIT
+        if buffer[at + 2] == _DATA:
+            _components(buffer[at : at + size], size)
+        return size
+
+    def _check(self, frame: bytes) -> None:
         if binascii.crc_hqx(frame, 0) != 0:
             raise RejectedError("checksum")
-        return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[2] != _DATA:

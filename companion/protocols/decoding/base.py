@@ -119,14 +119,20 @@ class Decoder(ABC):
         """Append the samples of the frame at `at`, if it is one; return the bytes to pass over, or `WAIT`."""
         try:
             size = self._size(buffer, at)
+            if size <= 0:  # NO_FRAME or WAIT
+                return size or 1
+            end = at + size
+            if end > len(buffer):
+                return WAIT
+            frame = buffer[at:end]
+            self._check(frame)
+        except IndexError:
+            return WAIT
         except RejectedError as error:
             self.rejected[error.reason] += 1
             return 1
-        if size <= 0:  # NO_FRAME or WAIT
-            return size or 1
-        end = at + size
         try:
-            found = self._decode(buffer[at:end], self._time_of(self._origin + end))
+            found = self._decode(frame, self._time_of(self._origin + end))
         except RejectedError as error:
             self.rejected[error.reason] += 1
             return size
@@ -138,11 +144,15 @@ class Decoder(ABC):
 
     @abstractmethod
     def _size(self, buffer: bytes, at: int) -> int:
-        """Return the length of the frame at `at`, checked; `NO_FRAME`, or `WAIT` for more bytes.
+        """Return the length of the frame at `at`, or `NO_FRAME`.
 
         Raises:
+            IndexError: more bytes are needed to tell.
             RejectedError: what begins there is to be counted as rejected; only its first byte is passed over.
         """
+
+    def _check(self, frame: bytes) -> None:  # noqa: B027 - lines and sentences are checked as they are read
+        """Check a whole frame; raise RejectedError to count it and to pass over its first byte only."""
 
     @abstractmethod
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:

@@ -17,7 +17,7 @@ from itertools import accumulate
 from typing import ClassVar, Final
 
 from companion.physics.units import G
-from companion.protocols.decoding.base import WAIT, Decoder, RejectedError, check_imu, check_vector
+from companion.protocols.decoding.base import Decoder, RejectedError, check_imu, check_vector
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
@@ -36,14 +36,11 @@ class MipDecoder(Decoder):
     START = re.compile(rb"\x75(?:\x65|\Z)")
 
     def _size(self, buffer: bytes, at: int) -> int:
-        if len(buffer) < at + 4:
-            return WAIT
-        size = 4 + buffer[at + 3] + 2
-        if len(buffer) < at + size:
-            return WAIT
-        if fletcher(buffer[at : at + size - 2]) != buffer[at + size - 2 : at + size]:
+        return 4 + buffer[at + 3] + 2
+
+    def _check(self, frame: bytes) -> None:
+        if fletcher(frame[:-2]) != frame[-2:]:
             raise RejectedError("checksum")
-        return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[2] != _SENSOR_DATA:

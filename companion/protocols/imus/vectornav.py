@@ -114,19 +114,18 @@ class VectorNavDecoder(SentenceDecoder):
     def _size(self, buffer: bytes, at: int) -> int:
         if buffer[at] != _SYNC:
             return super()._size(buffer, at)
-        available = len(buffer) - at
-        if available < 2:
+        groups = buffer[at + 1]
+        if groups == 0 or groups & ~_KNOWN_GROUPS:
+            raise RejectedError("unknown group")
+        end = at + 2 + 2 * groups.bit_count()
+        if end > len(buffer):
             return WAIT
-        header_bytes = _header_bytes(buffer[at + 1])
-        if available < header_bytes:
-            return WAIT
-        self._layout = layout_of(buffer[at : at + header_bytes])
-        size = self._layout[0].size + 2
-        if available < size:
-            return WAIT
-        if binascii.crc_hqx(buffer[at + 1 : at + size], 0) != 0:
+        self._layout = layout_of(buffer[at:end])
+        return self._layout[0].size + 2
+
+    def _check(self, frame: bytes) -> None:
+        if frame[0] == _SYNC and binascii.crc_hqx(frame[1:], 0) != 0:
             raise RejectedError("checksum")
-        return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[0] != _SYNC:
@@ -158,12 +157,6 @@ class VectorNavDecoder(SentenceDecoder):
         gyro_rad_s, accel_m_s2, temperature_degc = (gx, gy, gz), (ax, ay, az), next(iter(values[temperature]), None)
         check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
         return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc)]
-
-
-def _header_bytes(groups: int) -> int:
-    if groups == 0 or groups & ~_KNOWN_GROUPS:
-        raise RejectedError("unknown group")
-    return 2 + 2 * groups.bit_count()
 
 
 _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {

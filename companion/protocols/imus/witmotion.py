@@ -25,7 +25,7 @@ import struct
 from typing import Final
 
 from companion.physics.units import DEG, MG
-from companion.protocols.decoding.base import NO_FRAME, WAIT, Decoder, RejectedError
+from companion.protocols.decoding.base import NO_FRAME, Decoder, RejectedError
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
@@ -103,19 +103,10 @@ class WitMotionDecoder(Decoder):
 
 
 def _good(buffer: bytes, at: int) -> int:
-    """Return `FRAME_BYTES` where a frame begins, `NO_FRAME` or `WAIT`; raise RejectedError for a wrong sum."""
-    available = len(buffer) - at
-    if available < 1:
-        return WAIT
-    if buffer[at] != 0x55:
+    """Return `FRAME_BYTES` where a frame begins, or `NO_FRAME`; raise RejectedError for a wrong sum."""
+    if buffer[at] != 0x55 or not _FIRST_TYPE <= buffer[at + 1] <= _LAST_TYPE:
         return NO_FRAME
-    if available < 2:
-        return WAIT
-    if not _FIRST_TYPE <= buffer[at + 1] <= _LAST_TYPE:
-        return NO_FRAME
-    if available < FRAME_BYTES:
-        return WAIT
     last = at + FRAME_BYTES - 1
-    if sum(buffer[at:last]) & 0xFF != buffer[last]:
+    if buffer[last] != sum(buffer[at:last]) & 0xFF:
         raise RejectedError("checksum")
     return FRAME_BYTES

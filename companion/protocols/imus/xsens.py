@@ -18,7 +18,7 @@ import re
 import struct
 from typing import ClassVar, Final
 
-from companion.protocols.decoding.base import WAIT, Decoder, RejectedError, check_imu
+from companion.protocols.decoding.base import Decoder, RejectedError, check_imu
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
@@ -52,22 +52,16 @@ class XsensDecoder(Decoder):
         self._temperature_degc = None
 
     def _size(self, buffer: bytes, at: int) -> int:
-        available = len(buffer) - at
-        if available < 4:
-            return WAIT
-        size = 4 + buffer[at + 3] + 1
-        if buffer[at + 3] == _EXTENDED:
-            if available < 6:
-                return WAIT
-            length = int.from_bytes(buffer[at + 4 : at + 6], "big")
-            if length > MAX_DATA_BYTES:
-                raise RejectedError("too long")
-            size = 6 + length + 1
-        if available < size:
-            return WAIT
-        if sum(buffer[at + 1 : at + size]) & 0xFF:
+        if buffer[at + 3] != _EXTENDED:
+            return 4 + buffer[at + 3] + 1
+        length = buffer[at + 4] << 8 | buffer[at + 5]
+        if length > MAX_DATA_BYTES:
+            raise RejectedError("too long")
+        return 6 + length + 1
+
+    def _check(self, frame: bytes) -> None:
+        if sum(frame[1:]) & 0xFF:
             raise RejectedError("checksum")
-        return size
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[2] != _MT_DATA_2:

@@ -18,7 +18,7 @@ import functools
 import re
 from typing import Final
 
-from companion.protocols.decoding.base import ECHO, NO_FRAME, WAIT, Decoder, RejectedError
+from companion.protocols.decoding.base import ECHO, NO_FRAME, Decoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, Sample, TiltSample
 
@@ -42,20 +42,16 @@ class RionDecoder(Decoder):
     START = re.compile(b"\x68")
 
     def _size(self, buffer: bytes, at: int) -> int:
-        available = len(buffer) - at
-        if available < 2:
-            return WAIT
         length = buffer[at + 1]
-        if not 4 <= length < LONGEST or (available >= 4 and length not in _LENGTHS.get(buffer[at + 3], ())):
+        if not 4 <= length < LONGEST or length not in _LENGTHS.get(buffer[at + 3], ()):
             return NO_FRAME
-        if available <= length:
-            return WAIT
-        frame = buffer[at : at + 1 + length]
+        return 1 + length
+
+    def _check(self, frame: bytes) -> None:
         if sum(frame[1:-1]) & 0xFF != frame[-1]:
             raise RejectedError("checksum")
         if frame[3] == _ANSWER:
             _measurement(frame, 0.0)  # without angles it is rather no frame, with a sum that is right by chance
-        return 1 + length
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[3] != _ANSWER:
