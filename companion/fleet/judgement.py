@@ -217,16 +217,14 @@ def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[PartFinding]:
     return [PartFinding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
 
 
-class _Calibration(NamedTuple):
-    about: Any
-    """Row of `calibrations`."""
-    axes: list[Any]
-    """Rows of `biases` of one IMU: x, y, z."""
+_Calibration = tuple[Any, list[Any]]
+"""Row of `calibrations`, and the rows of `biases` of one IMU: x, y, z."""
 
-    def figures(self, name: str) -> list[float]:
-        """Give a figure of gyro x y z, accelerometer x y z."""
-        names = (f"gyro_{name}_rad_s", f"accel_{name}_m_s2")
-        return [np.nan if (value := getattr(row, each)) is None else value for each in names for row in self.axes]
+
+def _figures(calibration: _Calibration, name: str) -> list[float]:
+    """Give a figure of gyro x y z, accelerometer x y z."""
+    names = (f"gyro_{name}_rad_s", f"accel_{name}_m_s2")
+    return [np.nan if (value := getattr(row, each)) is None else value for each in names for row in calibration[1]]
 
 
 def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Row]]:
@@ -237,7 +235,7 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
     for key, about in done.items():
         for imu, rows in biases.get(key, {}).items():
             if len(rows) == 3:
-                imus.setdefault(imu, []).append(_Calibration(about, rows))
+                imus.setdefault(imu, []).append((about, rows))
     # The import is heavy, and most of the collector does without.
     from companion.autopilot.firmware.firmwares import model_of
 
@@ -246,7 +244,7 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
     found: _Found = []
     for imu, calibrations in sorted(imus.items()):
         history = _history(_power_ups(calibrations))
-        ids = calibrations[-1].axes[0]
+        ids = calibrations[-1][1][0]
         model = model_of(firmware, ids.gyro_id, ids.accel_id)
         about = {"aircraft": aircraft, "imu": imu, "model": model, "power_ups": len(history.at)}
         scatter = scatter_of_part(history.biases, history.temperature_degc)
@@ -316,14 +314,14 @@ def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
 
     Calibrations of one power-up must also agree, as a wrong clock could join many.
     """
-    ids = [(one.axes[0].gyro_id, one.axes[0].accel_id) for one in calibrations]
+    ids = [(axes[0].gyro_id, axes[0].accel_id) for _, axes in calibrations]
     others = [place for place, each in enumerate(ids) if each != ids[-1]]
     calibrations = calibrations[others[-1] + 1 if others else 0 :]
     found = calibrations[:1]
     for before, one in pairwise(calibrations):
-        read, use = (np.array([each.figures(name) for each in (before, one)]) for name in ("read", "sigma_use"))
+        read, use = (np.array([_figures(each, name) for each in (before, one)]) for name in ("read", "sigma_use"))
         off = np.nan_to_num(np.abs(read[1] - read[0]) / np.sqrt(np.square(use).sum(axis=0)))
-        if abs(one.about.started_at - before.about.started_at) < SAME_POWER_UP and (off < _AGREE_SIGMAS).all():
+        if abs(one[0].started_at - before[0].started_at) < SAME_POWER_UP and (off < _AGREE_SIGMAS).all():
             found.pop()
         found.append(one)
     return found
@@ -331,17 +329,17 @@ def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
 
 def _history(calibrations: Sequence[_Calibration]) -> PartHistory:
     biases, sigma_stat, sigma_use = (
-        np.array([one.figures(name) for one in calibrations]) for name in ("read", "sigma_stat", "sigma_use")
+        np.array([_figures(one, name) for one in calibrations]) for name in ("read", "sigma_stat", "sigma_use")
     )
-    samples = np.array([one.axes[0].samples or np.nan for one in calibrations], dtype=np.float64)
-    took_s = np.array([one.about.duration_s for one in calibrations])
+    samples = np.array([axes[0].samples or np.nan for _, axes in calibrations], dtype=np.float64)
+    took_s = np.array([about.duration_s for about, _ in calibrations])
     # Sample rate by the quickest of the calibrations before: the duration of others includes waiting.
     rate = samples / np.maximum(took_s, 1.0)
     rate = np.array([np.fmax.reduce(rate[max(k - 7, 0) : k + 1]) for k in range(len(rate))])
-    degc = np.array([one.axes[0].temperature_degc for one in calibrations], dtype=np.float64)
-    zeros = [one.about.zero_at for one in calibrations]
+    degc = np.array([axes[0].temperature_degc for _, axes in calibrations], dtype=np.float64)
+    zeros = [about.zero_at for about, _ in calibrations]
     return PartHistory(
-        at=[one.about.started_at for one in calibrations],
+        at=[about.started_at for about, _ in calibrations],
         temperature_degc=np.where(np.abs(degc) < MOST_DEGC, degc, np.nan),
         biases=biases,
         sigma_use=sigma_use,

@@ -316,7 +316,9 @@ def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
     if url.drivername == "sqlite":
         engine = sa.create_engine(url, connect_args={"timeout": _BUSY_S})
         sa.event.listen(engine, "connect", _prepare_sqlite)
-        sa.event.listen(engine, "begin", _begin_reading if reads_only else _begin_writing)
+        # SQLite refuses the first write of a transaction that began with a read when another has written meanwhile.
+        begin = "BEGIN" if reads_only else "BEGIN IMMEDIATE"
+        sa.event.listen(engine, "begin", lambda connection: connection.exec_driver_sql(begin))
         return engine
     return sa.create_engine(
         url,
@@ -330,17 +332,8 @@ def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
     )
 
 
-def _begin_reading(connection: sa.Connection) -> None:
-    connection.exec_driver_sql("BEGIN")
-
-
-def _begin_writing(connection: sa.Connection) -> None:
-    # SQLite refuses the first write of a transaction that began with a read when another has written meanwhile.
-    connection.exec_driver_sql("BEGIN IMMEDIATE")
-
-
 def _prepare_sqlite(connection: Any, _record: object) -> None:
-    connection.isolation_level = None  # `_begin_...` starts transactions
+    connection.isolation_level = None  # the listener to "begin" starts transactions
     connection.execute("PRAGMA journal_mode=WAL")
     # A confirmed item must survive a power cut.
     connection.execute("PRAGMA synchronous=FULL")

@@ -26,7 +26,7 @@ from companion.links.system.waiting import comes
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Daemon
 from companion.mqtt.fleet_sources import CurrentAircraft, Sources, utc
-from companion.storage.fleet_items import Clock, FleetItems, Kept, Mark, SourceItems, Waiting
+from companion.storage.fleet_items import Clock, FleetItems, Kept, Mark, Range, SourceItems, Waiting
 from companion.storage.state import UNREADABLE
 
 logger = logging.getLogger(__name__)
@@ -53,6 +53,7 @@ MOST_RANGES: Final = 256
 MOST_SEQUENCE: Final = 2**53
 
 _Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
+_Ranges = Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
 
 _ROUNDED: Final[dict[str, int]] = {
     "latitude_deg": 2,
@@ -238,21 +239,21 @@ class AircraftFleet:
             said = parse(message.payload)
             for kept in self._kept:
                 if said is not None and message.topic in _heard(kept.aircraft):
-                    await self._heed(kept.aircraft, said, confirmed=message.topic.endswith("/confirmed"))
+                    await self._heed(kept.aircraft, *said, confirmed=message.topic.endswith("/confirmed"))
         if heard:
             await self._count()
 
-    async def _heed(self, aircraft: str, said: Said, *, confirmed: bool) -> None:
+    async def _heed(self, aircraft: str, epoch: str, sequences: list[Range], *, confirmed: bool) -> None:
         if confirmed:
-            if await self._offload(self._items.confirm, aircraft, said.epoch, said.sequences, utc(utc_now())):
+            if await self._offload(self._items.confirm, aircraft, epoch, sequences, utc(utc_now())):
                 self._under_way -= {
                     (of, sequence)
                     for of, sequence in self._under_way
-                    if of == aircraft and any(first <= sequence <= last for first, last in said.sequences)
+                    if of == aircraft and any(first <= sequence <= last for first, last in sequences)
                 }
                 if self._wait_s > CONFIRMED_WITHIN_S:
                     self._begin_again()  # somebody is there again: in order, from the first
-        elif await self._offload(self._items.want, aircraft, said.epoch, said.sequences) and said.sequences:
+        elif await self._offload(self._items.want, aircraft, epoch, sequences) and sequences:
             self._begin_again()
         else:
             self._greeted[aircraft] = -1
@@ -327,20 +328,14 @@ def _heard(aircraft: str) -> tuple[str, str]:
 # --- payloads: docs/fleet/asyncapi.yaml
 
 
-class Said(msgspec.Struct, frozen=True):
-    """Sequences that a collector has, or wants."""
-
-    epoch: str
-    sequences: Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
-
-
-def parse(payload: bytes) -> Said | None:
-    """Read what a collector says; None: it is something else, or of a newer version. Never raises."""
+def parse(payload: bytes) -> tuple[str, list[Range]] | None:
+    """Return epoch and sequences that a collector has or wants; None: it says something else. Never raises."""
     try:
-        said: Said = decode(payload, Said, FORMAT_VERSION)
+        said = decode(payload, dict[str, Any], FORMAT_VERSION)
+        epoch, sequences = msgspec.convert((said.get("epoch"), said.get("sequences")), tuple[str, _Ranges])
     except UNREADABLE:
         return None
-    return said if all(first <= last for first, last in said.sequences) else None
+    return (epoch, sequences) if all(first <= last for first, last in sequences) else None
 
 
 def encode_item(waiting: Waiting, location: Location) -> bytes:

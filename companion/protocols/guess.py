@@ -16,7 +16,6 @@ ENOUGH_BYTES: Final = 1500
 
 _LEAST_FRAMES: Final = 2
 _SURE_FRAMES: Final = 4
-_MUCH_TEXT: Final = 0.9
 _CONSOLE: Final = re.compile(rb"\blogin: |\bPassword: |Linux version \d|\[ {0,4}\d+\.\d{6}\] |\bgetty\b")
 _MODEM: Final = re.compile(rb"(?:^|[\r\n])AT(?:[+&^$][A-Z]|[EZVI]\d?[\r\n])")
 _NOT_PLAIN: Final = bytes(byte for byte in range(256) if byte not in b"\t\r\n" and not 0x20 <= byte < 0x7F)
@@ -92,11 +91,6 @@ def strangers(data: bytes) -> str | None:
     if is_mavlink(data):
         return "MAVLink: an autopilot or its radio, which belongs into [mavlink]"
     return None
-
-
-def looks_garbled(data: bytes) -> bool:
-    """Return whether a line seems read at the wrong speed or parity: neither text nor known frames."""
-    return bool(data) and plain_share(data) < _MUCH_TEXT
 
 
 def plain_share(data: bytes) -> float:

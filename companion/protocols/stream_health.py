@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.guess import likeliest, looks_garbled, strangers
+from companion.protocols.guess import likeliest, plain_share, strangers
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 
 SILENT: Final = "silent"
@@ -38,6 +38,8 @@ _HARMLESS: Final = frozenset(
         "unknown sentence",
     }
 )
+_MUCH_TEXT: Final = 0.9
+"""Least share of plain text; a line with less is read at a wrong speed or parity."""
 _DAMAGED_SHARE: Final = 0.1
 _DAMAGED_FRAMES: Final = 3
 _MOST_DAMAGE_NAMED: Final = 3
@@ -135,7 +137,7 @@ class StreamHealth:
             return f"this is {found.protocol} ({' or '.join(found.kinds)})"
         if (stranger := strangers(self._tail)) is not None:
             return f"this is {stranger}"
-        if looks_garbled(self._tail):
+        if plain_share(self._tail) < _MUCH_TEXT:
             return "wrong baud or parity?"
         return ""
 

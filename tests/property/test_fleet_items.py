@@ -171,4 +171,4 @@ def test_a_newer_one_is_left_alone(tmp_path: Path) -> None:
 def test_any_bytes_from_the_wire_are_heeded_or_not_and_never_raise(payload: bytes) -> None:
     said = wire.parse(payload)
     if said is not None:
-        assert all(1 <= first <= last <= 2**53 for first, last in said.sequences)
+        assert all(1 <= first <= last <= 2**53 for first, last in said[1])

@@ -105,9 +105,15 @@ def words_of(error: OSError) -> str:
 async def connect_tcp(url: str, address: tuple[str, int]) -> int:
     """Connect to the first address of a host that answers and return the descriptor; raise LinkError with the cause."""
     host, port = address
+    loop = asyncio.get_running_loop()
+    reason = f"{url}: the host has no address"
     try:
         async with asyncio.timeout(CONNECT_DEADLINE_S):
-            return await connect(host, port)
+            for family, kind, protocol, _, found in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+                try:
+                    return await _connect(loop, socket.socket(family, kind, protocol), found)
+                except OSError as error:
+                    reason = f"{url}: {words_of(error)}"
     except TimeoutError:
         reason = f"{url}: no answer within {CONNECT_DEADLINE_S:g} s"
     except (socket.gaierror, UnicodeError) as error:
@@ -117,18 +123,6 @@ async def connect_tcp(url: str, address: tuple[str, int]) -> int:
     raise LinkError(reason)
 
 
-async def connect(host: str, port: int) -> int:
-    """Connect to the first address that answers; return the descriptor. Raise OSError or UnicodeError if none."""
-    loop = asyncio.get_running_loop()
-    failed = OSError("the host has no address")
-    for family, kind, protocol, _, found in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-        try:
-            return await _connect(loop, socket.socket(family, kind, protocol), found)
-        except OSError as error:
-            failed = error
-    raise failed
-
-
 async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, address: tuple[object, ...]) -> int:
     try:
         endpoint.settimeout(0)
@@ -136,14 +130,10 @@ async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, add
         # A peer that vanished without a word (power cut, Wi-Fi gone) is noticed within 5 + 3 * 2 s; and within 10 s
         # while something that we sent is not acknowledged, when no keepalive is sent.
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in (
-            ("TCP_KEEPIDLE", 5),
-            ("TCP_KEEPINTVL", 2),
-            ("TCP_KEEPCNT", 3),
-            ("TCP_USER_TIMEOUT", 10000),
-        ):
-            if hasattr(socket, option):
-                endpoint.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 10_000)
         await loop.sock_connect(endpoint, address)
         return endpoint.detach()
     except BaseException:
