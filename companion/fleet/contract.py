@@ -40,7 +40,7 @@ _Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
 _Object = dict[str, Any]
 _Imus = Annotated[list[_Object], msgspec.Meta(max_length=64)]
 _Words = list[Annotated[str, msgspec.Meta(max_length=16)]]
-_Keyed = TypeVar("_Keyed", "Hello", "Item")
+_Keyed = TypeVar("_Keyed", "Hello", "ReceivedItem")
 
 Row = dict[str, Any]
 Rows = dict[str, list[Row]]
@@ -62,7 +62,7 @@ class Hello(msgspec.Struct, frozen=True):
     at: str = ""
 
 
-class Item(msgspec.Struct, frozen=True):
+class ReceivedItem(msgspec.Struct, frozen=True):
     """Item of an aircraft; a newer format may change everything but its key."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
@@ -240,7 +240,7 @@ def read_hello(aircraft: str, payload: bytes) -> Hello:
     return _decode(aircraft, payload, Hello)
 
 
-def read_item(aircraft: str, payload: bytes) -> Item:
+def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
     """Parse the key of an item on that aircraft's topic, of any format.
 
     Raises:
@@ -248,10 +248,10 @@ def read_item(aircraft: str, payload: bytes) -> Item:
     """
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
-    return _decode(aircraft, payload, Item)
+    return _decode(aircraft, payload, ReceivedItem)
 
 
-def rows_of(item: Item) -> tuple[Row, Rows]:
+def rows_of(item: ReceivedItem) -> tuple[Row, Rows]:
     """Parse an item into its own columns and rows of other tables; `state` "unknown": a newer kind or format.
 
     Raises:
@@ -304,7 +304,7 @@ def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
     return told
 
 
-def _same(item: Item, rows: Rows) -> str:
+def _same(item: ReceivedItem, rows: Rows) -> str:
     """Hash everything that stays the same when an item is sent again under another epoch, so not `undone_at`."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
     if not rows:

@@ -20,8 +20,8 @@ from companion.fleet.contract import (
     FORMAT_VERSION,
     KINDS,
     Hello,
-    Item,
     NotTakenError,
+    ReceivedItem,
     Row,
     Rows,
     addressed,
@@ -303,7 +303,7 @@ def _refusal(error: sa.exc.SQLAlchemyError) -> str:
     return f"the database refuses it: {why(error)}"
 
 
-def _raw(item: Item, message: Incoming) -> Row:
+def _raw(item: ReceivedItem, message: Incoming) -> Row:
     return {"format_version": item.format_version, "payload": message.payload.decode(errors="replace")}
 
 

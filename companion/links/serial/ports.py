@@ -218,7 +218,15 @@ def port_faults(
     found = next((one for one in ports if one.device == device), None)
     holders = [] if found is None else [holder for holder in found.holders if holder.pid not in ours]
     faults = [*_console(device, found, holders, root)]
-    faults += [_second_reader(device, holder) for holder in holders if not _GETTY.fullmatch(holder.name)]
+    for holder in holders:
+        if holder.name == "ModemManager":
+            words = f"ModemManager (process {holder.pid}) has {device} open, and sends commands to it"
+            remedy = "sudo companion install-service (its udev rule), or: sudo systemctl disable --now ModemManager"
+            faults.append(PortFault(words, remedy))
+        elif not _GETTY.fullmatch(holder.name):
+            words = f"{holder.name} (process {holder.pid}) has {device} open too"
+            remedy = f"end it (sudo kill {holder.pid}), and what starts it"
+            faults.append(PortFault(f"{words}: each of two readers gets a part of the bytes", remedy))
     if found is None:
         return faults
     if found.latency_timer_ms is not None and found.latency_timer_ms > SLOW_TIMER_MS:
@@ -272,14 +280,3 @@ def _gettys_on(name: str, root: Path) -> Iterator[Holder]:
             words = (entry / "cmdline").read_bytes()[:4096].decode(errors="replace").split("\0")
             if any(word.removeprefix("/dev/") == name for word in words):
                 yield Holder(int(entry.name), comm)
-
-
-def _second_reader(device: str, holder: Holder) -> PortFault:
-    pid = holder.pid
-    if holder.name == "ModemManager":
-        return PortFault(
-            f"ModemManager (process {pid}) has {device} open, and sends commands to it",
-            "sudo companion install-service (its udev rule), or: sudo systemctl disable --now ModemManager",
-        )
-    words = f"{holder.name} (process {pid}) has {device} open too: each of two readers gets a part of the bytes"
-    return PortFault(words, f"end it (sudo kill {pid}), and what starts it")
