@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
 
 MEMORY_MIB: Final = 128
-"""The process needs 30 MiB, with the fleet 32 MiB."""
+"""The process needs 30 MiB, the fleet's part included."""
 FOUND_WITHIN_S: Final = 3.0
 """Wait this long for the autopilot's system id; without it the vehicle is number 1, as on MAVLink."""
 NEWS_WITHIN_S: Final = 1.0
