@@ -319,7 +319,8 @@ class MqttLink:
         self._trying = parcel.topic
         if self._tries > MOST_TRIES and len(parcel.payload) > LONG_BYTES:
             logger.warning(
-                "mqtt: %s: given up: %d bytes at %s, over which the connection ended %d times; set the broker's limit higher",
+                "mqtt: %s: given up: %d bytes at %s, over which the connection ended %d times;"
+                " set the broker's limit higher",
                 *(self.where, len(parcel.payload), parcel.topic, MOST_TRIES),
             )
             self.outbox.sent(parcel, given_up=True)
