@@ -224,9 +224,9 @@ def port_faults(
             remedy = "sudo companion install-service (its udev rule), or: sudo systemctl disable --now ModemManager"
             faults.append(PortFault(words, remedy))
         elif not _GETTY.fullmatch(holder.name):
-            words = f"{holder.name} (process {holder.pid}) has {device} open too"
-            remedy = f"end it (sudo kill {holder.pid}), and what starts it"
-            faults.append(PortFault(f"{words}: each of two readers gets a part of the bytes", remedy))
+            who = f"{holder.name} (process {holder.pid})"
+            words = f"{who} has {device} open too: each of two readers gets a part of the bytes"
+            faults.append(PortFault(words, f"end it (sudo kill {holder.pid}), and what starts it"))
     if found is None:
         return faults
     if found.latency_timer_ms is not None and found.latency_timer_ms > SLOW_TIMER_MS:
