@@ -1,4 +1,4 @@
-"""The command server of component 191: exactly one final COMMAND_ACK for each request; and who may ask for what.
+"""The command server of component 191: parses and checks requests, and sends one final COMMAND_ACK for each.
 
 A request is (sender's system, sender's component, command), because a COMMAND_ACK tells no more apart. Three kinds
 of repeat must be told apart too:
@@ -28,7 +28,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import __version__
 from companion.commands import Calibrate, Cancel, Undo
-from companion.component import requests
 from companion.component.service import AcceptedJob, CalibrationService, Refusal
 from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import Senders
@@ -61,6 +60,30 @@ _WORDS = {
 _NAMES: dict[type, str] = {Calibrate: "Calibration", Undo: "Undo", Cancel: "Cancel"}
 """Requests that need permission."""
 
+CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message
+
+
+class Key(NamedTuple):
+    """Identity of a request: a COMMAND_ACK names its requester and the command, nothing else."""
+
+    system_id: int
+    component_id: int
+    command: int
+
+
+class SendVersion(NamedTuple):
+    """A request for AUTOPILOT_VERSION."""
+
+
+class Refused(NamedTuple):
+    """A refusal: the MAV_RESULT and the reason."""
+
+    result: int
+    reason: str
+
+
+Request = Calibrate | Undo | Cancel | SendVersion
+
 
 class Permission:
     """Checks senders against `mavlink.allow`, counts refusals, and logs the first one of each sender."""
@@ -83,7 +106,7 @@ class Permission:
 
 
 class _Running(NamedTuple):
-    key: requests.Key
+    key: Key
     request: Calibrate | Undo
     job: AcceptedJob
 
@@ -113,7 +136,7 @@ class CommandServer:
         self._permission = permission
         self._running: _Running | None = None
         self._next_ack_s = 0.0
-        self._finals: OrderedDict[requests.Key, _Final] = OrderedDict()
+        self._finals: OrderedDict[Key, _Final] = OrderedDict()
         self._packets: deque[tuple[float, bytes]] = deque(maxlen=MAX_REMEMBERED)
         self._subscriptions = (
             link.subscribe(mavlink.MAVLink_command_long_message, self._on_message),
@@ -147,18 +170,18 @@ class CommandServer:
             self._finally(self._running.key, mavlink.MAV_RESULT_FAILED, now_s)
             self._running = None
 
-    def _on_message(self, message: requests.CommandMessage, now_s: float) -> None:
+    def _on_message(self, message: CommandMessage, now_s: float) -> None:
         if (message.target_system, message.target_component) != (self._link.system_id, self._link.component_id):
             return
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._link.system_id, self._link.component_id):
             return
         if message.command == mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
             return  # a verdict, not a job, and silence is one of its answers
-        command = requests.from_message(message)
-        request = self._permit(command, requests.judge(command))
-        copy = self._is_copy(command, now_s)
+        key = Key(message.get_srcSystem(), message.get_srcComponent(), message.command)
+        request = self._permit(key, judge(message))
+        copy = self._is_copy(bytes(message.get_msgbuf()), now_s)
         running = self._running
-        if running is not None and running.key == command.key and not isinstance(request, requests.Refused):
+        if running is not None and running.key == key and not isinstance(request, Refused):
             if request != running.request:
                 # Not by an ACK, which would be taken for the end of the running job.
                 before = running.request
@@ -168,43 +191,43 @@ class CommandServer:
             return
         if copy:
             return
-        final = self._finals.get(command.key)
-        if command.confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
+        final = self._finals.get(key)
+        # COMMAND_INT has no such field, and is always new.
+        confirmation = 0 if isinstance(message, mavlink.MAVLink_command_int_message) else message.confirmation
+        if confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
             # Remembered anew: this copy of the ACK may be lost as well.
-            self._finally(command.key, final.result, now_s, final.detail)
+            self._finally(key, final.result, now_s, final.detail)
             return
-        self._obey(command.key, request, now_s)
+        self._obey(key, request, now_s)
 
-    def _permit(
-        self, command: requests.ReceivedCommand, request: requests.Request | requests.Refused
-    ) -> requests.Request | requests.Refused:
+    def _permit(self, key: Key, request: Request | Refused) -> Request | Refused:
         """Return the request, or its refusal when the sender has no permission."""
         name = _NAMES.get(type(request))
         if name is None:
             return request
-        reason = self._permission.refuses((command.key.system_id, command.key.component_id), name.lower())
-        return requests.Refused(mavlink.MAV_RESULT_DENIED, f"{name} refused: {reason}") if reason else request
+        reason = self._permission.refuses((key.system_id, key.component_id), name.lower())
+        return Refused(mavlink.MAV_RESULT_DENIED, f"{name} refused: {reason}") if reason else request
 
-    def _is_copy(self, command: requests.ReceivedCommand, now_s: float) -> bool:
-        """Return whether the network delivered this packet before."""
+    def _is_copy(self, packet: bytes, now_s: float) -> bool:
+        """Return whether the network delivered this packet, sequence number included, before."""
         while self._packets and now_s - self._packets[0][0] > SAME_PACKET_S:
             self._packets.popleft()
-        if any(packet == command.packet for _, packet in self._packets):
+        if any(before == packet for _, before in self._packets):
             return True
-        self._packets.append((now_s, command.packet))
+        self._packets.append((now_s, packet))
         return False
 
-    def _obey(self, key: requests.Key, request: requests.Request | requests.Refused, now_s: float) -> None:
+    def _obey(self, key: Key, request: Request | Refused, now_s: float) -> None:
         try:
             match request:
                 case Calibrate() | Undo():
                     self._start(key, request, now_s)
                 case Cancel():
                     self._cancel(key, now_s)
-                case requests.SendVersion():
+                case SendVersion():
                     self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
                     self._link.send(autopilot_version())
-                case requests.Refused(result, reason):
+                case Refused(result, reason):
                     # Ground stations try out by themselves what a component supports: that is worth no warning.
                     unsupported = result == mavlink.MAV_RESULT_UNSUPPORTED
                     self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
@@ -213,7 +236,7 @@ class CommandServer:
             logger.exception("%s failed", name)
             self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
 
-    def _start(self, key: requests.Key, request: Calibrate | Undo, now_s: float) -> None:
+    def _start(self, key: Key, request: Calibrate | Undo, now_s: float) -> None:
         name = _NAMES[type(request)]
         if self._running is not None and self._running.job.finished.done():
             self.step(now_s)
@@ -238,7 +261,7 @@ class CommandServer:
         job.finished.add_done_callback(lambda _: self._wake())
         self._wake()
 
-    def _cancel(self, key: requests.Key, now_s: float) -> None:
+    def _cancel(self, key: Key, now_s: float) -> None:
         was_running = self._service.cancel(f"mavlink {key.system_id}/{key.component_id}")
         if not was_running:
             self._say(Severity.INFO, "Nothing to cancel", Weight.NEWS)
@@ -249,13 +272,11 @@ class CommandServer:
         self._running = None
         self._finally(running.key, _RESULTS[running.job.finished.result().outcome], now_s)
 
-    def _refuse(
-        self, key: requests.Key, result: int, reason: str, now_s: float, severity: Severity = Severity.WARNING
-    ) -> None:
+    def _refuse(self, key: Key, result: int, reason: str, now_s: float, severity: Severity = Severity.WARNING) -> None:
         self._say(severity, reason, Weight.REFUSAL)
         self._finally(key, result, now_s)
 
-    def _finally(self, key: requests.Key, result: int, now_s: float, detail: int = 0) -> None:
+    def _finally(self, key: Key, result: int, now_s: float, detail: int = 0) -> None:
         sent = self._acknowledge(key, result, detail=detail)
         self._finals[key] = _Final(result, detail, now_s, sent)
         self._finals.move_to_end(key)
@@ -278,7 +299,7 @@ class CommandServer:
         progress = min(max(int(running.job.progress_percent), 0), 100)
         self._acknowledge(running.key, mavlink.MAV_RESULT_IN_PROGRESS, progress)
 
-    def _acknowledge(self, key: requests.Key, result: int, progress: int = 0, detail: int = 0) -> bool:
+    def _acknowledge(self, key: Key, result: int, progress: int = 0, detail: int = 0) -> bool:
         return self._link.send(
             mavlink.MAVLink_command_ack_message(key.command, result, progress, detail, key.system_id, key.component_id)
         )
@@ -309,3 +330,63 @@ def encode_version(version: str) -> int:
     official = match is not None and match.end() == len(version)
     release_type = mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL if official else mavlink.FIRMWARE_VERSION_TYPE_DEV
     return major << 24 | minor << 16 | patch << 8 | release_type
+
+
+def judge(message: CommandMessage) -> Request | Refused:
+    """Return the request of a command. NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
+    if isinstance(message, mavlink.MAVLink_command_int_message):
+        last = float(message.x), float(message.y), message.z
+    else:
+        last = message.param5, message.param6, message.param7
+    parameters = message.param1, message.param2, message.param3, message.param4, *last
+    match message.command:
+        case mavlink.MAV_CMD_USER_1:
+            return _calibrate(parameters[0], parameters[1])
+        case mavlink.MAV_CMD_USER_2:
+            return Cancel()
+        case mavlink.MAV_CMD_USER_3:
+            return Undo()
+        case mavlink.MAV_CMD_PREFLIGHT_CALIBRATION:
+            return _preflight_calibration(parameters)
+        case mavlink.MAV_CMD_REQUEST_MESSAGE:
+            return _request_message(parameters[0])
+        case mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES if parameters[0] == 1:
+            return SendVersion()
+        case other:
+            return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Command {other} is not supported by the companion")
+
+
+def _calibrate(which: float, reboot: float) -> Calibrate | Refused:
+    # NaN stands for "not given" with some ground stations.
+    if reboot not in (0.0, 1.0) and not math.isnan(reboot):
+        return _denied(f"Calibration refused: param2 {reboot:g}, allowed 0, 1")
+    for what in What:
+        if which == what.value:
+            return Calibrate.of(what, reboot=reboot == 1.0)
+    return _denied(f"Calibration refused: param1 {which:g}, allowed 0, 1, 2")
+
+
+def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused:
+    """Parse MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers.
+
+    Mission Planner's button always sets param3, ground pressure, too: it is ignored beside gyros or accelerometers.
+    """
+    for number, value in enumerate(parameters, start=1):
+        if value != 0 and not (number in (1, 3, 5) and value == 1):
+            allowed = "0 or 1" if number in (1, 3, 5) else "0"
+            return _denied(f"Calibration refused: param{number} {value:g}, allowed {allowed}")
+    chosen = {(1, 1): What.BOTH, (1, 0): What.GYROS, (0, 1): What.ACCELEROMETERS}
+    what = chosen.get((int(parameters[0]), int(parameters[4])))
+    return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate.of(what)
+
+
+def _request_message(message_id: float) -> SendVersion | Refused:
+    if message_id == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+        return SendVersion()
+    if 0 <= message_id < 1 << 24 and message_id.is_integer():
+        return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {message_id:.0f} cannot be requested here")
+    return _denied(f"Message request refused: param1 {message_id:g}")
+
+
+def _denied(reason: str) -> Refused:
+    return Refused(mavlink.MAV_RESULT_DENIED, reason)

@@ -13,8 +13,7 @@ from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
-from companion.component.statustext import StatusText
-from companion.component.tunes import Tunes
+from companion.component.statustext import StatusText, Tunes
 from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
 

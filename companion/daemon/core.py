@@ -10,8 +10,7 @@ import msgspec
 
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.component.statustext import Severity, StatusText, Weight
-from companion.component.tunes import Tune, Tunes
+from companion.component.statustext import Severity, StatusText, Tune, Tunes, Weight
 from companion.config.sections import AtArm, Config
 from companion.configured import models
 from companion.configured.models import Profiles

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.commands import Calibrate, Cancel, Undo
-from companion.component import requests
+from companion.component.commands import CommandMessage, Refused, SendVersion, judge
 from companion.component.service import Refusal
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import (
@@ -229,12 +229,10 @@ def test_with_loss_a_press_never_starts_two_jobs_nor_ends_in_two_ways(block: int
 )
 def test_only_exact_parameters_start_something(command: int, parameters: list[float]) -> None:
     message = command_message(command, *parameters)
-    link, heard = MavlinkLink(system_id=9), list[requests.ReceivedCommand]()
-    link.subscribe(
-        mavlink.MAVLink_command_long_message, lambda received, _: heard.append(requests.from_message(received))
-    )
+    link, heard = MavlinkLink(system_id=9), list[CommandMessage]()
+    link.subscribe(mavlink.MAVLink_command_long_message, lambda received, _: heard.append(received))
     link.receive(Ground().pack(message), 0.0)
-    request = requests.judge(heard[0])
+    request = judge(heard[0])
     assert link.received["handler error"] == 0
     match request:
         case Calibrate() if command == CALIBRATE:
@@ -246,9 +244,9 @@ def test_only_exact_parameters_start_something(command: int, parameters: list[fl
             assert not any([parameters[1], parameters[3], *parameters[5:]])
         case Undo() | Cancel():
             assert command in (UNDO, CANCEL)
-        case requests.SendVersion():
+        case SendVersion():
             assert (command, parameters[0]) in ((512, 148), (520, 1))
-        case requests.Refused(result, reason):
+        case Refused(result, reason):
             assert result in (DENIED, UNSUPPORTED)
             assert reason
             assert (result == DENIED) == (

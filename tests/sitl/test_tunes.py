@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.tunes import APART_S, Tune
+from companion.component.statustext import TUNES_APART_S, Tune
 from sim.firmware.buzzer import notes_of
 from sim.sitl.px4 import Px4Sitl
 from tests.sitl.craft import Autopilot, Craft, DoubleCraft, SitlCraft
@@ -23,7 +23,7 @@ def test_a_tune_is_taken_without_a_complaint(autopilot: Autopilot, tune: Tune) -
             await craft.heartbeats()
             since_s = asyncio.get_running_loop().time()
             station.send(mavlink.MAVLink_play_tune_message(craft.ground.vehicle, 1, tune.value.encode(), b""))
-            await asyncio.sleep(APART_S)
+            await asyncio.sleep(TUNES_APART_S)
             await craft.heartbeats()
             assert "tune" not in craft.ground.texts_since(since_s).lower()
             if isinstance(craft, DoubleCraft):
@@ -50,7 +50,7 @@ async def played_last(instance: int) -> tuple[float, float]:
 
 @pytest.mark.only("px4")
 def test_px4_reads_on_in_a_new_tune_where_it_was_in_the_old_one(autopilot: Autopilot) -> None:
-    """Therefore `APART_S`: the notes are the new ones, from the third on, and their tempo is the old one."""
+    """Therefore `TUNES_APART_S`: the notes are the new ones, from the third on, and their tempo is the old one."""
     slow = "MFT32L1O4A"  # one note of 7.5 s
 
     async def main(craft: Craft) -> None:
@@ -58,7 +58,7 @@ def test_px4_reads_on_in_a_new_tune_where_it_was_in_the_old_one(autopilot: Autop
             await craft.heartbeats()
             for tune in (slow, Tune.DONE.value):
                 station.send(mavlink.MAVLink_play_tune_message(craft.ground.vehicle, 1, tune.encode(), b""))
-                await asyncio.sleep(APART_S)
+                await asyncio.sleep(TUNES_APART_S)
             if isinstance(craft, DoubleCraft):
                 assert craft.double.buzzer.broken_off == 1
             else:

@@ -13,8 +13,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.component.component import MavlinkComponent
 from companion.component.own_parameters import Parameter
 from companion.component.service import AcceptedJob, ArmAnswer, JobResult, Refusal
-from companion.component.statustext import StatusText
-from companion.component.tunes import Tunes
+from companion.component.statustext import StatusText, Tunes
 from companion.config.sections import EVERYBODY, Senders
 from companion.estimation.request import What
 from companion.links.mavlink.link import MavlinkLink
@@ -106,9 +105,14 @@ def command_message(
     if int_:
         x, y = int(p[4]), int(p[5])
         return mavlink.MAVLink_command_int_message(*target, 0, command, 0, 0, p[0], p[1], p[2], p[3], x, y, p[6])
-    return mavlink.MAVLink_command_long_message(
-        *target, command, confirmation, p[0], p[1], p[2], p[3], p[4], p[5], p[6]
-    )
+    return command_long(command, *p, target=target, confirmation=confirmation)
+
+
+def command_long(
+    command: int, *params: float, target: tuple[int, int] = (1, 191), confirmation: int = 0
+) -> mavlink.MAVLink_command_long_message:
+    p1, p2, p3, p4, p5, p6, p7 = params
+    return mavlink.MAVLink_command_long_message(*target, command, confirmation, p1, p2, p3, p4, p5, p6, p7)
 
 
 class ScriptedJob:

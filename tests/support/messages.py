@@ -44,7 +44,6 @@ NOT_FOR_PEOPLE = {
 ELSEWHERE = {
     "companion/config": "every line names file, key, what was found and what is allowed; one row tells so",
     "companion/commands.py": "help of the command line, and of a field what was found and what is allowed",
-    "companion/component/requests.py": "likewise, of a MAVLink command's parameters",
     "companion/installation": "printed by commands that are run at home, with what to do",
     "companion/cli/profile.py": "the table and its notes: docs/profiles.md",
     "companion/estimation/machine.py": "labels of the diagram in docs/calibration.md",

@@ -17,8 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.component.service import JobResult, Refusal
-from companion.component.statustext import Severity, Weight
-from companion.component.tunes import Tune
+from companion.component.statustext import Severity, Tune, Weight
 from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
 from companion.daemon.job import Job, JobCancelledError, Undone
 from companion.daemon.offsets.ledger import Ledger

@@ -18,8 +18,7 @@ from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.component.service import WRITTEN_PERCENT, JobResult
-from companion.component.statustext import Severity
-from companion.component.tunes import Tune
+from companion.component.statustext import Severity, Tune
 from companion.config.sections import Platform
 from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.core import Core

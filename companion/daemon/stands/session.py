@@ -20,8 +20,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.component.service import JobResult
-from companion.component.statustext import LINE_BYTES, Severity
-from companion.component.tunes import Tune
+from companion.component.statustext import LINE_BYTES, Severity, Tune
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job

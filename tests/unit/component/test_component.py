@@ -12,8 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.component.commands import encode_version
 from companion.component.component import MavlinkComponent
-from companion.component.statustext import Severity, StatusText
-from companion.component.tunes import Tunes
+from companion.component.statustext import Severity, StatusText, Tunes
 from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import CALIBRATE, Ground, ScriptedGate, ScriptedService, bench

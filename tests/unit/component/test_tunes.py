@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.component.tunes import APART_S, STALE_S, Tune, Tunes
+from companion.component.statustext import TUNE_STALE_S, TUNES_APART_S, Tune, Tunes
 from companion.links.mavlink.link import MavlinkLink
 from sim.firmware.buzzer import Played, notes_of
 from tests.support.component import Ground
@@ -65,7 +65,7 @@ async def test_it_is_sent_to_the_autopilot_at_once_and_the_next_when_the_first_i
     await bench.run(3.0)
     (first_s, first), (second_s, second) = bench.played
     assert (first, second) == (Tune.HOLD_STILL.value, Tune.WRONG.value)  # only the latest waits
-    assert second_s - first_s == pytest.approx(APART_S, abs=0.05)
+    assert second_s - first_s == pytest.approx(TUNES_APART_S, abs=0.05)
     targets = {
         (message.target_system, message.target_component)
         for _, message in bench.autopilot.received
@@ -100,7 +100,7 @@ async def test_one_that_had_to_wait_too_long_is_no_news() -> None:
     bench = Bench()
     await bench.run(1.0)
     bench.tunes.play(Tune.FAILED)
-    await asyncio.sleep(STALE_S)  # the loop of the component stood still
+    await asyncio.sleep(TUNE_STALE_S)  # the loop of the component stood still
     await bench.run(1.0)
     assert bench.played == []
 
@@ -118,7 +118,7 @@ async def test_one_that_had_to_wait_too_long_is_no_news() -> None:
 def test_the_notes_are_what_the_guide_says_and_short_and_shrill_enough(tune: Tune, heard: str) -> None:
     played = Played(0.0, notes_of(tune.value))
     assert str(played) == heard
-    assert played.seconds <= 1.2 < APART_S
+    assert played.seconds <= 1.2 < TUNES_APART_S
     assert len(tune.value) < 30, "PX4 and ArduPilot read on from the first field only where that is full"
     assert all(900.0 < note.frequency_hz < 5000.0 for note in played.notes if note.frequency_hz), "what a buzzer can"
 

@@ -11,8 +11,9 @@ from types import SimpleNamespace
 import pytest
 
 from companion.commands import Calibrate, Cancel, Undo
-from companion.component.requests import Key, ReceivedCommand, Refused, Request, judge
+from companion.component.commands import Refused, Request, judge
 from companion.estimation.request import What
+from tests.support.component import command_long
 
 SCRIPT = Path(__file__).parents[3] / "docs/ground_stations/mission_planner_companion.py"
 ACTIONS = Path(__file__).parents[3] / "docs/ground_stations/companion_actions.json"
@@ -31,8 +32,7 @@ def test_every_action_goes_to_the_companion_and_is_understood(action: dict[str, 
     assert action["compId"] == 191, "QGroundControl's default is the autopilot"
     command = action["mavCmd"]
     assert isinstance(command, int)
-    x1, x2, x3, x4, x5, x6, x7 = (float(str(action.get(f"param{n}", 0))) for n in range(1, 8))
-    asked = judge(ReceivedCommand(Key(255, 190, command), (x1, x2, x3, x4, x5, x6, x7), 0, b""))
+    asked = judge(command_long(command, *(float(str(action.get(f"param{n}", 0))) for n in range(1, 8))))
     assert not isinstance(asked, Refused), asked
 
 
@@ -84,8 +84,7 @@ def test_mission_planners_script_asks_the_companion_for_what_was_chosen(
     _run_script(SCRIPT.read_text().replace('DO = "calibrate"', f'DO = "{chosen}"'), planner, monkeypatch)
     ((system_id, component_id, command, *parameters),) = planner.sent
     assert (system_id, component_id) == (7, 191)
-    x1, x2, x3, x4, x5, x6, x7 = parameters
-    assert judge(ReceivedCommand(Key(255, 190, int(command)), (x1, x2, x3, x4, x5, x6, x7), 0, b"")) == expected
+    assert judge(command_long(int(command), *parameters)) == expected
 
 
 def test_mission_planners_script_is_python_2_too() -> None:
