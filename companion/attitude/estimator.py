@@ -37,8 +37,7 @@ from companion.attitude.quaternion import (
     shortest_arc,
     to_matrix,
 )
-from companion.attitude.strapdown import MotionStep, Strapdown
-from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD, Uncertainty
+from companion.attitude.strapdown import HEADING_UNKNOWN_RAD, MotionStep, Strapdown, Uncertainty
 from companion.config.sections import AllanModel
 from companion.physics.earth import earth_rate_ned_rad_s
 from companion.physics.frames import Matrix

@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.attitude.estimator import Attitude, AttitudeEstimator, AttitudeSettings, Phase
 from companion.attitude.quaternion import Quaternion, Triple, conjugate, from_matrix, multiply, rotate
-from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
+from companion.attitude.strapdown import HEADING_UNKNOWN_RAD
 from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.config.sections import Config, Imu

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from companion.attitude.quaternion import to_matrix
-from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
+from companion.attitude.strapdown import HEADING_UNKNOWN_RAD
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_bias
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.configured import models

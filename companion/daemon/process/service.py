@@ -17,7 +17,7 @@ from companion.daemon.faces.control import ControlServer
 from companion.daemon.faces.subsystem import Interfaces
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.offsets.subsystem import Offsets
-from companion.daemon.recorder.recorder import Recorder
+from companion.daemon.recorder import Recorder
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport

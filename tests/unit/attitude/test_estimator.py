@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from companion.attitude.estimator import Attitude, AttitudeEstimator, AttitudeSettings, Phase
-from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
+from companion.attitude.strapdown import HEADING_UNKNOWN_RAD
 from companion.estimation.noise.allan import noise_profile
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample

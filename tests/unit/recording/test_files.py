@@ -15,10 +15,9 @@ from mcap.reader import make_reader
 from companion.errors import StorageError
 from companion.estimation.solution.site import Whereabouts
 from companion.lab.logs.recording import Head, Recording
-from companion.recording import tape as tape_module
+from companion.recording import messages
 from companion.recording.files import RESERVE_BYTES, Beginning, RecordingFile, Ring
-from companion.recording.messages import PLACE, START, Message, decode, encode
-from companion.recording.tape import Tape
+from companion.recording.messages import PLACE, START, Message, Tape, decode, encode
 
 MB = 1 << 20
 
@@ -142,7 +141,7 @@ def test_the_disk_is_never_filled_to_the_brim_and_the_ring_gives_way_first(tmp_p
 def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tape_module, "MOST_MESSAGES", 50)
+    monkeypatch.setattr(messages, "MOST_MESSAGES", 50)
     tape = Tape()
     tape.begin(1000.0)
     file = RecordingFile(tmp_path / "a.mcap")

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.recording.tape import KeyFilter
+from companion.recording.messages import KeyFilter
 from tests.unit.links.test_mavlink_signing import KEY, peer
 
 SETUP = mavlink.MAVLink_setup_signing_message(1, 0, list(KEY), 2**40).pack(peer(None))

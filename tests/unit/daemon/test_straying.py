@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.attitude.straying import HeadingDriftMonitor
+from companion.daemon.heading.health import HeadingDriftMonitor
 
 HZ = 10.0
 

@@ -44,8 +44,7 @@ from companion.recording.files import (
     is_available,
     unused_path,
 )
-from companion.recording.messages import ImuState, Measured, Message, RawOutput, Solved
-from companion.recording.tape import KeyFilter, Tape
+from companion.recording.messages import ImuState, KeyFilter, Measured, Message, RawOutput, Solved, Tape
 
 logger = logging.getLogger(__name__)
 

@@ -1,1 +1,0 @@
-"""The recording of everything a calibration is made of."""
