@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from companion.config import parse
-from companion.daemon.faces.control import ControlServer
+from companion.daemon.interfaces.control import ControlServer
 from companion.daemon.process.service import Service
 from companion.estimation.machine import Event, State
 from companion.links.mavlink.link import MavlinkLink

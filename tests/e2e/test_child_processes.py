@@ -12,8 +12,8 @@ from typing import Final, Self
 
 import pytest
 
-from companion.daemon.faces.child import Child
-from companion.daemon.faces.control import ControlServer
+from companion.daemon.interfaces.child import Child
+from companion.daemon.interfaces.control import ControlServer
 from companion.daemon.job import Job
 from companion.estimation.machine import State
 from companion.estimation.request import What

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.daemon.faces.child import Child
+from companion.daemon.interfaces.child import Child
 from companion.estimation.machine import State
 from tests.e2e.test_child_processes import beside, calibrated, rig_of
 from tests.support.page import parsed

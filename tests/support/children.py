@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Callable
 
-from companion.daemon.faces.child import Child, StartChild
+from companion.daemon.interfaces.child import Child, StartChild
 from companion.daemon.process.service import Service
 from companion.errors import CompanionError, RequestRefusedError
 from companion.formats import Object

@@ -47,7 +47,7 @@ ELSEWHERE = {
     "companion/installation": "printed by commands that are run at home, with what to do",
     "companion/cli/profile.py": "the table and its notes: docs/profiles.md",
     "companion/estimation/machine.py": "labels of the diagram in docs/calibration.md",
-    "companion/daemon/faces/headline.py": "the big word of page and monitor: docs/page.md has each",
+    "companion/daemon/interfaces/headline.py": "the big word of page and monitor: docs/page.md has each",
     "companion/cli/monitor.py": "the frame of the monitor: docs/page.md",
     "companion/ground": "printed on the ground laptop, each with what to do: docs/ground_stations.md",
     "companion/report": "labels of pages; why none can be made: docs/report.md",

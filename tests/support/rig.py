@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from companion.config import parse
 from companion.daemon.core import Offload
-from companion.daemon.faces.child import StartChild
+from companion.daemon.interfaces.child import StartChild
 from companion.daemon.process.service import Service
 from companion.links.mavlink.link import MavlinkLink
 from sim.aircraft import Pose, Site, VirtualAircraft

@@ -1,6 +1,6 @@
 """The active calibration of each IMU, its age, and the findings against it.
 
-Three inputs: calibrations that end, the offsets that the autopilot reports (`offset_watch`), and the output in the
+Three inputs: calibrations that end, the offsets that the autopilot reports (`OffsetWatch`), and the output in the
 rolling window. A result that contradicts earlier ones and that nobody requested is held back: the active calibration
 and the gate stay as they are, until somebody requests a calibration or the output changes again.
 """
@@ -20,11 +20,10 @@ import numpy as np
 from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.component.service import JobResult
 from companion.configured import models
-from companion.daemon.arming.offset_watch import OffsetWatch
 from companion.daemon.calibrating.run import CalibrationRun, Key, in_short
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.autopilot_imu import AutopilotImu, OffsetWatch
 from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
 from companion.estimation.noise.allan import noise_profile

@@ -1,7 +1,7 @@
 """The answer to an arming request with its reason, prepared four times a second.
 
 PX4 waits for it with its commander thread stopped (autopilots 5.2): nothing may be computed, read or awaited then.
-`Readiness._judge` lists the reasons for a closed gate in the order in which they are reported.
+`Readiness._judge` lists the reasons for a closed gate in the order in which they are reported, also without a gate.
 """
 
 from __future__ import annotations
@@ -132,12 +132,7 @@ class Readiness:
         now_s = asyncio.get_running_loop().time()
         self.in_force.poll(writing=self._writing)
         if self.at_arm == "gate":
-            self._answer = self._judge(now_s)
-            if self._on_deck and self._answer.hold_still_s is not None:
-                # Nobody can hold a deck still.
-                status = self._collector.status(now_s)
-                meanwhile = "" if self._answer.meanwhile == BY_ITSELF else self._answer.meanwhile
-                self._answer = ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
+            self._answer = self.judge(now_s)
         else:
             # No gate; the answer names the state in which it would arm.
             state, words = self.state(now_s)
@@ -149,11 +144,20 @@ class Readiness:
         """Return whether a job runs, or an interrupted write is being restored."""
         return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
+    def judge(self, now_s: float) -> ArmAnswer:
+        """Return the answer of a gate at this moment, whether there is one or not."""
+        answer = self._judge(now_s)
+        if not self._on_deck or answer.hold_still_s is None:
+            return answer
+        # Nobody can hold a deck still.
+        status, meanwhile = self._collector.status(now_s), "" if answer.meanwhile == BY_ITSELF else answer.meanwhile
+        return ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
+
     def _judge(self, now_s: float) -> ArmAnswer:
         if (unmet := self._manager.blocking_reason(_NEEDED)) is not None:
             wait = _WAITS.get(unmet[0])
             return ArmAnswer("refuse", unmet[1]) if wait is None else ArmAnswer("wait", wait)
-        if not self._wanted.push:
+        if self.at_arm == "gate" and not self._wanted.push:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         if self._manager.state.is_writing:
             return self._during_write(now_s)
@@ -162,12 +166,13 @@ class Readiness:
             return ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
             return ArmAnswer("wait", reading)
-        if (checked := self.looked_at(now_s)) is not None:
-            return checked
         if findings := self.in_force.findings(now_s):
+            if not self.in_force.measured and all(finding.why in _CHECKED_NEXT for finding in findings):
+                left_s = self._wanted.settings.min_still_s + 1.0 - glance.still_s
+                return ArmAnswer.hold_still(left_s, _CHECKED_NEXT[findings[0].why])
             remedy = self._automatic.why_not()
             if remedy is None:
-                return ArmAnswer.hold_still(self.until_calibrated_s(now_s), BY_ITSELF)
+                return ArmAnswer.hold_still(self._until_calibrated_s(now_s), BY_ITSELF)
             return ArmAnswer("refuse", f"{findings[0].words}: {remedy}")
         if self.owed is not None:
             return ArmAnswer("refuse", self.owed)
@@ -177,15 +182,7 @@ class Readiness:
 
     # --- how long yet
 
-    def looked_at(self, now_s: float) -> ArmAnswer | None:
-        """Return the time to hold still, where the next still window settles every finding; else None."""
-        findings = self.in_force.findings(now_s)
-        if not findings or self.in_force.measured or any(finding.why not in _CHECKED_NEXT for finding in findings):
-            return None
-        left_s = self._wanted.settings.min_still_s + 1.0 - self._collector.glance(now_s).still_s
-        return ArmAnswer.hold_still(left_s, _CHECKED_NEXT[findings[0].why])
-
-    def until_calibrated_s(self, now_s: float) -> float:
+    def _until_calibrated_s(self, now_s: float) -> float:
         """Return the seconds of holding still until an automatic calibration would be active."""
         status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
         if status.enough:

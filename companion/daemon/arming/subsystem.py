@@ -48,7 +48,6 @@ class Armings:
         self.last: ArmingRecord | None = None
         self.seen_disarmed = False
         """False: the daemon may have started in flight."""
-        core.vehicle.on_event.add(self._on_event)
 
     async def run(self) -> None:
         """Save every arming until cancelled, and then those still queued."""
@@ -64,10 +63,8 @@ class Armings:
                 with contextlib.suppress(StorageError):
                     self._file.append(self._queue.get_nowait())
 
-    def _on_event(self, event: VehicleEvent) -> None:
-        self.seen_disarmed |= event == "disarmed"
-        if event != "armed" or not self.seen_disarmed:
-            return  # a daemon that starts in flight sees no arming
+    def add(self) -> None:
+        """Report and record an arming that was just seen."""
         readiness, in_force = self._readiness, self._readiness.in_force
         now_s = asyncio.get_running_loop().time()
         state, words = readiness.state(now_s)
@@ -104,7 +101,6 @@ class GateSetup:
         self.problem: str | None = None
         """Missing settings, for people; None while complete or not known."""
         self.known = False
-        core.vehicle.on_event.add(self._on_event)
         core.parameters.on_value.add(self._on_parameter)
 
     async def run(self) -> None:
@@ -130,15 +126,14 @@ class GateSetup:
                 self._core.say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
             self._said = self.problem
 
-    def _on_event(self, event: VehicleEvent) -> None:
-        if event in ("found", "rebooted"):
-            self.known = False
-            self._stale.set()
+    def check_again(self) -> None:
+        """Check again, as the autopilot has started or a setting has changed."""
+        self.known = False
+        self._stale.set()
 
-    def _on_parameter(self, name: str, value: float) -> None:
+    def _on_parameter(self, name: str, _value: float) -> None:
         if self.known and name in self._vehicle.kind.gate_parameters:
-            self.known = False
-            self._stale.set()
+            self.check_again()
 
 
 class Arming(Subsystem):
@@ -156,6 +151,16 @@ class Arming(Subsystem):
         self.readiness = Readiness(core, offsets.owed, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core)
+        core.vehicle.on_event.add(self._on_event)
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        match event:
+            case "found" | "rebooted":
+                self.gate_setup.check_again()
+            case "disarmed":
+                self.armings.seen_disarmed = True
+            case "armed" if self.armings.seen_disarmed:  # a daemon that starts in flight sees no arming
+                self.armings.add()
 
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"history": self._answer_history}

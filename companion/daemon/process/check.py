@@ -16,7 +16,7 @@ import msgspec
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.config.sections import UNKNOWN, Config, Imu
 from companion.configured.models import SerialDevice, baud_of, cannot_work, doubtful, serial_devices
-from companion.daemon.faces.control import process_behind
+from companion.daemon.interfaces.control import process_behind
 from companion.daemon.process.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object

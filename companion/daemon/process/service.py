@@ -13,9 +13,9 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Offload, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.faces.control import ControlServer
-from companion.daemon.faces.subsystem import Interfaces
 from companion.daemon.heading.subsystem import Heading
+from companion.daemon.interfaces.control import ControlServer
+from companion.daemon.interfaces.subsystem import Interfaces
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder import Recorder
 from companion.formats import Object
@@ -24,7 +24,7 @@ from companion.links.mavlink.transport import run_transport
 from companion.storage.state import only_daemon
 
 if TYPE_CHECKING:
-    from companion.daemon.faces.child import StartChild
+    from companion.daemon.interfaces.child import StartChild
 
 logger = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""A child process of the daemon (`companion.daemon.faces.child`): how it starts, reports and ends.
+"""A child process of the daemon (`companion.daemon.interfaces.child`): how it starts, reports and ends.
 
 It reads its settings from stdin, one line of JSON, and ends when stdin ends. It writes its status to stdout, one JSON
 object a line, at least every `REPORT_EVERY_S`, and its log to the daemon's stderr.

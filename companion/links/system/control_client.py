@@ -1,6 +1,6 @@
 """Client side of the control socket: one request a connection, one JSON object a line.
 
-The server is `companion.daemon.faces.control`. The command line and the daemon's own child processes are its clients.
+The server is `daemon/interfaces/control.py`. The command line and the daemon's own child processes are its clients.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ import msgspec
 import pytest
 
 from companion.config import parse
-from companion.daemon.faces import child as daemon_side
-from companion.daemon.faces.child import Child
+from companion.daemon.interfaces import child as daemon_side
+from companion.daemon.interfaces.child import Child
 from companion.links.system.child import ChildSettings
 
 MODULE = "tests.support.child_process"

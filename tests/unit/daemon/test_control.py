@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.daemon.faces import control
-from companion.daemon.faces.control import ControlServer
+from companion.daemon.interfaces import control
+from companion.daemon.interfaces.control import ControlServer
 from companion.errors import CalibrationRefusedError, LinkError
 from companion.formats import Object
 from companion.links.system import control_client

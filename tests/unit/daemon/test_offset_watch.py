@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import pytest
 
 from companion.component.service import JobResult
-from companion.daemon.arming.offset_watch import OffsetWatch
+from companion.daemon.devices.autopilot_imu import OffsetWatch
 from companion.estimation.records.validity import Why
 
 

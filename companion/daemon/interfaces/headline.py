@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Final, Literal
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.daemon.arming.readiness import BY_ITSELF
+from companion.component.service import ArmAnswer
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
@@ -35,7 +35,6 @@ class Headlines:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
         self._devices, self._attitude = devices, attitude
-        self._on_deck = core.config.vehicle.platform == "deck"
 
     def now(self) -> Object:
         """Return the headline of this moment."""
@@ -74,10 +73,10 @@ class Headlines:
         if unmet is not None:
             return "TWO COMPANIONS", reason, "bad"
         if self._readiness.at_arm == "gate":
-            return self._gate()
+            return self._by_answer(self._readiness.answer())
         if state != "uncalibrated":
             return "READY", words, "good"
-        return self._uncalibrated(words, now_s)
+        return self._uncalibrated(words, self._readiness.judge(now_s))
 
     def _no_autopilot(self) -> Headline:
         age_s = self._vehicle.heartbeat_age_s
@@ -108,8 +107,7 @@ class Headlines:
             return "HOLD STILL", words, "wait"
         return "WAITING", words, "wait"
 
-    def _gate(self) -> Headline:
-        answer = self._readiness.answer()
+    def _by_answer(self, answer: ArmAnswer) -> Headline:
         if answer.verdict == "accept":
             return "READY", answer.words, "good"
         if answer.hold_still_s is not None:
@@ -118,30 +116,17 @@ class Headlines:
             return "WAIT", answer.words.removeprefix("wait: "), "wait"
         return self._failed() or ("NOT READY", answer.words, "bad")
 
-    def _uncalibrated(self, words: str, now_s: float) -> Headline:
-        if (reading := self._readiness.in_force.reading()) is not None:
-            return "WAIT", reading, "wait"
-        if (looked_at := self._readiness.looked_at(now_s)) is not None and looked_at.hold_still_s is not None:
-            return _hold_still(looked_at.hold_still_s, looked_at.meanwhile)
+    def _uncalibrated(self, words: str, answer: ArmAnswer) -> Headline:
+        if answer.verdict == "wait":
+            return self._by_answer(answer)
         if words == self._readiness.owed:
             return "NOT READY", words, "bad"
-        if self._readiness.in_force.held_back is not None:
-            return self._failed() or ("NOT CALIBRATED", words, "bad")
-        todo = self._automatic.why_not()
-        if todo is not None:
-            return self._failed() or ("NOT CALIBRATED", f"{words}: {todo}" if todo != words else words, "bad")
-        glance = self._collector.glance(now_s)
-        if glance.obstacle is not None and not glance.moving:
+        held_back, todo = self._readiness.in_force.held_back, self._automatic.why_not()
+        if held_back is None and todo is None:
             # The sensor's own trouble says what to do; that nothing comes from it is only what follows.
-            return "NOT CALIBRATED", self._devices.watch.worst() or glance.obstacle.words, "bad"
-        if glance.obstacle is not None:
-            if (hold_s := glance.obstacle.hold_still_s) is not None:
-                return _hold_still(hold_s)
-            return "HOLD STILL", glance.obstacle.words, "wait"
-        if self._on_deck:
-            return "WAIT", f"{words}: {self._collector.status(now_s).measuring}", "wait"
-        left_s = self._readiness.until_calibrated_s(now_s)
-        return f"HOLD STILL {left_s:.0f} s", f"{words}: {BY_ITSELF}", "wait"
+            return "NOT CALIBRATED", self._devices.watch.worst() or answer.words, "bad"
+        words = words if held_back is not None or todo == words else f"{words}: {todo}"
+        return self._failed() or ("NOT CALIBRATED", words, "bad")
 
     def _failed(self) -> Headline | None:
         return ("FAILED", self._manager.reason, "bad") if self._manager.state is State.FAILED else None

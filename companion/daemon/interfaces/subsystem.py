@@ -21,8 +21,8 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, RuntimeSettings, Subsystem, Task, joined
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
+from companion.daemon.interfaces.headline import Headlines
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError, ConfigError
@@ -32,7 +32,7 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
 if TYPE_CHECKING:
-    from companion.daemon.faces.child import Child, StartChild
+    from companion.daemon.interfaces.child import Child, StartChild
 
 
 LARGEST: Final = 1e6
@@ -82,7 +82,7 @@ class Interfaces(Subsystem):
 
     def _child(self, name: str, module: str) -> Child:
         # Imported here: the start is shorter without.
-        from companion.daemon.faces.child import Child
+        from companion.daemon.interfaces.child import Child
         from companion.links.system.child import ChildSettings
 
         level = logging.getLevelName(logging.getLogger().level)
