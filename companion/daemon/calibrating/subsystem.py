@@ -21,10 +21,9 @@ from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undone
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition, ByHand
-from companion.daemon.stands.all_sides import SidesTask
 from companion.daemon.stands.measuring import Estimator, Measuring
-from companion.daemon.stands.on_spot import TurnTask, ZeroTask
 from companion.daemon.stands.session import PoseSession, PoseTask
+from companion.daemon.stands.tasks import SidesTask, TurnTask, ZeroTask
 from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest

@@ -48,11 +48,8 @@ class ActiveAlignment:
         self._gradienter, self._offload = config.gradienter, offload
         self._store = alignment_in(config.storage.path)
         self.record: AlignmentRecord | None = None
-        """The stored alignment, used or not."""
         self.unused: str | None = None
-        """Reason in one line why the stored alignment is not used, if so."""
         self.on_change: Listeners[[]] = Listeners()
-        """Notified when another zero becomes active."""
 
     def load(self) -> None:
         """Load the stored alignment; blocking."""

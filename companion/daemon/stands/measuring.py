@@ -34,9 +34,7 @@ SAY_WAITING_EVERY_S: Final = 10.0
 SAY_LEFT_EVERY_S: Final = 75.0
 """Interval of messages while it measures; the first minute of a deck has none."""
 READ_ATTEMPTS: Final = 2
-"""Failed reads of the autopilot's offsets that end a calibration."""
 MOST_UPSETS: Final = 5
-"""Changes of the offsets or restarts of the autopilot that end a calibration."""
 
 
 class Measuring:
@@ -48,7 +46,6 @@ class Measuring:
         """Number of upsets before this calibration, by IMU."""
         self._said, self._said_s = "", -math.inf
         self.on_measured: Listeners[Window] = Listeners()
-        """Notified of every window at once."""
 
     def begin(self) -> None:
         """Start a calibration, which may measure more than once."""

@@ -78,7 +78,6 @@ class SessionState:
     objection: str = ""
     """Fault of the latest stand, if it was not the one asked for."""
     share: float = 0.0
-    """Progress of the stand, 0 to 1."""
     since_s: float = 0.0
     """Time since which it has not moved."""
     moved: bool = False
@@ -128,7 +127,6 @@ class PoseTask(abc.ABC):
     if_armed: ClassVar[str | None] = None
     """Why it fails when the aircraft arms; None: it goes on once disarmed."""
     total: int
-    """Number of poses, about."""
     fit_from: int
     """Number of poses from which the estimate is made, after each."""
     board: Mounting | None = None
@@ -175,7 +173,6 @@ class PoseSession:
         self._imus, self._measuring, self._writes = imus, measuring, writes
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
         self.state: SessionState | None = None
-        """The latest alignment; None before the first."""
 
     async def run(self, job: Job, request: AlignmentRequest, task: PoseTask) -> str:
         """Measure all poses, estimate, write and keep; returns the result in one line.
@@ -254,13 +251,11 @@ class PoseSession:
             # A stand that only has to go on is measured, and shown so, from its first second on.
             standing = state.moved and (waiting_for is None or hold_still_s is not None)
             state.share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
-            if not state.moved:
-                words = f"{state.objection or wish.words}; waiting for it to move"
-            elif not standing:
-                turned = self._turned(state, now_s) if moving else ""
-                words = f"{state.objection or wish.words}; {turned or waiting_for}"
+            turned = self._turned(state, now_s) if moving or standing else ""
+            if not standing:
+                reason = turned or waiting_for if state.moved else "waiting for it to move"
+                words = f"{state.objection or wish.words}; {reason}"
             else:
-                turned = self._turned(state, now_s)
                 words = f"measuring, {max(state.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
                 words += f" ({turned})" if turned else ""
                 if not state.hold_still_said:

@@ -152,6 +152,5 @@ def _angle_deg(one: Array, other: Array) -> float:
 
 
 def _follows(before: Array, after: Array, turn: Matrix) -> bool:
-    """Verify that up has turned nearly as predicted."""
     wanted = turn @ before
     return _angle_deg(after, wanted) < max(SEEN_DEG, SEEN_SHARE * _angle_deg(before, wanted))

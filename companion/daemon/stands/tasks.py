@@ -1,14 +1,18 @@
-"""Alignments that turn the aircraft on one spot: the gradienter's zero (and tilts), and level without one."""
+"""Kinds of alignment: on one spot the gradienter's zero (and tilts), or level without one; on all sides accelerometers.
+
+On all sides (`SidesTask`) needs neither a gradienter nor a level spot: bias and scale follow from stands in any
+orientation. After each stand it says what is still unknown, and ends by itself.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar, Final
 
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import changes_for, whole_bias
+from companion.autopilot.firmware.imu_calibration import changes_for, whole_accelerometer, whole_bias
 from companion.autopilot.parameters.change import Change
 from companion.configured import models
 from companion.daemon.core import Core
@@ -19,11 +23,13 @@ from companion.daemon.stands.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
 from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
-from companion.estimation.alignment.faces import mounting
+from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, mounting, seen_before
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
+    LEVEL,
     AlignmentRequest,
     HeldPose,
+    Hold,
     Wish,
     asked_turn_deg,
     objection,
@@ -33,11 +39,14 @@ from companion.estimation.means.pose import CompassModel, up_in_vehicle, vehicle
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.align_record import (
     AlignmentRecord,
+    FaceRecord,
+    FacesRecord,
     HandRecord,
     StandRecord,
     TurnImuRecord,
     TurnRecord,
     board_record,
+    faces_imu_record,
     imu_record,
     stand_record,
     turn_imu_record,
@@ -47,7 +56,6 @@ from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
 
 LEAST_STANDS: Final = 3
-"""Stands from which a zero can be estimated."""
 READING_SIGMA_DEG: Final = 0.005
 """Noise of one mean of a gradienter (table in method 3.4)."""
 SLOPE_WARNING_DEG: Final = 1.5
@@ -62,7 +70,6 @@ class SpotTask(PoseTask):
     result: Alignment
     stands: Sequence[StandMeans] = ()
     zero_deg: tuple[float, float] = (0.0, 0.0)
-    """Zero of the gradienter in the configuration."""
 
     def __init__(self, core: Core, request: AlignmentRequest) -> None:
         self._core, self._request = core, request
@@ -155,7 +162,6 @@ class ZeroTask(SpotTask):
         return []
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:  # noqa: D102
-        del local
         windows = state.windows
         result, settings, tilt = self.result, self._kept.settings(), windows[0].tilt
         assert settings is not None
@@ -293,3 +299,118 @@ def _level_sigma_m_s2(found: Alignment) -> float:
 
 def _temperatures(window: Window) -> dict[str, float | None]:
     return {imu.name: imu.temperature_degc for imu in window.imus}
+
+
+EXPECTED: Final = 12
+"""Usual number of stands."""
+MOST: Final = 24
+_FIRST: Final = Wish("any side down, propped up, hands off", Hold(LEVEL))
+
+
+class SidesTask(PoseTask):
+    """Accelerometers held on all sides."""
+
+    def __init__(self, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], kept: ActiveSixPosition) -> None:
+        self._request, self._imus, self._kept = request, imus, kept
+        self.total, self.fit_from = EXPECTED, 1
+        self._by_imu: dict[str, FacesEstimate] = {}
+        self._missing: Wish | None = _FIRST
+
+    def wish(self, state: SessionState) -> Wish | None:  # noqa: D102 - as in the base class
+        return self._missing if len(state.poses) < MOST else None
+
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
+        pose = HeldPose(np.array(now.imus[0].accel_m_s2))
+        imu = next((imu for imu in now.imus if imu.name in self._by_imu), None)
+        if imu is None or self._missing is None:
+            return pose, None
+        found = self._by_imu[imu.name]
+        up = self._face(imu).accel_m_s2 - found.figures[BIAS]
+        again = seen_before(found, up / np.linalg.norm(up), self._imus[imu.name].in_force.orientation)
+        return pose, None if again is None else f"it stands as in stand {again + 1}: {self._missing.words}"
+
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
+        before, self._by_imu, self._missing = self._by_imu, {}, None
+        for name in readable(state.windows, among=self._imus):
+            if (calibration := self._imus[name].calibration) is None:
+                continue
+            means = [imu for window in state.windows for imu in window.imus if imu.name == name]
+            sigmas = np.array([(imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2) for imu in means])
+            # One sigma of the change of the bias in the next minutes.
+            wander = np.median(np.sqrt(np.maximum(sigmas[:, 0] ** 2 - sigmas[:, 1] ** 2, 0.0)), axis=0)
+            found = faces([self._face(one) for one in means], local.gravity_m_s2, local.gravity_sigma_m_s2, wander)
+            self._by_imu[name] = found
+            self._missing = self._missing or missing(found, calibration.orientation)
+        if not self._by_imu:
+            raise CalibrationRefusedError("no IMU whose accelerometers can be read")
+        return [
+            f"Stand {stand + 1} is left out: it is {float(found.off_m_s2[stand]) / MG:+.1f} mg off"
+            for name, found in self._by_imu.items()
+            for stand in set(found.left_out) - set(before[name].left_out if name in before else ())
+        ]
+
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> FacesRecord:  # noqa: D102
+        if self._missing is not None:
+            self.shortfall = f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
+            log.warnings.append(self.shortfall)
+        elif self._request.write:
+            log.warnings += self._scales_left()
+        first = next(iter(self._by_imu))
+        ups = self._by_imu[first].up @ self._imus[first].in_force.orientation.T
+        degrees = _temperatures(state.windows[-1])
+        return FacesRecord(
+            measured_at=log.started,
+            gravity_m_s2=local.gravity_m_s2,
+            stands=tuple(
+                FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
+                for up, window in zip(ups, state.windows, strict=True)
+            ),
+            imus=tuple(
+                faces_imu_record(
+                    found,
+                    name=name,
+                    accel_id=calibration.accel_id,
+                    corrections=calibration.corrections,
+                    temperature_degc=degrees.get(name),
+                    running=self._kept.running(name),
+                    # Bias without any offset, in the sensor's own scale, as an offset corrects it.
+                    whole_m_s2=np.asarray(calibration.accel_offset_m_s2) + found.figures[BIAS] / calibration.in_use(),
+                )
+                for name, found in self._by_imu.items()
+                for calibration in (self._imus[name].in_force,)
+            ),
+        )
+
+    def changes(self) -> dict[str, list[Change]]:  # noqa: D102
+        return {
+            name: whole_accelerometer(
+                self._imus[name].in_force, vector(found.figures[BIAS]), vector(found.figures[SCALE])
+            )
+            for name, found in self._by_imu.items()
+        }
+
+    async def keep(self, record: HandRecord) -> None:  # noqa: D102
+        assert isinstance(record, FacesRecord)
+        await self._kept.keep(record)
+
+    def summary(self) -> str:  # noqa: D102
+        bias_mg = max(float(found.sigma[BIAS].max()) for found in self._by_imu.values()) / MG
+        scale = max(float(found.sigma[SCALE].max()) for found in self._by_imu.values())
+        end = "written" if self._request.write else "not written (--write does)"
+        return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
+
+    def _face(self, imu: ImuWindow) -> Face:
+        """Return a mean in the sensor's own axes, in which firmwares scale."""
+        turn = self._imus[imu.name].in_force.orientation.T
+        return Face(turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2)))
+
+    def _scales_left(self) -> Iterator[str]:
+        for name, found in self._by_imu.items():
+            calibration = self._imus[name].in_force
+            right = calibration.in_use() / (1.0 + found.figures[SCALE])
+            if calibration.scale_unused_within and (calibration.in_use(vector(right)) == 1.0).all():
+                off_mg = 2e3 * float(np.abs(right - 1.0).max())
+                yield (
+                    f"imu {name}: scales stay 1, for PX4 starts without such as are within 1 % of it; the offsets are"
+                    f" right when level, on another side up to {off_mg:.1f} mg off"
+                )
