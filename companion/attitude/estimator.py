@@ -148,10 +148,6 @@ class Leveller:
         self.ned_from_e = normalised(multiply(shortest_arc(found, _UP), self.ned_from_e))
         return believed
 
-    def turn_heading(self, angle_rad: float) -> None:
-        """Turn clockwise about the vertical."""
-        self.ned_from_e = normalised(multiply(from_rotation_vector((0.0, 0.0, angle_rad)), self.ned_from_e))
-
 
 class HeadingAid:
     """Gain and gate of the heading correction."""
@@ -342,7 +338,8 @@ class AttitudeEstimator:
         gain = self.compass.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
         if gain == 0.0:
             return False
-        self._leveller.turn_heading(gain * innovation_rad)
+        clockwise = from_rotation_vector((0.0, 0.0, gain * innovation_rad))
+        self._leveller.ned_from_e = normalised(multiply(clockwise, self._leveller.ned_from_e))
         self._uncertainty.head(gain, sigma_rad)
         return True
 

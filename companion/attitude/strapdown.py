@@ -52,7 +52,6 @@ class MotionStep(NamedTuple):
     rate_rad_s: Triple
     """Mean rate in the sensor's axes, bias removed."""
     missing_s: float
-    """Time in it without samples."""
     orientation: Quaternion
     """Sensor axes to E at its end."""
 
@@ -140,7 +139,6 @@ class Strapdown:
         self._unturned, self._turn_s = (0.0, 0.0, 0.0), 0.0
 
     def _finished(self, t_s: float) -> MotionStep:
-        """Return the complete step and begin the next."""
         (ex, ey, ez), half = self.frame_rate_rad_s, -0.5 * self._span_s
         self.orientation = normalised(multiply((1.0, half * ex, half * ey, half * ez), self.orientation))
         (vx, vy, vz), (ux, uy, uz), mean = self._velocity, self._angle, 1.0 / self._span_s
@@ -158,7 +156,6 @@ MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
 """Horizontal acceleration after averaging that does not show in the length of the force."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
-"""One sigma of an unknown heading."""
 _BIAS_WANDERS_S: Final = 300.0
 """Time in which a bias moves by the floor of its Allan deviation, for consumer gyros."""
 

@@ -22,7 +22,7 @@ import math
 import re
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -71,10 +71,6 @@ class Key(NamedTuple):
     command: int
 
 
-class SendVersion(NamedTuple):
-    """A request for AUTOPILOT_VERSION."""
-
-
 class Refused(NamedTuple):
     """A refusal: the MAV_RESULT and the reason."""
 
@@ -82,7 +78,8 @@ class Refused(NamedTuple):
     reason: str
 
 
-Request = Calibrate | Undo | Cancel | SendVersion
+Request = Calibrate | Undo | Cancel | Literal["version"]
+"""A checked request; "version": for AUTOPILOT_VERSION."""
 
 
 class Permission:
@@ -224,7 +221,7 @@ class CommandServer:
                     self._start(key, request, now_s)
                 case Cancel():
                     self._cancel(key, now_s)
-                case SendVersion():
+                case "version":
                     self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
                     self._link.send(autopilot_version())
                 case Refused(result, reason):
@@ -351,7 +348,7 @@ def judge(message: CommandMessage) -> Request | Refused:
         case mavlink.MAV_CMD_REQUEST_MESSAGE:
             return _request_message(parameters[0])
         case mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES if parameters[0] == 1:
-            return SendVersion()
+            return "version"
         case other:
             return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Command {other} is not supported by the companion")
 
@@ -380,9 +377,9 @@ def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused
     return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate.of(what)
 
 
-def _request_message(message_id: float) -> SendVersion | Refused:
+def _request_message(message_id: float) -> Literal["version"] | Refused:
     if message_id == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
-        return SendVersion()
+        return "version"
     if 0 <= message_id < 1 << 24 and message_id.is_integer():
         return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {message_id:.0f} cannot be requested here")
     return _denied(f"Message request refused: param1 {message_id:g}")

@@ -46,7 +46,6 @@ class MavlinkComponent:
         self._next_heartbeat_s = -math.inf
         self._beats = 0
         self.turns = 0
-        """Turns of the loop, for the watchdog."""
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)

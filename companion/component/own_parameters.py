@@ -42,7 +42,6 @@ class Parameter:
     name: str
     """CMP_ and at most 12 more of A-Z, 0-9 and _ (16 in all, the protocol's limit)."""
     value: float
-    """Value at the start."""
     minimum: float
     maximum: float
     on_set: Callable[[float], None] | None = None

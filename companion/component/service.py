@@ -35,13 +35,9 @@ class JobResult(msgspec.Struct, frozen=True):
 class AcceptedJob(Protocol):
     """A calibration or an undo under way."""
 
-    @property
-    def progress_percent(self) -> int:
-        """0 to 100; never falls."""
-
-    @property
-    def finished(self) -> asyncio.Future[JobResult]:
-        """The result, set once."""
+    progress_percent: int
+    """0 to 100; never falls."""
+    finished: asyncio.Future[JobResult]
 
 
 class CalibrationService(Protocol):

@@ -21,6 +21,7 @@ import re
 import unicodedata
 from collections import deque
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -31,9 +32,7 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.connection import Budget
 
 LINE_BYTES = 50
-"""Length of one STATUSTEXT."""
 MOST_LINES = 5
-"""Lines of one text; longer texts are cut."""
 QUEUE_TEXTS = 16
 LINES_PER_S = 2.0
 BURST_LINES = 8.0
@@ -160,7 +159,7 @@ class StatusText:
         if not text or any(said[:2] == (severity, text) and now_s - said[2] < REPEAT_S for said in self._recent):
             return False
         if len(self._waiting) >= QUEUE_TEXTS:
-            lightest = min(self._waiting, key=_weight)
+            lightest = min(self._waiting, key=itemgetter(0))
             if lightest[0] > weight:
                 return False
             self._waiting.remove(lightest)
@@ -192,14 +191,10 @@ class StatusText:
     def _take_next(self, now_s: float) -> None:
         self._waiting = [text for text in self._waiting if text[0] is Weight.RESULT or now_s - text[1] <= STALE_S]
         if self._waiting:
-            heaviest = max(self._waiting, key=_weight)
+            heaviest = max(self._waiting, key=itemgetter(0))
             self._waiting.remove(heaviest)
             for severity, line in as_lines(*heaviest[2:]):
                 self._sending.append(mavlink.MAVLink_statustext_message(severity, line.encode("ascii")))
-
-
-def _weight(text: tuple[Weight, float, Severity, str]) -> Weight:
-    return text[0]
 
 
 TUNES_APART_S: Final = 1.5

@@ -1,7 +1,7 @@
 """The thread's side of recording: MCAP files, one or a ring of them. Nothing here is called on the event loop.
 
 An MCAP file may be cut anywhere: each chunk is compressed by itself, and one is finished and synced at every `write`,
-once a second.
+once a second. Writing raises StorageError, in one line, where the disk refuses.
 """
 
 from __future__ import annotations

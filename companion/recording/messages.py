@@ -160,7 +160,6 @@ class Tape:
         self._waiting: list[Message] = []
         self._bytes = 0
         self._states: dict[str, Message] = {}
-        """The latest state by topic."""
         self._since_s = 0.0
         self._states_before: list[Message] = []
 

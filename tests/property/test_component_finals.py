@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.commands import Calibrate, Cancel, Undo
-from companion.component.commands import CommandMessage, Refused, SendVersion, judge
+from companion.component.commands import CommandMessage, Refused, judge
 from companion.component.service import Refusal
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import (
@@ -244,7 +244,7 @@ def test_only_exact_parameters_start_something(command: int, parameters: list[fl
             assert not any([parameters[1], parameters[3], *parameters[5:]])
         case Undo() | Cancel():
             assert command in (UNDO, CANCEL)
-        case SendVersion():
+        case "version":
             assert (command, parameters[0]) in ((512, 148), (520, 1))
         case Refused(result, reason):
             assert result in (DENIED, UNSUPPORTED)

@@ -120,7 +120,8 @@ class Listening:
 
     @property
     def words(self) -> str:
-        return self.sensor.problem or ""
+        trouble = self.sensor.health.trouble(asyncio.get_running_loop().time())
+        return "" if trouble is None else trouble.words
 
     @property
     def counts(self) -> dict[str, int]:

@@ -56,7 +56,6 @@ class Automatic:
         self._next_s = -math.inf
         self._failures = 0
         self.turns = 0
-        """Turns of `run`, for the watchdog."""
         self.stopped: str | None = None
         """Reason to wait for a request; None while it works."""
 
@@ -120,7 +119,6 @@ class Automatic:
         return all(same)
 
     def _is_possible(self) -> bool:
-        """Return whether it is disarmed, nothing runs, and the window is complete."""
         needed = (Precondition.IDLE, Precondition.DISARMED, Precondition.ARM_STATE_KNOWN)
         if self._manager.blocking_reason(needed) is not None:
             return False

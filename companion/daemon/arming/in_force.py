@@ -320,7 +320,6 @@ class ActiveCalibration:
     def _confirm(
         self, key: Key, state: _TriadState, present: Present, degc: float | None, end_s: float, averaged_s: float
     ) -> None:
-        """Confirm what the window agrees with."""
         held = state.held
         if held is Why.REBOOTED:
             held = state.shelved or held

@@ -66,14 +66,13 @@ class Readiness:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
         self._min_still_s = core.config.calibration.min_still_s
-        self.in_force, self._automatic, self._owed = in_force, automatic, owed
+        self.in_force, self._automatic, self.owed = in_force, automatic, owed
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._countdown = -math.inf, math.inf
         """Time of the last countdown to a calibration, and the seconds that it named."""
         self._has_gated = False
         self.turns = 0
-        """Completed updates, for the watchdog."""
 
     @property
     def at_arm(self) -> AtArm:
@@ -85,11 +84,6 @@ class Readiness:
         """Return whether ArduPilot's script gets the answer: while this gates, and afterwards, to release it."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
-
-    @property
-    def owed(self) -> str | None:
-        """Action required of the pilot before the flight."""
-        return self._owed.words
 
     # --- the answer
 
@@ -141,7 +135,6 @@ class Readiness:
 
     @property
     def _writing(self) -> bool:
-        """Return whether a job runs, or an interrupted write is being restored."""
         return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
     def judge(self, now_s: float) -> ArmAnswer:
@@ -174,8 +167,8 @@ class Readiness:
             if remedy is None:
                 return ArmAnswer.hold_still(self._until_calibrated_s(now_s), BY_ITSELF)
             return ArmAnswer("refuse", f"{findings[0].words}: {remedy}")
-        if self.owed is not None:
-            return ArmAnswer("refuse", self.owed)
+        if self.owed.words is not None:
+            return ArmAnswer("refuse", self.owed.words)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
         return ArmAnswer("accept", self.state(now_s)[1])
@@ -183,7 +176,6 @@ class Readiness:
     # --- how long yet
 
     def _until_calibrated_s(self, now_s: float) -> float:
-        """Return the seconds of holding still until an automatic calibration would be active."""
         status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
         if status.enough:
             return write_s
@@ -223,8 +215,8 @@ class Readiness:
     def _state(self, now_s: float) -> tuple[ArmedState, str]:
         in_force, findings = self.in_force, self.in_force.findings(now_s)
         against = _STEPS.get(self._manager.state) or in_force.reading() or (findings[0].words if findings else None)
-        if against or self.owed is not None:
-            return "uncalibrated", against or self.owed or ""
+        if against or self.owed.words is not None:
+            return "uncalibrated", against or self.owed.words or ""
         gyro, accel = in_force.sigma("gyro"), in_force.sigma("accel")
         sigmas = [f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []
         sigmas += [f"{accel / MG:.2f} mg"] if accel is not None else []

@@ -43,7 +43,7 @@ class Armings:
 
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._readiness, self._say, self._offload = readiness, core.say, core.offload
-        self._file = armings_in(core.config.storage.path)
+        self.file = armings_in(core.config.storage.path)
         self._queue: asyncio.Queue[ArmingRecord] = asyncio.Queue(QUEUE)
         self.last: ArmingRecord | None = None
         self.seen_disarmed = False
@@ -55,13 +55,13 @@ class Armings:
             while True:
                 arming = await self._queue.get()
                 try:
-                    await self._offload(self._file.append, arming)
+                    await self._offload(self.file.append, arming)
                 except StorageError as error:
                     logger.warning("arming not kept: %s", error)
         finally:
             while not self._queue.empty():
                 with contextlib.suppress(StorageError):
-                    self._file.append(self._queue.get_nowait())
+                    self.file.append(self._queue.get_nowait())
 
     def add(self) -> None:
         """Report and record an arming that was just seen."""
@@ -85,10 +85,6 @@ class Armings:
             uncalibrated = state == "uncalibrated"
             severity = Severity.WARNING if uncalibrated else Severity.NOTICE
             self._say(severity, f"Armed{' UNCALIBRATED' if uncalibrated else ''}: {words}", Weight.RESULT)
-
-    def history(self) -> list[ArmingRecord]:
-        """Read all kept armings, newest first; blocking."""
-        return self._file.read()[::-1]
 
 
 class GateSetup:
@@ -216,7 +212,7 @@ class Arming(Subsystem):
         yield await self._core.offload(self._history, request.limit)
 
     def _history(self, limit: int | None) -> Object:
-        armings = self.armings.history()
+        armings = self.armings.file.read()[::-1]
         by_calibration: dict[str | None, list[ArmingRecord]] = {}
         for arming in reversed(armings):
             by_calibration.setdefault(arming.calibration, []).append(arming)
@@ -237,7 +233,6 @@ class Arming(Subsystem):
         }
 
     def _flights(self, limit: int | None) -> list[Object]:
-        """Return the flights that `companion flight` has kept."""
         try:
             found = FlightStore(self._core.config.storage.path).newest(limit)
         except StorageError as error:

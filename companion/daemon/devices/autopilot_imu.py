@@ -18,7 +18,7 @@ from companion.autopilot.firmware.imu_messages import ImuMessage, Six
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ImuStream
 from companion.autopilot.telemetry.px4_console import EkfBias, RawMean
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.component.service import JobResult
 from companion.config.sections import Imu
 from companion.configured import models
@@ -47,7 +47,6 @@ class AutopilotImu:
         self.problem = "not read yet"
         self.failures = 0
         self.upsets = 0
-        """Restarts of the autopilot and foreign changes of its offsets."""
         self.upset = ""
         self.on_sample: Listeners[ImuSample] = Listeners()
         self.on_counting: Listeners[ImuSample] = Listeners()
@@ -259,18 +258,6 @@ def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
         for imu in imus:
             stack.enter_context(imu.changing())
         yield
-
-
-def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
-    """Return what of the autopilot is missing for a measurement, in one line."""
-    if (conflict := vehicle.conflict) is not None:
-        return f"waiting: {conflict}"
-    if vehicle.arm_state is ArmState.UNKNOWN:
-        return "waiting for the autopilot's heartbeat"
-    for imu in imus.values():
-        if imu.obstacle is not None:
-            return f"waiting for imu {imu.name}: {imu.obstacle}"
-    return None
 
 
 _Known = tuple[tuple[float, ...], int]

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,6 @@ import numpy as np
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.sensors import SerialSensor
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Array
 from companion.protocols.stream_health import Trouble
 
@@ -39,67 +38,13 @@ NO_OFFSETS: Final = object()
 """Offsets of an IMU whose readings nobody changes."""
 
 
-class MotionWitness:
-    """Knows how far the aircraft has tilted or turned, from its IMUs in their own axes: no mounting is needed."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
-        self._offsets: dict[str, object] = {}
-
-    def update(self, latest: Mapping[str, Batch], offsets_of: Callable[[str], object]) -> None:
-        """Note the last whole second of each IMU.
-
-        `offsets_of`: the offsets subtracted from its readings, or None while unknown. An IMU with other offsets, or
-        another orientation of the board, begins anew as a witness: the change must not look like a tilt.
-        """
-        for name, batch in latest.items():
-            seconds = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S))
-            offsets = offsets_of(name)
-            if offsets is None or (seconds and seconds[-1][0] == batch.slot):
-                continue
-            if self._offsets.get(name) is not offsets:
-                self._offsets[name] = offsets
-                seconds.clear()
-            rate, force = batch.mean[:3], batch.mean[3:]
-            size = float(np.linalg.norm(force))
-            if size > 0.0:
-                down = force / size
-                about = float(rate @ down)
-                turned_deg = math.degrees(about) if abs(about) > TURNING_RAD_S else 0.0
-                seconds.append((batch.slot, down, turned_deg))
-
-    def tilted_deg(self, near_since_s: float, since_s: float, until_s: float) -> float:
-        """Return the least tilt that any IMU saw since `near_since_s`, if it has lasted since `since_s`."""
-        return min((self._tilted_deg(each, since_s) for each in self._heard(near_since_s, until_s)), default=0.0)
-
-    @staticmethod
-    def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:
-        stayed = [down for slot, down, _ in seconds[1:] if slot >= since_s][-TILTED_SECONDS:]
-        if len(stayed) < TILTED_SECONDS:
-            return 0.0
-        cosines = [float(seconds[0][1] @ down) for down in stayed]
-        return math.degrees(math.acos(min(1.0, max(-1.0, *cosines))))
-
-    def turned_deg(self, near_since_s: float, until_s: float) -> float:
-        """Return the least turn about the vertical that any IMU saw."""
-        turns = [abs(sum(turned_deg for *_, turned_deg in each)) for each in self._heard(near_since_s, until_s)]
-        return min(turns, default=0.0)
-
-    def _heard(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
-        """Return the whole seconds in between, of each IMU that has seen as much as the others."""
-        # Not as the clock: while a sensor is implausible, nothing is collected of any IMU.
-        newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
-        found = [
-            [second for second in seconds if since_s <= second[0] <= until_s - 1.0]
-            for seconds in self._seconds.values()
-            if seconds and seconds[-1][0] >= newest - QUIET_S
-        ]
-        first = min((seconds[0][0] for seconds in found if seconds), default=0)
-        return [seconds for seconds in found if seconds and seconds[0][0] <= first + LATE_S]
-
-
 class SensorWatch:
-    """Checks every sensor twice a second."""
+    """Checks every sensor twice a second.
+
+    The IMUs are the witnesses of a tilt or a turn, in their own axes: no mounting is needed. `offsets_of`: the offsets
+    subtracted from an IMU's readings, or None while unknown. An IMU with other offsets, or another orientation of the
+    board, begins anew as a witness: the change must not look like a tilt.
+    """
 
     def __init__(
         self,
@@ -109,10 +54,11 @@ class SensorWatch:
         say: Say = lambda *what: None,
     ) -> None:
         self._sensors, self._collector = sensors, collector
-        self._offsets_of = offsets_of
-        self._witness = MotionWitness()
+        self._offsets_of, self._say = offsets_of, say
+        self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
+        """Whole seconds of each IMU: its slot, the direction of its mean force, and the turn about it in degrees."""
+        self._offsets: dict[str, object] = {}
         self._has_failed = False
-        self._say = say
 
     async def run(self) -> None:
         """Check until cancelled."""
@@ -129,7 +75,7 @@ class SensorWatch:
 
     def update(self, now_s: float) -> None:
         """Check all sensors once."""
-        self._witness.update(self._collector.imu_seconds(), self._offsets_of)
+        self._note_motion()
         for sensor in self._sensors:
             found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:
@@ -139,16 +85,44 @@ class SensorWatch:
                     self._say(Severity.WARNING, f"{sensor.name}: {words}", Weight.NEWS)
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
 
+    def _note_motion(self) -> None:
+        for name, batch in self._collector.imu_seconds().items():
+            seconds, offsets = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S)), self._offsets_of(name)
+            if offsets is None or (seconds and seconds[-1][0] == batch.slot):
+                continue
+            if self._offsets.get(name) is not offsets:
+                self._offsets[name] = offsets
+                seconds.clear()
+            rate, force = batch.mean[:3], batch.mean[3:]
+            size = float(np.linalg.norm(force))
+            if size > 0.0:
+                down = force / size
+                about = float(rate @ down)
+                seconds.append((batch.slot, down, math.degrees(about) if abs(about) > TURNING_RAD_S else 0.0))
+
+    def _seen(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
+        """Return the whole seconds in between, of each IMU that has seen as much as the others."""
+        # Not as the clock: while a sensor is implausible, nothing is collected of any IMU.
+        newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
+        found = [
+            [second for second in seconds if since_s <= second[0] <= until_s - 1.0]
+            for seconds in self._seconds.values()
+            if seconds and seconds[-1][0] >= newest - QUIET_S
+        ]
+        first = min((seconds[0][0] for seconds in found if seconds), default=0)
+        return [seconds for seconds in found if seconds and seconds[0][0] <= first + LATE_S]
+
     def _stuck(self, sensor: SerialSensor) -> Trouble | None:
         since_s = sensor.health.stream.unchanged_since_s
         last_s = sensor.health.stream.last_sample_s
         if since_s is None or last_s is None:
             return None
         near_s = sensor.health.stream.near_since_s or since_s
-        tilted_deg = self._witness.tilted_deg(near_s, since_s, last_s)
+        # The least that any IMU saw counts.
+        tilted_deg = min((_tilted_deg(each, since_s) for each in self._seen(near_s, last_s)), default=0.0)
         # Turns are summed up, and what is not seen of one adds up likewise.
-        near_s = max(near_s, since_s - BEFORE_S)
-        turned_deg = self._witness.turned_deg(near_s, last_s) if "compass" in sensor.kinds else 0.0
+        seen = self._seen(max(near_s, since_s - BEFORE_S), last_s) if "compass" in sensor.kinds else []
+        turned_deg = min((abs(sum(turn_deg for *_, turn_deg in each)) for each in seen), default=0.0)
         if turned_deg > TURNED_DEG:
             how = f"turned by {turned_deg:.0f} deg"
         elif tilted_deg > TILTED_DEG and "gradienter" in sensor.kinds:
@@ -170,3 +144,12 @@ class SensorWatch:
         now_s = asyncio.get_running_loop().time()
         found = [(sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors]
         return sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)
+
+
+def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:
+    """Return the tilt since the first second, if it has lasted since `since_s`."""
+    stayed = [down for slot, down, _ in seconds[1:] if slot >= since_s][-TILTED_SECONDS:]
+    if len(stayed) < TILTED_SECONDS:
+        return 0.0
+    cosines = [float(seconds[0][1] @ down) for down in stayed]
+    return math.degrees(math.acos(min(1.0, max(-1.0, *cosines))))

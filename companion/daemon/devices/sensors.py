@@ -47,7 +47,7 @@ class SensorHealth:
     """Present trouble of one sensor, and how often each trouble has begun."""
 
     def __init__(self, link: ByteLink, protocol: str, decoder: Decoder) -> None:
-        self.link, self.protocol, self._decoder = link, protocol, decoder
+        self.link, self._decoder = link, decoder
         self.stream = StreamHealth(protocol, decoder)
         self.counts: Counter[str] = Counter()
         self._breaks = 0
@@ -113,17 +113,6 @@ class SensorHealth:
         logger.log(level, "%s: %s (%d so far)", self.link.name, what.words, self.counts[what.key])
         return not again
 
-    def status(self) -> dict[str, object]:
-        """For `companion status` and `check`."""
-        found = self.trouble(asyncio.get_running_loop().time())
-        return {
-            "trouble": found.key if found is not None else None,
-            "counts": dict(self.counts),
-            "protocol": self.protocol,
-            "speaks": self.stream.speaks,
-            "port": self.link.settings.url,
-        }
-
 
 def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
     if budget is None or budget.exceeded_s is None or now_s - budget.exceeded_s >= FLOOD_S:
@@ -152,24 +141,20 @@ class SensorRole:
             self._rate_hz = (self._samples - before) / (t_s - since_s) if before else 0.0
             self._counted = (t_s, self._samples)
 
-    @property
-    def problem(self) -> str | None:
-        """Return the fault in one line, or None while samples come."""
-        sensor = self._sensor
-        if (problem := sensor.problem) is not None:
-            return problem
-        now_s = asyncio.get_running_loop().time()
+    def _problem(self, now_s: float) -> str | None:
+        """Return the fault of this use, though frames come, in one line; None while samples come."""
+        sensor, port = self._sensor, self._sensor.link.settings
         if self._last_s is not None and now_s - self._last_s < SILENT_AFTER_S:
             return None
-        port = sensor.link.settings
         if self.kind == "compass" and (north := sensor.other_north) is not None:
             return f'{port}: its headings are {north}, compass.reference is another; set reference = "{north}"'
         return f"{port}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""
-        sensor = self._sensor
-        problem, words = self.problem, sensor.text
+        sensor, now_s = self._sensor, asyncio.get_running_loop().time()
+        trouble, words = sensor.health.trouble(now_s), sensor.text
+        problem = self._problem(now_s) if trouble is None else trouble.words
         summary = problem or f"{sensor.protocol} on {sensor.link.settings.url}, {self._rate_hz:.0f} frames/s"
         if problem is None and sensor.health.counts:
             summary += f"; so far {', '.join(f'{count} {key}' for key, count in sensor.health.counts.items())}"
@@ -189,7 +174,11 @@ class SensorRole:
             "shared_with": others,
             "restarts": sensor.decoder.times.clock.breaks,
             "too_late": sensor.decoder.times.dropped[LATE],
-            **sensor.health.status(),
+            "trouble": None if trouble is None else trouble.key,
+            "counts": dict(sensor.health.counts),
+            "protocol": sensor.protocol,
+            "speaks": sensor.health.stream.speaks,
+            "port": sensor.link.settings.url,
         }
 
 
@@ -236,8 +225,7 @@ class SerialSensor:
             group.create_task(self._converse(), name=f"{self.name} dialogue")
             await self.link.run()
 
-    def _on_state(self, connected: bool, reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
-        del reason
+    def _on_state(self, connected: bool, _reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
         if connected:
             now_s = asyncio.get_running_loop().time()
             self._interrupted(now_s)
@@ -314,9 +302,3 @@ class SerialSensor:
         if self._held_by:
             return f"nothing is said to it: {self._held_by} has the port open too"
         return self.dialogue.words if self.dialogue is not None else ""
-
-    @property
-    def problem(self) -> str | None:
-        """Return the fault of the device in one line, or None while samples come."""
-        found = self.health.trouble(asyncio.get_running_loop().time())
-        return found.words if found is not None else None

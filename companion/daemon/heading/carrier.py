@@ -152,7 +152,6 @@ class Carrier:
         self._recent: deque[Sequence[ImuSample]] = deque()
         """Reads within `KEPT_S` on the ground, or without an estimator."""
         self.align_wanted = False
-        """Align as soon as it is still on the ground."""
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
 

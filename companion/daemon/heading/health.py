@@ -68,7 +68,6 @@ class HeadingDriftMonitor:
 
     def __init__(self) -> None:
         self.strayed_rad = 0.0
-        """Recent turn of the heading less that of the gyros."""
         self.is_too_far = False
         self._last: tuple[float, float, float] | None = None
         self._turned_rad = self._sigma_rad = self._apart_rad = 0.0

@@ -135,8 +135,13 @@ class PoseNow:
 
     async def refresh(self) -> Object | None:
         """Return `now`, with the declination updated when due."""
-        if self._compass is not None and self._compass.magnetic:
-            await self._look_up(asyncio.get_running_loop().time())
+        now_s = asyncio.get_running_loop().time()
+        due = now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None
+        if self._compass is not None and self._compass.magnetic and due:
+            where: Whereabouts = models.whereabouts(self._core.config, self._core.vehicle)
+            if where.latitude_deg is not None:
+                self._looked_up_s = now_s
+                self._declination_deg = (await self._core.offload(local_earth, where)).site.declination_deg
         return self.now()
 
     def now(self) -> Object | None:
@@ -179,10 +184,3 @@ class PoseNow:
             "gradienter_y_deg": None if tilt is None else round(tilt.y_deg, 4),
             "compass_deg": None if heading is None else round(heading.heading_deg, 3),
         }
-
-    async def _look_up(self, now_s: float) -> None:
-        if now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None:
-            where: Whereabouts = models.whereabouts(self._core.config, self._core.vehicle)
-            if where.latitude_deg is not None:
-                self._looked_up_s = now_s
-                self._declination_deg = (await self._core.offload(local_earth, where)).site.declination_deg

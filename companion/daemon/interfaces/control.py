@@ -90,22 +90,15 @@ class ControlServer:
         self._silent.pop(client, None)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            request = await self._request(reader, writer)
-            if request is not None:
-                await self._take(request, writer)
-        except (ConnectionError, TimeoutError):
-            pass  # the client went away; its job goes on
-
-    async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
-        try:
-            async with asyncio.timeout(REQUEST_TIMEOUT_S):
-                line = await reader.readline()
-            return parse_request(line)
-        except ValueError as error:
-            await write_line(writer, {"kind": "error", "reason": f"request not understood: {error}"})
-            await _finish(writer)
-            return None
+        with contextlib.suppress(ConnectionError, TimeoutError):  # the client went away; its job goes on
+            try:
+                async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                    request = parse_request(await reader.readline())
+            except ValueError as error:
+                await write_line(writer, {"kind": "error", "reason": f"request not understood: {error}"})
+                await _finish(writer)
+                return
+            await self._take(request, writer)
 
     async def _take(self, request: Object, writer: asyncio.StreamWriter) -> None:
         if (client := asyncio.current_task()) is not None:

@@ -119,7 +119,7 @@ class Headlines:
     def _uncalibrated(self, words: str, answer: ArmAnswer) -> Headline:
         if answer.verdict == "wait":
             return self._by_answer(answer)
-        if words == self._readiness.owed:
+        if words == self._readiness.owed.words:
             return "NOT READY", words, "bad"
         held_back, todo = self._readiness.in_force.held_back, self._automatic.why_not()
         if held_back is None and todo is None:

@@ -15,7 +15,7 @@ from companion.component.service import MEASURED_PERCENT
 from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
 from companion.errors import AutopilotError, CalibrationRefusedError
@@ -25,7 +25,7 @@ from companion.estimation.means.windows import Window
 from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
-from companion.estimation.solution.truth import NOTHING, Otherwise, OwnHeading
+from companion.estimation.solution.truth import Otherwise
 from companion.links.system.listeners import Listeners
 
 POLL_S: Final = 0.2
@@ -57,7 +57,8 @@ class Measuring:
 
         `if_armed`: error if it was armed since the job began; None: it goes on once disarmed.
         """
-        armed = self._core.vehicle.arm_state is ArmState.ARMED
+        vehicle = self._core.vehicle
+        armed = vehicle.arm_state is ArmState.ARMED
         if if_armed is not None and (armed or job.was_armed):
             raise CalibrationRefusedError(if_armed)
         job.check_time()
@@ -65,7 +66,13 @@ class Measuring:
         status = self._core.collector.status(asyncio.get_running_loop().time())
         if armed:
             return status, "armed: it goes on once it is disarmed", None
-        other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
+        if vehicle.conflict is not None:
+            return status, f"waiting: {vehicle.conflict}", None
+        if vehicle.arm_state is ArmState.UNKNOWN:
+            return status, "waiting for the autopilot's heartbeat", None
+        found = ((name, imu.obstacle) for name, imu in self._imus.items())
+        unread = (f"waiting for imu {name}: {obstacle}" for name, obstacle in found if obstacle is not None)
+        other = next(unread, None) or models.place_doubt(self._core.config, vehicle)
         if other is not None or status.obstacle is None:
             return status, other, None
         return status, status.obstacle.words, status.obstacle.hold_still_s
@@ -144,18 +151,12 @@ class Estimator:
         return found, where, otherwise
 
     async def _otherwise(self, window: Window) -> Otherwise:
-        config = self._core.config
-        if config.gradienter is not None and config.compass is not None:
-            return NOTHING
-        return Otherwise(
-            sides=self._faces.sides(window) if config.gradienter is None else {},
-            heading=await self._own_heading() if config.compass is None else None,
-        )
-
-    async def _own_heading(self) -> OwnHeading | None:
-        """Return the autopilot's heading; None where it has none of its own."""
-        found, core = self._own.heading(), self._core
+        core, heading = self._core, self._own.heading() if self._core.config.compass is None else None
         try:
-            return found if found is not None and await core.vehicle.kind.yaw_is_its_own(core.parameters) else None
+            # The autopilot's heading, where it has one of its own.
+            if heading is not None and not await core.vehicle.kind.yaw_is_its_own(core.parameters):
+                heading = None
         except AutopilotError:
-            return None
+            heading = None
+        sides = self._faces.sides(window) if core.config.gradienter is None else {}
+        return Otherwise(sides=sides, heading=heading)
