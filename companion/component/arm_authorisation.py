@@ -102,12 +102,8 @@ class ArmingScript:
         if autopilot is None or not self._link.connected or not self._gate.asks_script:
             return math.inf
         if now_s >= self._next_s:
-            self._next_s = now_s + PERIOD_S
-            self._link.send(self._message(autopilot[0]))
+            self._next_s, answer = now_s + PERIOD_S, self._gate.answer()
+            verdict = VERDICTS[answer.verdict] if self._gate.at_arm == "gate" else NOT_GATING
+            reason = shortened(to_ascii(answer.words), REASON_BYTES).encode("ascii")
+            self._link.send(to_script(autopilot[0], MARK + bytes([verdict]) + reason))
         return self._next_s
-
-    def _message(self, system_id: int) -> mavlink.MAVLink_tunnel_message:
-        answer = self._gate.answer()
-        verdict = VERDICTS[answer.verdict] if self._gate.at_arm == "gate" else NOT_GATING
-        reason = shortened(to_ascii(answer.words), REASON_BYTES).encode("ascii")
-        return to_script(system_id, MARK + bytes([verdict]) + reason)

@@ -213,9 +213,7 @@ class Tune(enum.Enum):
     WRONG = "MFT200O4E8C8E8C8E8C8"
     """To and fro: not the requested pose."""
     DONE = "MFT200O4C8E8G8>C4"
-    """Upwards: all is done."""
     FAILED = "MFT200O5C8<G8E8C2"
-    """Downwards."""
 
 
 class Tunes:

@@ -83,6 +83,8 @@ class ActiveCalibration:
         # The IMUs that the autopilot flies with; where it has none of them, all.
         flown = [imu.name for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
         names = flown or [imu.name for imu in config.imu]
+        self.what = What.BOTH if config.gradienter is not None else What.GYROS
+        """Biases that an automatic calibration determines."""
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
         self.temperatures_degc: dict[str, float] = {}
@@ -96,11 +98,6 @@ class ActiveCalibration:
         calibrating.alignment.on_change.add(self._realigned)
 
     # --- what is known
-
-    @property
-    def what(self) -> What:
-        """Biases that an automatic calibration determines."""
-        return What.BOTH if self._config.gradienter is not None else What.GYROS
 
     def findings(self, now_s: float) -> list[Objection]:
         """List the findings against the active calibration; empty while it is good."""

@@ -127,9 +127,7 @@ class Devices(Subsystem):
     @property
     def not_heard(self) -> str:
         """Words: no autopilot has been heard, and why."""
-        why = self.signing.rejecting
-        behind = f": {why}" if why else ""
-        return f"not heard yet on {self._core.config.mavlink.url}{behind}"
+        return ": ".join(filter(None, (f"not heard yet on {self._core.config.mavlink.url}", self.signing.rejecting)))
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.signing.load()

@@ -228,7 +228,8 @@ class AttitudeService:
         if not self.health.pushing or not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()
-        if attitude is None or not _is_finite(attitude):
+        figures = () if attitude is None else (*attitude.quaternion, *attitude.sigma_rad, *attitude.rate_rad_s)
+        if attitude is None or not all(map(math.isfinite, (attitude.t_s, *figures))):
             self.health.stop("attitude lost: samples were missing for too long")
             return
         levelled = self.difference.levelled(attitude, read_s)
@@ -289,15 +290,14 @@ class AttitudeService:
         self.fallback.close(asyncio.get_running_loop().time())
 
     def _tell(self, now_s: float) -> None:
-        if self.health.pushing != self._was_pushing:
-            self._was_pushing = self.health.pushing
-            if self._was_pushing:
-                self._say_once(Severity.NOTICE, "Attitude: heading pushed to the autopilot", now_s)
-            else:
-                self._say_once(Severity.WARNING, f"Attitude push stopped: {self.health.why_not}", now_s)
+        if self.health.pushing and not self._was_pushing:
+            self._say_once(Severity.NOTICE, "Attitude: heading pushed to the autopilot", now_s)
+        elif self._was_pushing and not self.health.pushing:
+            self._say_once(Severity.WARNING, f"Attitude push stopped: {self.health.why_not}", now_s)
         elif self._restarted and not self._late_told and now_s - self._started_s >= LATE_S:
             self._late_told = True
             self._say_once(Severity.WARNING, f"Attitude not pushed: {self.health.why_not}", now_s)
+        self._was_pushing = self.health.pushing
         warning = self.health.warning
         if warning is not None and self._warned is None:
             logger.warning("%s", warning)
@@ -369,10 +369,6 @@ class AttitudeService:
         if attitude is None:
             return None
         return {**_angles(attitude), "north": "true", "source": "attitude", "still": self.carrier.still}
-
-
-def _is_finite(attitude: Attitude) -> bool:
-    return all(map(math.isfinite, (*attitude.quaternion, *attitude.sigma_rad, *attitude.rate_rad_s, attitude.t_s)))
 
 
 def _angles(attitude: Attitude | None) -> Object:

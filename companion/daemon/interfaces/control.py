@@ -157,7 +157,6 @@ def _bind(path: Path) -> socket.socket:
 
 
 def _open_to(path: Path, group: str) -> None:
-    """Open the socket to a group; log where that is not possible."""
     try:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
         path.chmod(0o660)

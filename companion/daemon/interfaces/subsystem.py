@@ -208,17 +208,15 @@ def own_parameters(wanted: RuntimeSettings) -> list[Parameter]:
     gyro, accel = wanted.settings.target_gyro_sigma_rad_s / DEG_H, wanted.settings.target_accel_sigma_m_s2 / MG
 
     aim, switch = wanted.retarget, wanted.switch
+
+    def set_at_arm(value: float) -> None:
+        switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
+
     return [
         Parameter("CMP_GYR_TGT", gyro, 0.01, LARGEST, lambda value: aim(target_gyro_sigma_rad_s=value * DEG_H)),
         Parameter("CMP_ACC_TGT", accel, 0.0001, LARGEST, lambda value: aim(target_accel_sigma_m_s2=value * MG)),
         Parameter("CMP_PUSH", wanted.push, 0.0, 1.0, lambda value: switch(push=bool(_whole("CMP_PUSH", value)))),
-        Parameter(
-            "CMP_AT_ARM",
-            AT_ARM.index(wanted.at_arm),
-            0.0,
-            2.0,
-            lambda value: switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)]),
-        ),
+        Parameter("CMP_AT_ARM", AT_ARM.index(wanted.at_arm), 0.0, 2.0, set_at_arm),
         Parameter("CMP_TUNES", wanted.tunes, 0.0, 1.0, lambda value: switch(tunes=bool(_whole("CMP_TUNES", value)))),
         Parameter("CMP_STATE", 0.0, 0.0, 3.0),
         Parameter("CMP_GYR_SIG", 0.0, 0.0, LARGEST),
