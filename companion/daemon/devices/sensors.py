@@ -58,9 +58,9 @@ class SensorHealth:
         self._good_since_s: float | None = None
         self._warned_s: dict[str, float] = {}
 
-    def opened(self) -> None:
+    def opened(self, now_s: float) -> None:
         """Forget the stream of before: the port was opened (again)."""
-        self._opened_s = asyncio.get_running_loop().time()
+        self._opened_s = now_s
         self.stream.opened()
 
     def trouble(self, now_s: float) -> Trouble | None:
@@ -229,7 +229,7 @@ class SerialSensor:
         if connected:
             now_s = asyncio.get_running_loop().time()
             self._interrupted(now_s)
-            self.health.opened()
+            self.health.opened(now_s)
             self._openings += 1
             self._alone, self._look_at_s = False, -math.inf
             if self.dialogue is not None:

@@ -55,19 +55,12 @@ class Reach:
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
         vehicle.on_event.add(self._on_event)
 
-    @property
-    def answered(self) -> bool:
-        """Return whether the autopilot has answered anything, so that it hears us."""
-        results = self._vehicle.commands.results
-        return self._parameters.answering or any(
-            count for word, count in results.items() if word not in ("no answer", "dropped")
-        )
-
     def text(self) -> tuple[bool, str]:
         """Return whether all is well, and the facts with the remedy, for `companion check`."""
         if not self._vehicle.alive:
             return True, "not known: no autopilot"
-        if not self.answered:
+        answers = (word for word, count in self._vehicle.commands.results.items() if count)
+        if not self._parameters.answering and set(answers) <= {"no answer", "dropped"}:
             needs = "" if self._baud is None else f"; {port_needs(self._vehicle.firmware, self._baud)}"
             return False, (
                 "the autopilot is heard but does not answer: it does not hear our heartbeat, so nobody can reach the"
