@@ -335,20 +335,24 @@ def judge(message: CommandMessage) -> Request | Refused:
         last = float(message.x), float(message.y), message.z
     else:
         last = message.param5, message.param6, message.param7
-    parameters = message.param1, message.param2, message.param3, message.param4, *last
+    first, parameters = message.param1, (message.param1, message.param2, message.param3, message.param4, *last)
     match message.command:
         case mavlink.MAV_CMD_USER_1:
-            return _calibrate(parameters[0], parameters[1])
+            return _calibrate(first, message.param2)
         case mavlink.MAV_CMD_USER_2:
             return Cancel()
         case mavlink.MAV_CMD_USER_3:
             return Undo()
         case mavlink.MAV_CMD_PREFLIGHT_CALIBRATION:
             return _preflight_calibration(parameters)
-        case mavlink.MAV_CMD_REQUEST_MESSAGE:
-            return _request_message(parameters[0])
-        case mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES if parameters[0] == 1:
+        case mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES if first == 1:
             return "version"
+        case mavlink.MAV_CMD_REQUEST_MESSAGE if first == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+            return "version"
+        case mavlink.MAV_CMD_REQUEST_MESSAGE if 0 <= first < 1 << 24 and first.is_integer():
+            return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {first:.0f} cannot be requested here")
+        case mavlink.MAV_CMD_REQUEST_MESSAGE:
+            return _denied(f"Message request refused: param1 {first:g}")
         case other:
             return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Command {other} is not supported by the companion")
 
@@ -375,14 +379,6 @@ def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused
     chosen = {(1, 1): What.BOTH, (1, 0): What.GYROS, (0, 1): What.ACCELEROMETERS}
     what = chosen.get((int(parameters[0]), int(parameters[4])))
     return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate.of(what)
-
-
-def _request_message(message_id: float) -> Literal["version"] | Refused:
-    if message_id == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
-        return "version"
-    if 0 <= message_id < 1 << 24 and message_id.is_integer():
-        return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {message_id:.0f} cannot be requested here")
-    return _denied(f"Message request refused: param1 {message_id:g}")
 
 
 def _denied(reason: str) -> Refused:
