@@ -346,6 +346,6 @@ class Health:
             return
         share = 0.5 if self.warning is not None else 1.0
         tilt, heading = difference.tilt_rad / DEG, abs(difference.heading_rad) / DEG
-        found = (("tilt", tilt, TOLD_TILT_DEG), ("heading", heading, TOLD_HEADING_DEG))
-        parts = [f"{off_deg:.0f} deg in {name}" for name, off_deg, told_deg in found if off_deg > share * told_deg]
+        parts = [f"{tilt:.0f} deg in tilt"] if tilt > share * TOLD_TILT_DEG else []
+        parts += [f"{heading:.0f} deg in heading"] if heading > share * TOLD_HEADING_DEG else []
         self.warning = f"attitude is {', '.join(parts)} off the autopilot's" if parts else None
