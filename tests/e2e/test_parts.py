@@ -11,7 +11,7 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import part_of
 from companion.config.sections import NoiseProfile
-from companion.estimation.means.windows import Hidden, ImuWindow
+from companion.estimation.means.windows import ImuWindow
 from companion.estimation.records.record import ImuRecord
 from companion.estimation.request import What
 from companion.estimation.solution.site import IN_CONFIGURATION
@@ -135,7 +135,7 @@ def test_integers_that_hide_the_mean_are_not_blamed_on_the_part() -> None:
     earth = np.diag([1.0, 1.0, 0.0]) * (8.0 * DEG_H) ** 2
     (said,) = wide_gyros([window], earth, IN_CONFIGURATION)
     assert said.startswith("imu fc: gyro sigma is that of an unknown part")
-    hidden = msgspec.structs.replace(window, hidden={"gyro": Hidden("coarse steps", useless=False)})
+    hidden = msgspec.structs.replace(window, hidden={"gyro": "coarse steps"})
     (said,) = wide_gyros([hidden], earth, IN_CONFIGURATION)
     assert said.startswith("no compass: ")
     (said,) = wide_gyros([window], None, IN_CONFIGURATION)

@@ -24,7 +24,7 @@ from companion.estimation.collector.outlook import (
     is_enough,
 )
 from companion.estimation.means.pose import FieldWindow, heading_window, tilt_window
-from companion.estimation.means.windows import ImuEstimate, ImuInput, Window, imu_estimates
+from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, Window, imu_estimates
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.stillness.stretch import Stretch
 from companion.estimation.turning.turn import Turn
@@ -86,7 +86,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
         return Window(
             start_s=float(self.slots[0]),
             end_s=self.slots[-1] + 1.0,
-            imus=tuple(item.window for item in estimates),
+            imus=tuple(window for _, window in estimates),
             tilt=None if self.tilt is None else tilt_window(self.tilt),
             heading=None
             if self.heading is None
@@ -277,8 +277,8 @@ class GroundWindows(WindowSource):
         estimates = self.estimate_later(self.slots(None), None, late=1)()
         if isinstance(estimates, CalibrationRefusedError):
             return msgspec.structs.replace(status, progress=0.0, obstacle=CollectorObstacle(str(estimates)))
-        needed = max(expected_s(settings, estimates), stretch.good + 1)
-        enough = stretch.full or is_enough(settings, estimates)
+        own = [each for each, _ in estimates]
+        needed, enough = max(expected_s(settings, own), stretch.good + 1), stretch.full or is_enough(settings, own)
         return msgspec.structs.replace(status, enough=enough, progress=1.0 if enough else stretch.good / needed)
 
 
@@ -288,7 +288,7 @@ def _estimates(
     batches: Sequence[Sequence[Batch]],
     raw: Sequence[Sequence[Batch]],
     horizon_s: float,
-) -> list[ImuEstimate] | CalibrationRefusedError:
+) -> list[tuple[Estimate, ImuWindow]] | CalibrationRefusedError:
     """Estimate a still window; `raw`: means in floats beside a stream of integers, of the seconds that have any."""
     end_s, rejected = slots[-1] + 1.0, slots[-1] - slots[0] + 1 - len(slots)
     try:

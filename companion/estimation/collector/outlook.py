@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from companion.estimation.collector.intake import SourceStatus
-from companion.estimation.means.windows import WHITE_SHARE, Estimate, ImuEstimate
+from companion.estimation.means.windows import WHITE_SHARE, Estimate
 from companion.physics.frames import Floats
 
 _NO_ROOM: Final = 1e-300
@@ -95,14 +95,14 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
         return max(math.floor(self.max_s), self.min_slots)
 
 
-def is_enough(settings: Settings, found: Sequence[ImuEstimate]) -> bool:
+def is_enough(settings: Settings, found: Sequence[Estimate]) -> bool:
     """Tell whether every axis meets its target, or its white part is below 30 % of the part that stays."""
-    return all(bool((each.own.white_variance <= _room(settings, each.own)).all()) for each in found)
+    return all(bool((each.white_variance <= _room(settings, each)).all()) for each in found)
 
 
-def expected_s(settings: Settings, found: Sequence[ImuEstimate]) -> int:
+def expected_s(settings: Settings, found: Sequence[Estimate]) -> int:
     """Return the good seconds after which it is expected to be enough, the noise staying as seen so far."""
-    needed = [np.square(each.own.white) / np.maximum(_room(settings, each.own), _NO_ROOM) for each in found]
+    needed = [np.square(each.white) / np.maximum(_room(settings, each), _NO_ROOM) for each in found]
     longest = max((float(each.max()) for each in needed), default=0.0)
     return min(max(math.ceil(min(longest, settings.max_s)), settings.min_slots), settings.max_slots)
 

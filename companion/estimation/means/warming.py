@@ -3,14 +3,14 @@
 A slope s moves the mean of the next minute by s (T + 60 s) / 2 from the mean over T. The allowance is the slope
 of the window with its standard error, times that lever. The age of the part bounds it: a box that was switched on
 rises by `WARM_UP_K` with an unknown time constant, so at the age t it warms by at most WARM_UP_K / (e t). A thermometer
-bounds it better. Flicker bends the line too, but V(T, H) has it already: it counts by half in the standard error.
+bounds it better.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -29,8 +29,9 @@ _LATER_S: Final = (120.0, 600.0, 3600.0)
 _WORTH_WAITING: Final = 2.0 / 3.0
 """Share of the present sigma below which a later one is worth waiting for."""
 _TEMPERATURE_WARNING_K: Final = 3.0
-_UNKNOWN: Final = 1.0
+UNKNOWN: Final = 1.0
 """Variance of a slope that the window does not tell, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
+_TINY: Final = float(np.finfo(float).tiny)
 _BENT_SIGMAS: Final = 3.0
 """Curvature over its sigma from which the temperature is taken for a parabola."""
 _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
@@ -39,26 +40,6 @@ _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
 
 State = tuple[float, float]
 """Temperature and its rate, degC and K/s."""
-
-
-class Lines(NamedTuple):
-    """Straight lines through the readings of gyro and accelerometer, rad/s^2 and m/s^3; (6,), or (3,) of one triad."""
-
-    hidden: Floats
-    """Slopes that are not significant; zero where the slope is."""
-    hidden_variance: Floats
-    """Variance of `hidden`, flicker and walk counted by half; infinite where the window is too short for a line."""
-    ramp: Floats
-    """Significant slopes: the reported mean is the end of that line."""
-    variance: Floats
-    """Variance of either slope, with the part's flicker and walk."""
-    level_variance: Floats
-    """Variance of the mean over the window as a prediction of the next minutes, without any ramp."""
-
-    @property
-    def slope(self) -> Floats:
-        """Slope, significant or not."""
-        return self.hidden + self.ramp
 
 
 class Path(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,49 +59,63 @@ class Path(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
-    """Slopes of one window; vehicle FRD, rad/s^2 and m/s^3."""
+    """Straight lines through the readings of gyro and accelerometer over one window; (6,), rad/s^2 and m/s^3."""
 
-    lines: Lines
-    """Variances are at most `_UNKNOWN`."""
+    slope: Floats
+    ramp: Floats
+    """Slopes that are significant, else zero: the reported mean is the end of that line."""
+    variance: Floats
+    """Variance of the slope, with the part's flicker and walk; `UNKNOWN` where the window is too short for a line."""
+    level_variance: Floats
+    """Variance of the mean over the window as a prediction of the next minutes, without any ramp."""
     warm_up: tuple[float, float]
     """Bias change of gyro and accelerometer in a warm-up of `WARM_UP_K`, rad/s and m/s^2."""
     half_s: float
     """Half of the window's length."""
     rate: tuple[float, float] | None
     """Rate of the thermometer, K/s, and its variance; None: no thermometer."""
-    path: Path | None = None
-    """Temperature through the window; None: no change is known."""
+    path: Path | None
+    """Temperature through the window; None: no significant change."""
+
+    def rotated(self, rotation: Matrix) -> Warming:
+        """Turn the lines into other axes."""
+        both = np.kron(np.eye(2), rotation)
+        return msgspec.structs.replace(
+            self,
+            slope=both @ self.slope,
+            ramp=both @ self.ramp,
+            variance=np.minimum(np.square(both) @ self.variance, UNKNOWN),
+            level_variance=np.square(both) @ self.level_variance,
+        )
 
     @property
     def rate_k_s(self) -> float:
         """Significant rate of the temperature; zero where it may be chance or there is no thermometer."""
-        k_s, variance = self.rate or (0.0, 0.0)
-        return k_s if abs(k_s) > 2.0 * math.sqrt(variance) else 0.0
-
-    def of(self, triad: Triad) -> Lines:
-        """Select one triad."""
-        return Lines(*(each[rows_of(triad)] for each in self.lines))
+        return 0.0 if self.rate is None or self.path is None else self.rate[0]
 
     def ahead(self, triad: Triad) -> Floats:
         """Difference between the reported mean, the end of a ramp, and the mean over the window; (3,)."""
-        return self.of(triad).ramp * self.half_s
+        return self.ramp[rows_of(triad)] * self.half_s
 
     def goes_on(self, triad: Triad) -> tuple[Floats, Floats]:
         """Slope that continues for some seconds, (3,), and its sigma: a ramp, or what the thermometer explains."""
-        lines, move = self.of(triad), self.warm_up[0 if triad == "gyro" else 1]
+        rows, move = rows_of(triad), self.warm_up[0 if triad == "gyro" else 1]
         prior = np.square(self.rate_k_s * move / WARM_UP_K)
-        share = np.where(lines.ramp != 0.0, 1.0, prior / np.maximum(prior + lines.variance, np.finfo(float).tiny))
-        return share * lines.slope, np.sqrt(share * lines.variance)
+        share = np.where(self.ramp[rows] != 0.0, 1.0, prior / (prior + self.variance[rows] + _TINY))
+        return share * self.slope[rows], np.sqrt(share * self.variance[rows])
 
     def unseen(self, powered_s: float) -> Floats:
         """Variance (6,) of the next minute's biases by an unseen slope: gyro (rad/s)^2, accelerometer (m/s^2)^2.
 
         `powered_s`: least age of the sensor at the end of the window.
         """
-        by_age = np.asarray(likely_k_s(powered_s) ** 2)
-        rate2 = by_age if self.rate is None else _bounded(by_age, np.asarray(self.rate[0]), np.asarray(self.rate[1]))
+        age_s = max(powered_s, 0.0)
+        steepest = math.exp(-age_s / QUICKEST_S) / QUICKEST_S if age_s < QUICKEST_S else 1.0 / (math.e * age_s)
+        rate2 = (WARM_UP_K / 2.0 * steepest) ** 2
+        if self.rate is not None:
+            rate2 = float(_mean_square(rate2, *self.rate))
         prior = rate2 * np.repeat(np.square(self.warm_up), 3) / WARM_UP_K**2
-        return _bounded(prior, self.lines.hidden, self.lines.hidden_variance) * (self.half_s + NEXT_S / 2.0) ** 2
+        return _mean_square(prior, self.slope - self.ramp, self.variance) * (self.half_s + NEXT_S / 2.0) ** 2
 
     def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
         """Explain a gyro sigma that is mostly warm-up; empty where it is not. `other_variance`: (6,), the rest."""
@@ -138,35 +133,28 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         return words
 
 
-def _bounded(prior: Floats, measured: Floats, variance: Floats) -> Floats:
+def _mean_square(prior: Floats | float, measured: Floats | float, variance: Floats | float) -> Floats:
     """Return the mean square of a slope that was measured with this variance and is likely as large as the prior."""
-    share = prior / np.maximum(prior + variance, np.finfo(float).tiny)
+    share = prior / (prior + variance + _TINY)
     return np.asarray(np.square(share * measured) + share * variance)
 
 
-def likely_k_s(powered_s: float) -> float:
-    """One sigma of the warming rate of a sensor that was switched on so long ago, K/s."""
-    age_s = max(powered_s, 0.0)
-    steepest = math.exp(-age_s / QUICKEST_S) / QUICKEST_S if age_s < QUICKEST_S else 1.0 / (math.e * age_s)
-    return WARM_UP_K / 2.0 * steepest
-
-
-def temperature_path(batches: Sequence[Batch]) -> Path | None:
-    """Temperature through a window; None where no change is known."""
+def temperature(batches: Sequence[Batch]) -> tuple[tuple[float, float] | None, Path | None]:
+    """Return `rate` and `path` of a `Warming`."""
     line, bent = _fitted(batches, 1), _fitted(batches, 2)
-    if line is None or abs(line[0][1]) < 2.0 * math.sqrt(line[1][1]):
-        return None
+    if line is None:
+        return None, None
+    rate = float(line[0][1]), float(line[1][1])
+    if abs(rate[0]) < 2.0 * math.sqrt(rate[1]):
+        return rate, None
     is_bent = bent is not None and abs(bent[0][2]) > _BENT_SIGMAS * math.sqrt(bent[1][2])
     (level, k_s, bend), (_, of_k_s, of_bend) = bent if bent is not None and is_bent else line
     half_s = (batches[-1].slot + 1.0 - batches[0].slot) / 2.0
     start, middle, end = (
         (float(level + k_s * at_s + bend * at_s**2), float(k_s + 2.0 * bend * at_s)) for at_s in (-half_s, 0.0, half_s)
     )
-    return Path(
-        states=(start, middle, end),
-        span_s=2.0 * half_s,
-        variance=float(of_k_s * half_s**2 + of_bend * (2.0 / 3.0 * half_s**2) ** 2),
-    )
+    variance = float(of_k_s * half_s**2 + of_bend * (2.0 / 3.0 * half_s**2) ** 2)
+    return rate, Path(states=(start, middle, end), span_s=2.0 * half_s, variance=variance)
 
 
 def _fitted(batches: Sequence[Batch], degree: int) -> tuple[Floats, Floats] | None:
@@ -198,23 +186,6 @@ def _resolution_k(degc: Floats) -> float:
         # As coarse as its digits allow.
         return next((step for step in _STEPS_K if abs(values[0] / step - round(values[0] / step)) < 1e-6), 0.0)
     return float(np.diff(values).min()) if len(values) <= 3 else 0.0
-
-
-def warming(rotation: Matrix, lines: Lines, warm_up: tuple[float, float], batches: Sequence[Batch]) -> Warming:
-    """Turn the slopes of one window into the vehicle's axes and add what the thermometer tells."""
-    both, square = np.kron(np.eye(2), rotation), np.kron(np.eye(2), np.square(rotation))
-    most = [np.minimum(each, _UNKNOWN) for each in (lines.hidden_variance, lines.variance)]
-    hidden_variance, variance = (np.minimum(square @ each, _UNKNOWN) for each in most)
-    line = _fitted(batches, 1)
-    return Warming(
-        lines=Lines(
-            both @ lines.hidden, hidden_variance, both @ lines.ramp, variance, np.asarray(square @ lines.level_variance)
-        ),
-        warm_up=warm_up,
-        half_s=(batches[-1].slot + 1.0 - batches[0].slot) / 2.0,
-        rate=None if line is None else (float(line[0][1]), float(line[1][1])),
-        path=temperature_path(batches),
-    )
 
 
 def drifting(name: str, ramps: Floats, temperatures_degc: Sequence[float]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from companion.config.sections import NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.estimation.means.integers import integer_columns
 from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
-from companion.estimation.means.warming import Lines, Warming, drifting, warming
+from companion.estimation.means.warming import UNKNOWN, Warming, drifting, temperature
 from companion.estimation.noise.allan import (
     FLOOR_OF_FLICKER,
     WARM_UP,
@@ -41,9 +41,6 @@ RAW_BATCHES: Final = 10
 """Seconds with means in floats that say enough of their own scatter."""
 RAW_STEP: Final = 1e-5
 """Their rounding: five decimals, rad/s and m/s^2."""
-_FLICKER_OF_SLOPE: Final = 0.5
-"""Share of the slope's variance by flicker and walk that counts as a hidden warm-up: V(T, H) has them already. With
-none of it 2 sigma cover 82 % of an ADIS16405's accelerometers in the steepest simulated ramp, with half 89 %."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
@@ -76,14 +73,6 @@ def integer_steps(imu: ImuInput) -> Floats | None:
     return np.where(steps > 0.0, steps, 1.0)
 
 
-class Hidden(msgspec.Struct, frozen=True):
-    """Doubt in the means of one triad of integers."""
-
-    words: str
-    useless: bool
-    """The means are no measurement; else good to half a step."""
-
-
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     """Means of one IMU over one still stretch; axes are the vehicle's FRD."""
 
@@ -101,8 +90,10 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
     """Warnings of a drift, unless a curve of the temperature explains it."""
-    hidden: dict[Triad, Hidden] = {}
-    """Triads whose noise spreads the integers too little for a mean."""
+    hidden: dict[Triad, str] = {}
+    """Words on triads whose noise spreads the integers too little for a mean: good to half a step."""
+    useless: frozenset[Triad] = frozenset()
+    """Triads of `hidden` whose means are no measurement at all."""
     named: bool = True
     """The part is known."""
     covariance: NDArray[np.float64] | None = None
@@ -116,8 +107,7 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
 
     def refused(self, part: Triad) -> str | None:
         """Return why the means of a triad are no measurement; None when they are one."""
-        found = self.hidden.get(part)
-        return found.words if found is not None and found.useless else None
+        return self.hidden[part] if part in self.useless else None
 
 
 class Window(msgspec.Struct, frozen=True, kw_only=True):
@@ -150,20 +140,13 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """N in force: measured, or the profile's where that is larger."""
     flicker: Floats
     walk: Floats
-    lines: Lines
+    warming: Warming
     half_step: NDArray[np.bool_]
     """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
     undecided: NDArray[np.bool_]
     """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
     useless: NDArray[np.bool_]
     """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
-
-
-class ImuEstimate(msgspec.Struct, frozen=True):
-    """Estimate of one IMU in its own axes and in the vehicle's."""
-
-    own: Estimate
-    window: ImuWindow
 
 
 def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float) -> Estimate:
@@ -182,13 +165,13 @@ def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
     wander = slope_variance(flicker, walk, end_s - slots[0]) if imu.profile.is_named else np.zeros(6)
     mean, leverage = robust_mean(values, whole.huber_c, whole.least), np.full(6, 1.0 / seconds)
-    slope, hidden, level = np.zeros(6), np.full(6, np.nan), values
-    if len(slots) >= RAMP_BATCHES:
+    slope, ramp, level = np.zeros(6), np.zeros(6), values
+    if is_long := len(slots) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s, whole.huber_c, whole.least)
         ramps = is_ramp(line, len(slots), wander)
-        slope, hidden = np.where(ramps, line.slope, 0.0), np.where(ramps, 0.0, line.slope)
-        level = values - slope * (times - times.mean())[:, None]
+        slope, ramp = line.slope, np.where(ramps, line.slope, 0.0)
+        level = values - ramp * (times - times.mean())[:, None]
         mean, leverage = np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage)
     measured = np.maximum(white_noise(slots, level), whole.least)
     white = np.maximum(measured, np.repeat([model.white for model in models], 3))
@@ -198,12 +181,12 @@ def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s
     quantum = np.sqrt(np.square(quantum) + np.mean([batch.shared_variance for batch in batches], axis=0))
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
-    going_on = np.square(slope * horizon_s / 2.0) / 3.0
+    going_on = np.square(ramp * horizon_s / 2.0) / 3.0
     white_part = np.square(white) * leverage
     rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
-    # Variance of a slope, infinite where there is no line.
     of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0)
-    of_line = of_line + 3.0 * np.square(quantum / (end_s - slots[0])) + np.where(np.isnan(hidden), np.inf, 0.0)
+    of_line = of_line + 3.0 * np.square(quantum / (end_s - slots[0])) + wander
+    rate, path = temperature(batches)
     return Estimate(
         mean=mean,
         stat_variance=np.square(measured) * leverage + np.square(quantum),
@@ -212,12 +195,15 @@ def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s
         white=white,
         flicker=flicker,
         walk=walk,
-        lines=Lines(
-            hidden=np.nan_to_num(hidden),
-            hidden_variance=np.where(slope != 0.0, 0.0, of_line + _FLICKER_OF_SLOPE * wander),
-            ramp=slope,
-            variance=of_line + wander,
+        warming=Warming(
+            slope=slope,
+            ramp=ramp,
+            variance=np.minimum(of_line, UNKNOWN) if is_long else np.full(6, UNKNOWN),
             level_variance=np.square(white) / seconds + rest,
+            warm_up=imu.profile.warm_up or WARM_UP,
+            half_s=(end_s - slots[0]) / 2.0,
+            rate=rate,
+            path=path,
         ),
         half_step=half_step,
         undecided=whole.unknown,
@@ -263,8 +249,8 @@ def imu_estimates(
     end_s: float,
     horizon_s: float,
     rejected: int,
-) -> list[ImuEstimate]:
-    """Estimate all IMUs from their good batches, which are of the same seconds.
+) -> list[tuple[Estimate, ImuWindow]]:
+    """Estimate all IMUs from their good batches, which are of the same seconds: in its own axes, and the vehicle's.
 
     `raw`: of those seconds, means in floats beside a stream of integers; by them where they know the gyros better.
 
@@ -274,23 +260,21 @@ def imu_estimates(
     for imu, seconds in zip(imus, batches, strict=True):
         _refuse_broken(imu, seconds)
     found = []
-    beside: Sequence[Sequence[Batch]] = raw or [()] * len(imus)
-    for imu, seconds, means in zip(imus, batches, beside, strict=True):
-        own = estimate(imu, seconds, end_s=end_s, horizon_s=horizon_s)
+    for imu, seconds, means in zip(imus, batches, raw or [()] * len(imus), strict=True):
+        used, by, own = imu, seconds, estimate(imu, seconds, end_s=end_s, horizon_s=horizon_s)
         if len(means) >= RAW_BATCHES:
             floats = msgspec.structs.replace(imu, gyro_step_rad_s=RAW_STEP, accel_step_m_s2=RAW_STEP, truncates=False)
             better = estimate(floats, means, end_s=end_s, horizon_s=horizon_s)
             if better.use_variance[:3].sum() < own.use_variance[:3].sum():
-                found.append(ImuEstimate(better, _imu_window(floats, means, better, rejected)))
-                continue
-        found.append(ImuEstimate(own, _imu_window(imu, seconds, own, rejected)))
+                used, by, own = floats, means, better
+        found.append((own, _imu_window(used, by, own, rejected)))
     return found
 
 
 def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     rotation = np.asarray(imu.rotation, dtype=np.float64)
-    gyro, accel = slice(0, 3), slice(3, 6)
+    gyro, accel, hidden = slice(0, 3), slice(3, 6), _hidden(imu, found)
     return ImuWindow(
         name=imu.name,
         samples=sum(batch.n for batch in batches),
@@ -303,11 +287,12 @@ def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, reject
         accel_sigma_use_m_s2=_turned(rotation, found.use_variance[accel]),
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
         warnings=tuple(_warnings(imu, batches, found, rejected)),
-        hidden=_hidden(imu, found),
+        hidden=hidden,
+        useless=frozenset(part for part in hidden if found.useless[rows_of(part)].any()),
         named=imu.profile.is_named,
         mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
-        warming=warming(rotation, found.lines, imu.profile.warm_up or WARM_UP, batches),
-        drifting=drifting(imu.name, found.lines.ramp, temperatures),
+        warming=found.warming.rotated(rotation),
+        drifting=drifting(imu.name, found.warming.ramp, temperatures),
     )
 
 
@@ -316,19 +301,16 @@ def _turned(rotation: Floats, variance: Floats) -> Vector:
     return vector(np.sqrt(np.square(rotation) @ variance))
 
 
-def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
-    found: dict[Triad, Hidden] = {}
+def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, str]:
+    found: dict[Triad, str] = {}
     steps = f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", f"{imu.accel_step_m_s2 / MG:.1f} mg"
     for part, step in zip(TRIADS, steps, strict=True):
-        undecided, useless_axes = own.undecided[rows_of(part)], own.useless[rows_of(part)]
+        undecided, useless = own.undecided[rows_of(part)], own.useless[rows_of(part)]
         if undecided.any():
-            useless = bool(useless_axes.any())
-            axes = _axes(useless_axes if useless else undecided)
-            what = "not known: bias and" if useless else "half a step unknown:"
-            found[part] = Hidden(
-                f"{part} {imu.name} {axes}: {what} noise smaller than its telemetry's steps of {step}: no"
-                " floats (ArduPilot: companion lua; PX4: its console)",
-                useless,
+            what = "not known: bias and" if useless.any() else "half a step unknown:"
+            found[part] = (
+                f"{part} {imu.name} {_axes(useless if useless.any() else undecided)}: {what} noise smaller than its"
+                f" telemetry's steps of {step}: no floats (ArduPilot: companion lua; PX4: its console)"
             )
     return found
 

@@ -106,21 +106,22 @@ def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[Imu
         along = expected.along.get(triad)
         if along is None or bias is None or imu.warming is None:
             continue
-        lines, half_s, slope = imu.warming.of(triad), imu.warming.half_s, np.array(along.slope)
+        rows, half_s, slope = rows_of(triad), imu.warming.half_s, np.array(along.slope)
+        ramp, of_line = imu.warming.ramp[rows], imu.warming.variance[rows]
         of_slope = np.array(along.slope_variance)
-        more = lines.slope - slope
-        if (np.abs(more) > _CONTRADICTS * np.sqrt(lines.variance + of_slope)).any():
+        more = imu.warming.slope[rows] - slope
+        if (np.abs(more) > _CONTRADICTS * np.sqrt(of_line + of_slope)).any():
             continue
         followed.append(triad)
-        share = of_slope / (lines.variance + of_slope)
+        share = of_slope / (of_line + of_slope)
         bend = np.maximum(np.array(along.shift_variance) - half_s**2 * of_slope, 0.0)
-        variance = half_s**2 * share * lines.variance + bend
-        rows, at = rows_of(triad), np.arange(6)[rows_of(triad)]
-        shift[rows] = np.array(along.shift) + half_s * (share * more - lines.ramp)
-        covariance[at, at] = shared.covariance[at, at] + lines.level_variance + variance
-        stat[rows] = np.sqrt(np.square(stat[rows]) * np.where(lines.ramp != 0.0, _END_OF_RAMP, 1.0) + variance)
+        variance = half_s**2 * share * of_line + bend
+        at = np.arange(6)[rows]
+        shift[rows] = np.array(along.shift) + half_s * (share * more - ramp)
+        covariance[at, at] = shared.covariance[at, at] + imu.warming.level_variance[rows] + variance
+        stat[rows] = np.sqrt(np.square(stat[rows]) * np.where(ramp != 0.0, _END_OF_RAMP, 1.0) + variance)
         # The slope may go on, or end now.
-        warm_up[rows] = (np.square(slope + share * more) / 3.0 + share * lines.variance) * (NEXT_S / 2.0) ** 2
+        warm_up[rows] = (np.square(slope + share * more) / 3.0 + share * of_line) * (NEXT_S / 2.0) ** 2
     gyro, accel = moved(imu.biases, shift)
     at_its_end = dataclasses.replace(
         imu, gyro_rad_s=gyro, accel_m_s2=accel, covariance=covariance, sigma_stat=stat, warm_up_variance=warm_up

@@ -22,7 +22,7 @@ from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.warming import Warming
-from companion.estimation.means.windows import Hidden, ImuWindow, Window
+from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, SiteRecord, WhenWarm
 from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Remedies
@@ -199,7 +199,7 @@ def solve(
     imus = tuple(
         _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in believed
     )
-    refusals = dict.fromkeys(hidden.words for imu in believed for triad, hidden in imu.hidden.items() if triad in asked)
+    refusals = dict.fromkeys(words for imu in believed for triad, words in imu.hidden.items() if triad in asked)
     if refusals and all(bias is None for imu in imus for bias in imu.biases):
         raise CalibrationRefusedError("; ".join(refusals))
     unknown = [(imu.name, triad) for triad in asked for imu in believed if imu.refused(triad)]
@@ -296,7 +296,7 @@ def _estimate(
         covariance=covariance,
         warm_up_variance=unseen,
         k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,
-        warnings=(*imu.warnings, *dict.fromkeys(of.words for triad, of in imu.hidden.items() if triad in asked)),
+        warnings=(*imu.warnings, *dict.fromkeys(words for triad, words in imu.hidden.items() if triad in asked)),
         drifting=imu.drifting if gyro is None or not wide else (*imu.drifting, wide),
         warming=imu.warming,
     )
@@ -315,8 +315,8 @@ def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
     """Hide triads with impossible biases, with cause and remedy in words. `up` (3,), vehicle FRD."""
     means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
     found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
-    hidden = {triad: Hidden(f"{words}; {local.remedies.any_bias}", useless=True) for triad, words in found.items()}
-    return msgspec.structs.replace(imu, hidden={**imu.hidden, **hidden}) if hidden else imu
+    hidden = imu.hidden | {triad: f"{words}; {local.remedies.any_bias}" for triad, words in found.items()}
+    return msgspec.structs.replace(imu, hidden=hidden, useless=imu.useless | found.keys())
 
 
 def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:

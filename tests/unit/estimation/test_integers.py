@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from companion.config.sections import NoiseProfile
 from companion.estimation.collector.outlook import is_enough
 from companion.estimation.means.integers import MIN_BEYOND_TWO, fit, shape_variance, truncation_edges
-from companion.estimation.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
+from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, imu_estimates, integer_steps
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu, settings
@@ -61,25 +61,28 @@ def filtered(
     return mean + sigma * rows
 
 
-def estimate(batches: list[Batch], profile: NoiseProfile = QUIET) -> ImuEstimate:
+Found = tuple[Estimate, ImuWindow]
+
+
+def estimate(batches: list[Batch], profile: NoiseProfile = QUIET) -> Found:
     return imu_estimates([stream(profile)], [batches], end_s=batches[-1].slot + 1.0, horizon_s=180.0, rejected=0)[0]
 
 
-def errors(found: ImuEstimate, mean_lsb: Floats) -> Floats:
+def errors(found: Found, mean_lsb: Floats) -> Floats:
     """(6,) in LSB."""
-    window = found.window
+    window = found[1]
     found_lsb: Floats = np.concatenate([window.gyro_rad_s, window.accel_m_s2]) / STEPS
     return found_lsb - mean_lsb
 
 
-def sigmas(found: ImuEstimate) -> Floats:
-    window = found.window
+def sigmas(found: Found) -> Floats:
+    window = found[1]
     found_lsb: Floats = np.concatenate([window.gyro_sigma_stat_rad_s, window.accel_sigma_stat_m_s2]) / STEPS
     return found_lsb
 
 
-def unknown(found: ImuEstimate) -> NDArray[np.bool_]:
-    return found.own.undecided
+def unknown(found: Found) -> NDArray[np.bool_]:
+    return found[0].undecided
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.386, 0.5, 1.0])
@@ -114,7 +117,7 @@ def test_noise_behind_a_filter_widens_sigma_by_what_it_scatters_from_second_to_s
     for _ in range(12):
         mean = rng.uniform(-3.0, 3.0, 6) + GRAVITY_LSB
         found = estimate(batches_of(filtered(rng, mean, 0.6, 30, rate_hz, cutoff_hz), rate_hz))
-        whites = np.sqrt(found.own.white_variance) / STEPS
+        whites = np.sqrt(found[0].white_variance) / STEPS
         pulls += (errors(found, mean) / whites)[~unknown(found)].tolist()
     assert len(pulls) > 50
     assert 0.75 < math.sqrt(np.mean(np.square(pulls))) < 1.2
@@ -129,8 +132,8 @@ def test_a_ramp_is_followed_to_its_end() -> None:
     found = estimate(batches_of(exact))
     off = errors(found, 0.8 + GRAVITY_LSB)
     assert abs(off[0]) * LSB_DEG_H < 15.0
-    assert any("drifts" in line for line in found.window.drifting)
-    assert not found.own.lines.ramp[1:3].any()
+    assert any("drifts" in line for line in found[1].drifting)
+    assert not found[0].warming.ramp[1:3].any()
 
 
 def test_a_knock_of_three_seconds_moves_the_mean_by_less_than_its_sigma() -> None:
@@ -166,7 +169,7 @@ def test_an_axis_of_two_values_takes_the_noise_of_its_neighbours_with_a_tenth_of
         exact = white(rng, np.zeros(6), 0.3, 60)
         exact[:, 0] *= ratio
         found = estimate(batches_of(exact + lsb))
-        assert found.window.refused("gyro") is None
+        assert found[1].refused("gyro") is None
         assert unknown(found)[:3].tolist() == [True, False, False]
         off = errors(found, lsb)[0]
         assert abs(off) * LSB_DEG_H < 60.0
@@ -181,10 +184,10 @@ def test_two_distinct_values_off_zero_cost_half_a_step_and_a_warning() -> None:
     assert unknown(found).all()
     assert np.abs(off).max() <= 0.5
     assert sigmas(found) == pytest.approx([0.5] * 6, rel=0.02)
-    assert "half a step" in found.window.hidden["gyro"].words
-    assert found.window.refused("gyro") is None
+    assert "half a step" in found[1].hidden["gyro"]
+    assert found[1].refused("gyro") is None
     # More seconds may bring the third value: never enough before the time is up.
-    assert not is_enough(settings(), [found])
+    assert not is_enough(settings(), [found[0]])
 
 
 @pytest.mark.parametrize("mean", [0.5, -0.4, 0.97, -1.02, 0.0])
@@ -192,7 +195,7 @@ def test_two_values_or_one_around_zero_are_refused_with_what_to_do(mean: float) 
     rng = np.random.default_rng(9)
     lsb = np.array([mean, 5.3, -4.1, *GRAVITY_LSB[3:]])
     found = estimate(batches_of(white(rng, lsb, 0.05, 20)))
-    window = found.window
+    window = found[1]
     refused = window.refused("gyro")
     assert refused is not None
     assert "fc2 x" in refused

@@ -47,7 +47,7 @@ def batches_of(means: Floats, *, spread: float = 1.0, n: int = 100) -> list[Batc
 
 
 def window_of(source: ImuInput, batches: list[Batch], horizon_s: float = 180.0):  # type: ignore[no-untyped-def]
-    return imu_estimates([source], [batches], end_s=batches[-1].slot + 1.0, horizon_s=horizon_s, rejected=0)[0].window
+    return imu_estimates([source], [batches], end_s=batches[-1].slot + 1.0, horizon_s=horizon_s, rejected=0)[0][1]
 
 
 @pytest.mark.parametrize("seconds", [10, 30, 60])
@@ -129,7 +129,7 @@ def test_rounding_with_enough_noise_costs_nothing_and_seconds_without_counts_cos
     assert min(truncated.gyro_sigma_stat_rad_s) > 0.5
     assert np.subtract(truncated.gyro_rad_s, exact.gyro_rad_s) == pytest.approx([0.5] * 3, abs=0.01)
     assert truncated.accel_sigma_stat_m_s2 == exact.accel_sigma_stat_m_s2
-    assert "half a step" in truncated.hidden["gyro"].words
+    assert "half a step" in truncated.hidden["gyro"]
 
 
 def test_the_bound_for_rounding_covers_its_bias() -> None:
