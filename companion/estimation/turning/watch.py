@@ -3,6 +3,10 @@
 The witnesses are the slope of the heading since the last movement, and the gyros against their level at rest. A heading
 that turns while the gyros stay at their level is a magnetic field that turns. Gyros that leave their level while the
 heading stands have changed themselves. One gyro without compass cannot tell a turn from a new bias.
+
+A gyro's bias does not jump; a platform that begins to turn does. The mean rate at rest before the current window
+therefore bounds the turn within it. The bound depends on the part: white noise of both means, flicker and random walk
+in between, and warm-up, from the thermometer or from the slope of the rates.
 """
 
 from __future__ import annotations
@@ -13,13 +17,40 @@ from collections.abc import Mapping
 from typing import Final
 
 import msgspec
+import numpy as np
 
-from companion.config.sections import NoiseProfile
+from companion.config.sections import AllanModel, NoiseProfile
+from companion.estimation.noise.allan import floor_variance
+from companion.estimation.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.estimation.seconds.batch import Batch
-from companion.estimation.turning.level import ImuLevel
-from companion.estimation.turning.turn import Turn, by_both, by_compass, by_gyros
-from companion.physics.frames import Matrix, vector, wrap_deg
+from companion.estimation.turning.turn import SIGNIFICANT, Turn, by_both, by_compass, by_gyros
+from companion.physics.frames import Array, Floats, Matrix, vector
+from companion.physics.units import DEG, DEG_H
 
+LEVEL_S: Final = 5
+"""Least seconds at rest that make a level."""
+RESTED_S: Final = 20
+"""Least seconds before a step within a window: just after switching on, a gyro warms up as fast as a step."""
+NOISE_KNOWN_S: Final = 20
+"""Least seconds that show the white noise of their means; before that, the noise of the last window holds."""
+PER_K_RAD_S: Final = 54.0 * DEG_H
+"""Bias of a common gyro per kelvin (BMI088, method 2.1)."""
+PER_G_RAD_S: Final = 0.1 * DEG
+"""Sensitivity of an uncompensated MEMS gyro to gravity: another tilt gives another level."""
+EARTH_RAD_S: Final = 15.04 * DEG_H
+WARMING_S: Final = 120.0
+"""A warm-up that is visible now may have been twice as steep for so long; an invisible one is over after it."""
+WARMING_RAD_S2: Final = 0.5 * DEG_H
+"""Drift of an older level without thermometer, at most by `WARMED_RAD_S`."""
+WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
+RAMP_SIGMAS: Final = 1.5
+HINT_SIGMAS: Final = 2.0
+"""A smaller step is chance."""
+STEP_SIGMAS: Final = 5.0
+STEP_CHI_SQUARE: Final = 12.0
+"""Gain of a step over a cubic, a warm-up, from which it is sure."""
+ACROSS_SHARE: Final = 0.25
+"""Share of a turn about the vertical that an error of the vertical, some degrees, shows in the level plane."""
 STEADY_SIGMAS: Final = 2.5
 """Seconds that are farther off do not join the level: a slow turn would become the level."""
 CLEARED_S: Final = 10
@@ -28,6 +59,175 @@ SMOOTHED_OVER: Final = 5
 """Headings in one value of the wander, so that noise does not look like wander."""
 BLIND_S: Final = 5
 """Longest pause, for example while offsets are written, after which headings still belong together."""
+
+_SLOT: Final = 0
+_RATES: Final = slice(1, 4)
+_READINGS: Final = slice(1, 7)
+"""Rates and forces, vehicle FRD."""
+_DEGC: Final = 7
+"""NaN without a thermometer."""
+_TURNED: Final = 8
+"""Variance of the platform's rate by the compass, for seconds of the level; NaN without a compass."""
+
+
+class ImuLevel:
+    """Seconds of one IMU: those of the current window, and those at rest before it, which are its level.
+
+    `rotation`: sensor to vehicle FRD; `steps`: resolution of its stream, rad/s and m/s^2, 0 for floats.
+    """
+
+    def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
+        self._gyro, self._steps, self._span = profile.gyro, steps, span
+        self._turned = np.kron(np.eye(2), rotation)
+        self._least = np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
+        """N, B and K of its six channels."""
+        self._white = np.zeros(6)
+        """White noise of the last window that was long enough to show it; only that of the gyros is kept."""
+        self.window: deque[Floats] = deque()
+        self.rest: deque[Floats] = deque(maxlen=2 * span)
+        """The level."""
+        self.turn: Turn | None = None
+        """Rate about the vertical above the level at rest; None without a level."""
+        self.has_changed = False
+        """Part of that rate lies in the level plane, as no turn of the ground does: the sensor itself has changed."""
+        self.tilting_rad_s: Array = np.zeros(3)
+        """Rotation of the direction of gravity: (3,) horizontal, vehicle FRD."""
+        self.tilting_variance = 0.0
+        """Variance of each component."""
+        self.began: int | None = None
+        """First second after a step of the rate that neither the part's noise nor a warm-up explains."""
+        self.step_rad_s = 0.0
+        """Error that the likeliest step leaves in the mean of the window; 0 where it is chance."""
+        self.white = 0.0
+        """White noise N about the vertical."""
+
+    def add(self, slot: int, batch: Batch, turned: float | None) -> None:
+        """Add a still second; one that leaves the window joins the level, with `turned` as in `end_window`."""
+        degc = math.nan if batch.temperature_degc is None else batch.temperature_degc
+        self.window.append(np.array([slot, *self._turned @ batch.mean, degc, math.nan]))
+        self._variance = batch.variance
+        self.end_window(turned, self._span)
+
+    def end_window(self, turned: float | None, kept: int = 0) -> None:
+        """End the window but for the latest seconds; the others join the level.
+
+        `turned`: variance of the platform's rate by the compass, NaN without; None: it turns, and they do not join.
+        """
+        while len(self.window) > kept:
+            second = self.window.popleft()
+            if turned is None:
+                continue
+            usual = self._usual()
+            if math.isnan(usual) and not math.isnan(turned):
+                self.rest.clear()
+            second[_TURNED] = usual if math.isnan(turned) else turned
+            self.rest.append(second)
+
+    def split(self, slot: int) -> None:
+        """Make the seconds before a step the level; drop those after it."""
+        turned = self._usual()
+        self.rest.clear()
+        while self.window and self.window[-1][_SLOT] >= slot:
+            self.window.pop()
+        self.end_window(turned)
+
+    def _usual(self) -> float:
+        """Variance of the platform's rate during the level."""
+        return sum(float(second[_TURNED]) for second in self.rest) / len(self.rest) if self.rest else math.nan
+
+    def look(self) -> bool:
+        """Compare the window with the level, if there is one, and with gravity; return False while it is too short."""
+        if len(self.window) < FEWEST:
+            return False
+        window = np.array(self.window)
+        slots, rows = window[:, _SLOT].astype(np.int64), window[:, _READINGS]
+        # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, which is enough here.
+        force = rows[:, 3:].mean(axis=0)
+        size = _length(force)
+        down = np.asarray(-force / size)
+        shows_noise = len(slots) >= NOISE_KNOWN_S
+        slope = fit_slope(
+            slots,
+            rows,
+            white=self._least[0] if shows_noise else np.maximum(self._least[0], self._white),
+            flicker=self._least[1],
+            walk=self._least[2],
+            hidden=np.array([hidden_by_steps(self._steps[k // 3], float(self._variance[k])) for k in range(6)]),
+        )
+        if shows_noise:
+            self._white[:3] = slope.white[:3].max()
+        self.white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
+        self.began, self.step_rad_s = None, 0.0
+        if self._steps[0] == 0.0 and len(window) >= RESTED_S + LEVEL_S:
+            self.began, self.step_rad_s = _step(window[:, _SLOT], window[:, _RATES] @ down, self.white, self._gyro)
+        self.turn, self.has_changed = self._above_level(window, slope, down)
+        up, moves = -down, slope.per_s[3:] / size
+        # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
+        self.tilting_rad_s = np.cross(moves - up * (up @ moves), up)
+        self.tilting_variance = float(slope.variance[3:].max()) / size**2
+        return True
+
+    def _above_level(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn | None, bool]:
+        """Return the rate above the level about the vertical, and whether another part is above it too."""
+        count, weight = len(window), len(self.rest)
+        if weight < LEVEL_S:
+            return None, False
+        level = np.array(self.rest).mean(axis=0)
+        now = window.mean(axis=0)
+        off = now[_RATES] - level[_RATES]
+        unseen = float(np.nan_to_num(level[_TURNED]))
+        age_s = float(now[_SLOT] - level[_SLOT])
+        gap_s = max(age_s - (count + weight) / 2.0, 0.0)
+        noise = np.square(slope.white[:3]) * (1.0 / count + 1.0 / weight)
+        noise = noise + floor_variance(self._gyro.flicker, self._gyro.walk, weight, count + 2.0 * gap_s)
+        # Warm-up: as fast as the rates show, or as the thermometer says.
+        ramp = np.abs(slope.per_s[:3])
+        ramp = np.where(ramp > RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
+        if math.isfinite(now[_DEGC] - level[_DEGC]):
+            warmed = PER_K_RAD_S * float(now[_DEGC] - level[_DEGC])
+        else:
+            warmed = min(WARMING_RAD_S2 * max(age_s - WARMING_S, 0.0), WARMED_RAD_S)
+        # Integers of the stream hide up to half a step each time.
+        hidden = 0.5 * self._steps[0]
+        leaned = _length(down + level[4:7] / _length(level[4:7]))
+        felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
+        variance = noise + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
+        along = float(off @ down)
+        across = np.abs(off - along * down)
+        # The heading may be another one: the Earth's rate then points elsewhere in the level plane.
+        limit = SIGNIFICANT * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
+        turn = Turn(
+            rate_rad_s=along,
+            sigma_rad_s=math.sqrt(np.square(down) @ variance + unseen),
+            noise_rad_s=math.sqrt(np.square(down) @ noise + unseen),
+            by="gyros",
+            is_vouched=math.isfinite(level[_TURNED]),
+        )
+        return turn, bool((across > limit).any())
+
+
+def _length(vector: Floats) -> float:
+    return math.sqrt(vector @ vector)
+
+
+def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tuple[int | None, float]:
+    """Return `began` and `step_rad_s` for (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`."""
+    count = len(values)
+    values = values - values.mean()
+    before = np.arange(RESTED_S, count - LEVEL_S + 1)
+    after = count - before
+    jump = -np.cumsum(values)[before - 1] * (1.0 / after + 1.0 / before)
+    chance = white**2 * (1.0 / before + 1.0 / after)
+    best = int(np.argmax(np.square(jump) / chance))
+    first, last = float(before[best]), float(after[best])
+    sigma = math.sqrt(chance[best] + floor_variance(model.flicker, model.walk, first, last))
+    if abs(jump[best]) <= HINT_SIGMAS * sigma:
+        return None, 0.0
+    time = (slots - slots[0]) / (slots[-1] - slots[0])
+    basis, _ = np.linalg.qr(np.vander(time, 4))
+    better = jump[best] ** 2 / chance[best] - np.square(values @ basis).sum() / white**2
+    is_sure = abs(jump[best]) > STEP_SIGMAS * sigma and better > STEP_CHI_SQUARE
+    return int(slots[before[best]]) if is_sure else None, abs(float(jump[best])) * last / count
 
 
 class TurnWatch:
@@ -50,7 +250,6 @@ class TurnWatch:
         """Rate as of the last second."""
         self.words = ""
         """Reason why no calibration is possible, for a pilot; empty without one."""
-        self._forget_headings()
 
     def set_imu(self, name: str, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float]) -> None:
         """Add an IMU, or begin anew with another stream of it; arguments as for `ImuLevel`."""
@@ -60,32 +259,31 @@ class TurnWatch:
         """Drop readings of one IMU, or of all: they are not comparable with later ones."""
         for name, level in self._levels.items():
             if imu is None or name == imu:
-                level.forget()
+                level.window.clear()
+                level.rest.clear()
 
     def new_stretch(self) -> None:
         """End the still stretch; its seconds join the levels."""
         turned = self._turned()
         for level in self._levels.values():
-            level.new_stretch(turned)
+            level.end_window(turned if level.rest or len(level.window) >= LEVEL_S else None)
         self._headings = deque(((False, batch) for _, batch in self._headings), maxlen=self._span)
         self._start = None
         self.turn = Turn()
 
     def moved(self) -> None:
         """The gyros or the gradienter felt a movement."""
-        self._forget_headings()
+        self._headings.clear()
         self._is_suspect = True
         self.words = ""
 
-    def _forget_headings(self) -> None:
-        self._headings.clear()
-        self._smoothed: deque[float] = deque(maxlen=SMOOTHED_OVER)
-        self._low_deg, self._high_deg = math.inf, -math.inf
-
     @property
     def wander_deg(self) -> float | None:
-        """Range of the heading since the last movement; None until enough is known."""
-        return self._high_deg - self._low_deg if math.isfinite(self._low_deg) else None
+        """Range of the heading since the last movement, in the longest window at most; None until enough is known."""
+        turned = np.unwrap([float(batch.mean[0]) for _, batch in self._headings], period=360.0)
+        if len(turned) < SMOOTHED_OVER:
+            return None
+        return float(np.ptp(np.convolve(turned, np.full(SMOOTHED_OVER, 1.0 / SMOOTHED_OVER), "valid")))
 
     def add_second(self, slot: int, imus: Mapping[str, Batch], heading: Batch | None, *, good: bool) -> bool:
         """Add a second in which nothing but, perhaps, the compass has moved; False where the stretch ends with it.
@@ -97,10 +295,10 @@ class TurnWatch:
             good: whether the second belongs to a still stretch.
         """
         if slot - self._last_slot > BLIND_S:
-            self._forget_headings()
+            self._headings.clear()
         self._last_slot = slot
         if heading is not None:
-            self._add_heading(heading, good=good)
+            self._headings.append((good, heading))
         if good:
             self._start = slot if self._start is None else self._start
             turned = self._turned()
@@ -108,15 +306,6 @@ class TurnWatch:
                 if name in imus:
                     level.add(slot, imus[name], turned)
         return self._judge(slot)
-
-    def _add_heading(self, heading: Batch, *, good: bool) -> None:
-        self._headings.append((good, heading))
-        value = float(heading.mean[0])
-        last = self._smoothed[-1] if self._smoothed else value
-        self._smoothed.append(last + wrap_deg(value - last))
-        if len(self._smoothed) == SMOOTHED_OVER:
-            smooth = sum(self._smoothed) / SMOOTHED_OVER
-            self._low_deg, self._high_deg = min(self._low_deg, smooth), max(self._high_deg, smooth)
 
     def _turned(self) -> float | None:
         """Variance of the rate by the compass, NaN without; None where seconds cannot join a level at rest."""
@@ -128,15 +317,15 @@ class TurnWatch:
         return turn.variance if turn.by in ("compass", "compass and gyros") else math.nan
 
     def _judge(self, slot: int) -> bool:
-        found = {name: one for name, level in self._levels.items() if (one := level.evidence())}
+        found = [level for level in self._levels.values() if level.look()]
         # A turn is in all gyros; the quietest shows its beginning best.
-        quietest = min(found.values(), key=lambda one: one.white, default=None)
+        quietest = min(found, key=lambda one: one.white, default=None)
         if quietest is not None and quietest.began is not None:
             for level in self._levels.values():
                 level.split(quietest.began)
             self._is_suspect = True
             return False
-        gyros = by_gyros([one.turn for one in found.values() if one.turn is not None and not one.has_changed])
+        gyros = by_gyros([one.turn for one in found if one.turn is not None and not one.has_changed])
         seen = by_compass([batch for _, batch in self._headings])
         if seen is None or not seen.is_significant:
             # A jump of the compass may lie before the still stretch.
@@ -144,11 +333,11 @@ class TurnWatch:
         turn = by_both(gyros, seen)
         # A gyro has changed itself if other gyros or a heading that stands contradict it.
         others = gyros or turn if turn.is_significant else turn
-        for name, one in found.items():
+        for one in found:
             if one.turn is not None and (one.has_changed or one.turn.contradicts(others)):
-                self._levels[name].forget_level()
+                one.rest.clear()
         if quietest is not None:
-            surest = min(found.values(), key=lambda one: one.tilting_variance)
+            surest = min(found, key=lambda one: one.tilting_variance)
             turn = msgspec.structs.replace(
                 turn,
                 tilting_rad_s=vector(surest.tilting_rad_s),
@@ -160,15 +349,13 @@ class TurnWatch:
         is_long = self._start is not None and slot - self._start >= CLEARED_S
         if is_long and abs(turn.rate_rad_s) <= STEADY_SIGMAS * noise:
             self._is_suspect = False
-        turns = turn.is_significant and (turn.by != "gyros" or self._is_suspect)
-        self.words = self._turning() if turns else ""
+        self.words = ""
+        if turn.is_significant and (turn.by != "gyros" or self._is_suspect):
+            self.words = f"the aircraft {turn.in_words}"
+            if turn.by == "compass and gyros":
+                self.words += ": gyros and compass turn together"
+            elif turn.by == "gyros" and len(self._levels) == 1:
+                self.words += (
+                    f", or gyro {next(iter(self._levels))} has changed: if it stands still, restart the companion"
+                )
         return True
-
-    def _turning(self) -> str:
-        words = f"the aircraft {self.turn.in_words}"
-        if self.turn.by == "compass and gyros":
-            return f"{words}: gyros and compass turn together"
-        if self.turn.by == "gyros" and len(self._levels) == 1:
-            (name,) = self._levels
-            return f"{words}, or gyro {name} has changed: if it stands still, restart the companion"
-        return words
