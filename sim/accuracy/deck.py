@@ -106,7 +106,7 @@ def sail(
         found = deck.work(range(1, 1 + span)).run()
         if isinstance(found, CalibrationRefusedError):
             raise found
-        error, sigma = _against_the_truth(found.window, imu, tilt, compass)
+        error, sigma = _against_the_truth(found[0], imu, tilt, compass)
         errors.append(error)
         sigmas.append(sigma)
     return Errors(np.array(errors), np.array(sigmas))

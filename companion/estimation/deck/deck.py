@@ -10,7 +10,7 @@ import functools
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -84,12 +84,8 @@ class Stream:
         if last is None:
             return gap_s <= LONGEST_GAP_S
         whole = np.vstack([last, own])
-        rates = whole[:, 1:4]
-        step_s = float(np.median(np.diff(whole[:, 0]).tolist()))
-        second = rates[2:] - 2.0 * rates[1:-1] + rates[:-2]
-        white2 = float(np.square(second).mean()) / 6.0 * step_s if len(second) else 0.0
-        self.seconds.append(ImuSecond(batch, passage(whole[:, 0], rates, whole[:, 4:]), white2))
-        while self.levels and next(iter(self.levels)) < self.seconds[0].batch.slot:
+        self.seconds.append((batch, passage(whole[:, 0], whole[:, 1:4], whole[:, 4:])))
+        while self.levels and next(iter(self.levels)) < self.seconds[0][0].slot:
             del self.levels[next(iter(self.levels))]
         return True
 
@@ -189,9 +185,7 @@ class Deck(WindowSource):
 
     def common(self, since_s: float | None = None) -> range:
         """Return the seconds of all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
-        ends = [
-            (one.seconds[0].batch.slot, one.seconds[-1].batch.slot) for one in self._streams.values() if one.seconds
-        ]
+        ends = [(one.seconds[0][0].slot, one.seconds[-1][0].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)
         begin, now = max(first for first, _ in ends), min(last for _, last in ends) + 1
@@ -214,7 +208,7 @@ class Deck(WindowSource):
         streams = self._streams.values()
         estimate = DeckWindow(
             imus=[stream.imu for stream in streams],
-            seconds=[[one for one in stream.seconds if one.batch.slot in slots] for stream in streams],
+            seconds=[[one for one in stream.seconds if one[0].slot in slots] for stream in streams],
             levels=[{slot: one for slot, one in stream.levels.items() if slot in slots} for stream in streams],
             headings={slot: heading for slot, heading in self._headings.items() if slot in slots},
             slots=slots,
@@ -229,7 +223,7 @@ class Deck(WindowSource):
         """Keep what the work has found; return False if it comes too late."""
         if not super().accept(work, found):
             return False
-        if work.since_s is None and isinstance(found, DeckFound) and (tilt := found.window.tilt) is not None:
+        if work.since_s is None and isinstance(found, tuple) and (tilt := found[0].tilt) is not None:
             self._reference_deg = tilt.x_deg, tilt.y_deg
         return True
 
@@ -240,7 +234,7 @@ class Deck(WindowSource):
 
         def window() -> Window | CalibrationRefusedError:
             found: DeckFound | CalibrationRefusedError = estimate()
-            return found.window if isinstance(found, DeckFound) else found
+            return found[0] if isinstance(found, tuple) else found
 
         return Measurement(slots=slots, estimate=window)
 
@@ -254,37 +248,28 @@ class Deck(WindowSource):
         if isinstance(found, CalibrationRefusedError):
             return status(enough=False, progress=0.0, measuring=str(found))
         targets = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
-        span_s = found.window.end_s - found.window.start_s
-        aims = [aim(span_s, known, targets[at % 2]) for at, known in enumerate(found.known)]
-        if all(each.sigma <= each.goal for each in aims):
+        window, known = found
+        span_s = window.end_s - window.start_s
+        aims = [aim(span_s, each, targets[at % 2]) for at, each in enumerate(known)]
+        if all(sigma <= goal for sigma, goal, _ in aims):
             return status(enough=True, progress=1.0, measuring="sigma is good enough")
         if seconds >= MAX_S:
             return status(enough=True, progress=1.0, measuring=f"measured for {MAX_S // 60} min")
-        at, last = max(enumerate(aims), key=lambda each: each[1].whole_s)
-        left_s = max(last.whole_s - seconds, 1)
+        at, (sigma, goal, whole_s) = max(enumerate(aims), key=lambda each: each[1][2])
+        left_s = max(whole_s - seconds, 1)
         left, unit = more(left_s), UNITS[TRIADS[at % 2]]
-        words = f"{left}: {last.in_words(unit.si, unit.name)}"
+        words = f"{left}: {progress(sigma / unit.si, goal / unit.si, unit.name)}"
         return status(enough=False, progress=seconds / (seconds + left_s), measuring=words, left=left)
 
     def _at_least(self, needed: int) -> str:
         return f"at least {max(needed - self.seconds, 1)} s more"
 
 
-class Aim(NamedTuple):
-    """The sigma that a triad is measured to: the target, or all that more time can give."""
+def aim(span_s: float, known: TriadVariances, target: float) -> tuple[float, float, float]:
+    """Return sigma, goal and the predicted length of the window that reaches the goal, s.
 
-    sigma: float
-    goal: float
-    whole_s: float
-    """Predicted length of the window that reaches the goal."""
-
-    def in_words(self, unit: float, name: str) -> str:
-        """Give '12 deg/h, goal 6.1'."""
-        return f"{_figure(self.sigma / unit)} {name}, goal {_figure(self.goal / unit)}"
-
-
-def aim(span_s: float, known: TriadVariances, target: float) -> Aim:
-    """Return the aim of a triad by the newest estimate, from a window of so many seconds."""
+    The goal is the target, or all that more time can give. `known` is from a window of `span_s` seconds.
+    """
     use, white = known
     floor = use - white
     goal = max(target**2, floor * (1.0 + WHITE_SHARE))
@@ -292,7 +277,12 @@ def aim(span_s: float, known: TriadVariances, target: float) -> Aim:
     if use > goal:
         wanted = (goal - floor) / white
         whole_s = min(span_s * wanted ** (-1.0 / _FALLS), MAX_S) if wanted > 0.0 else MAX_S
-    return Aim(math.sqrt(use), math.sqrt(goal), whole_s)
+    return math.sqrt(use), math.sqrt(goal), whole_s
+
+
+def progress(sigma: float, goal: float, unit: str) -> str:
+    """Give '12 deg/h, goal 6.1'."""
+    return f"{_figure(sigma)} {unit}, goal {_figure(goal)}"
 
 
 def more(left_s: float) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -56,22 +56,10 @@ TriadVariances = tuple[float, float]
 """Largest variance of the axes of a triad, and the part of it that more seconds take away."""
 
 
-class DeckFound(NamedTuple):
-    """A window, and how far it is."""
-
-    window: Window
-    known: tuple[TriadVariances, ...]
-    """Gyros and accelerometers of one IMU after another."""
-
-
-class ImuSecond(NamedTuple):
-    """One second of one IMU."""
-
-    batch: Batch
-    """In the sensor's axes."""
-    passage: Passage
-    white2: float
-    """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
+DeckFound = tuple[Window, Sequence[TriadVariances]]
+"""A window, and how far it is: gyros and accelerometers of one IMU after another."""
+ImuSecond = tuple[Batch, Passage]
+"""One second of one IMU; the batch is in the sensor's axes."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +115,7 @@ class DeckWindow:
             heading=None if self.compass is None else self._heading(last, self.compass),
             turn_rad_s=vector(last.turn_rad_s),
         )
-        return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
+        return window, [known for _, triads, _ in found for known in triads]
 
     def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
         """Return the seconds in which a sensor repeated one reading while it was swayed.
@@ -139,7 +127,7 @@ class DeckWindow:
             return set()
         slots, values = np.array(list(readings)), np.array(list(readings.values()))
         changes = np.abs(np.diff(values, axis=0)).max(axis=1) > _SAME
-        rates = {one.batch.slot: one.batch.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        rates = {batch.slot: batch.mean[:3] @ self.imus[0].rotation.T for batch, _ in self.seconds[0]}
         found: set[int] = set()
         for run in np.split(slots, np.flatnonzero(changes) + 1):
             swayed = [rates[slot][:2] for slot in run if slot in rates]
@@ -163,11 +151,11 @@ class DeckWindow:
         compared = None if gradienter is None else compare(levels)
         believed = self._believed(imu, seconds, reference, compared)
         forward = np.array([1.0, 0.0, 0.0]) if self.compass is None else self.compass.vehicle_from_sensor[:, 0]
-        found = smooth([one.passage for one in seconds], headings, forward, believed)
+        found = smooth([passage for _, passage in seconds], headings, forward, believed)
         direction, own = _felt(found, gradienter, reference, compared)
         gyro_own = found.gyro_covariance
         mean_rate = np.linalg.norm(found.turn_rad_s)
-        steps = _hidden_steps(imu, seconds)
+        steps = _hidden_steps(imu, [batch for batch, _ in seconds])
         going_on = np.square(found.ramp_rad_s2 * self.horizon_s / 2.0) / 3.0
         gyro, accel = imu.profile.gyro, imu.profile.accel
         to_come = _FLICKER_TO_COME * gyro.flicker**2 + gyro.walk**2 * self.horizon_s / 3.0
@@ -181,10 +169,10 @@ class DeckWindow:
         covariance[3:, 3:] = own + np.diag(accel_floor)
         use = np.sqrt(np.diag(covariance))
         heading_rad = math.atan2(found.body_to_ned[-1, 1, 0], found.body_to_ned[-1, 0, 0])
-        temperatures = [one.batch.temperature_degc for one in seconds if one.batch.temperature_degc is not None]
+        temperatures = [batch.temperature_degc for batch, _ in seconds if batch.temperature_degc is not None]
         window = ImuWindow(
             name=imu.name,
-            samples=sum(one.batch.n for one in seconds),
+            samples=sum(batch.n for batch, _ in seconds),
             duration_s=span_s,
             gyro_rad_s=vector(found.gyro_rad_s),
             accel_m_s2=vector(direction),
@@ -221,7 +209,7 @@ class DeckWindow:
         model = imu.profile.gyro
         white = model.white
         if not imu.profile.is_named:
-            white = max(white, math.sqrt(float(np.mean([one.white2 for one in seconds]))))
+            white = max(white, math.sqrt(float(np.mean([passage.white2 for _, passage in seconds]))))
         slope = slope_variance(np.array(model.flicker), np.array(model.walk), float(len(seconds)))
         return Believed(
             accel_m_s2=accel,
@@ -267,12 +255,12 @@ def _felt(
     return size * up / float(up @ right), covariance + np.outer(right, right) * found.force_sigma_m_s2**2
 
 
-def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
+def _hidden_steps(imu: ImuInput, batches: Sequence[Batch]) -> Array:
     """Return the variance (6,) that integers hide where the swaying does not spread them, and that of shared errors."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    means = np.array([one.batch.mean for one in seconds])
-    spread = np.sqrt(means.var(axis=0) + np.mean([one.batch.variance for one in seconds], axis=0))
+    means = np.array([batch.mean for batch in batches])
+    spread = np.sqrt(means.var(axis=0) + np.mean([batch.variance for batch in batches], axis=0))
     hidden = np.where(spread < _SPREAD * steps, np.square(steps / 2.0), 0.0)
-    hidden = hidden + np.mean([one.batch.shared_variance for one in seconds], axis=0)
+    hidden = hidden + np.mean([batch.shared_variance for batch in batches], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

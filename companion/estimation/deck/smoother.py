@@ -92,7 +92,7 @@ class _Stretch:
 
     def __init__(self, passages: Sequence[Passage]) -> None:
         columns = zip(*passages, strict=True)
-        self.spans, self.turn, self.turned, self.velocity, self.by_bias = map(np.array, columns)
+        self.spans, self.turn, self.turned, self.velocity, self.by_bias, _ = map(np.array, columns)
 
     @property
     def ends(self) -> Floats:
@@ -136,26 +136,25 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         attitudes = stretch.attitudes(start, bias)
         forces = stretch.forces(attitudes, bias, believed.accel_m_s2)
         system = _System.of(stretch, attitudes, forces, (headings_rad, compass_forward), believed.compass_lag_s)
-        answer = system.solve(noise, believed, _NO_RAMP)
-        noise = system.noise(answer)
-        start = rotations(answer.values[_START]) @ start
-        bias = bias + answer.values[_GYRO]
-        if (np.square(answer.values[_GYRO]) < _NEAR**2 * np.diag(answer.covariance)[_GYRO]).all():
+        values, covariance, by_earth = system.solve(noise, believed, _NO_RAMP)
+        noise = system.noise(values)
+        start = rotations(values[_START]) @ start
+        bias = bias + values[_GYRO]
+        if (np.square(values[_GYRO]) < _NEAR**2 * np.diag(covariance)[_GYRO]).all():
             break
     assert noise is not None
     ramping = system.solve(noise, believed, _UNKNOWNS)
-    chance = np.sqrt(np.diag(ramping.covariance)[_RAMP] + believed.gyro_slope**2)
-    if (np.abs(ramping.values[_RAMP]) > RAMP_T * chance).any():
-        ramping = system.solve(system.noise(ramping), believed, _UNKNOWNS)
-        bias = bias + ramping.values[_GYRO]
-        answer, ramp = ramping, ramping.values[_RAMP]
+    chance = np.sqrt(np.diag(ramping[1])[_RAMP] + believed.gyro_slope**2)
+    if (np.abs(ramping[0][_RAMP]) > RAMP_T * chance).any():
+        values, covariance, by_earth = system.solve(system.noise(ramping[0]), believed, _UNKNOWNS)
+        bias, ramp = bias + values[_GYRO], values[_RAMP]
     force, force_sigma = _mean_up(-forces[:, 2], stretch.spans, believed.accel_white)
     # What the Earth was taken to do beforehand is put back: `by_earth` is of all of it.
-    bias = bias + answer.by_earth[_GYRO] @ np.array([EARTH_RATE_NORTH_RAD_S, 0.0, 0.0])
+    bias = bias + by_earth[_GYRO] @ np.array([EARTH_RATE_NORTH_RAD_S, 0.0, 0.0])
     return Found(
         gyro_rad_s=bias,
-        gyro_covariance=answer.covariance[_GYRO, _GYRO],
-        by_earth=answer.by_earth[_GYRO],
+        gyro_covariance=covariance[_GYRO, _GYRO],
+        by_earth=by_earth[_GYRO],
         ramp_rad_s2=ramp,
         turn_rad_s=stretch.rate - bias,
         force_m_s2=force,
@@ -175,13 +174,6 @@ def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Arra
         return stretch.rate
     turn = np.polyfit(stretch.ends[1:][known], np.unwrap(headings_rad[known]), 1)[0]
     return np.asarray(stretch.rate - turn * start[2])
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    values: Array
-    covariance: Matrix
-    by_earth: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -221,8 +213,10 @@ class _System:
         off = np.remainder(headings_rad - azimuth + math.pi, 2.0 * math.pi) - math.pi
         return cls(columns, np.array([forces[:, 0] / up, forces[:, 1] / up, off]), float(stretch.spans.mean()))
 
-    def solve(self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int) -> _Answer:
-        """Least squares, weighted by the noise; without it, by a guess."""
+    def solve(
+        self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int
+    ) -> tuple[Array, Matrix, Matrix]:
+        """Solve by least squares, weighted by the noise, without it by a guess; return values, covariance, by Earth."""
         wander = believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3
         level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
         # (3, n, unknowns + 4): the readings are the last column.
@@ -247,11 +241,11 @@ class _System:
         covariance_found = covariance * (len(rows) / max(len(rows) - spent, len(rows) / 4.0))
         values = np.zeros(_UNKNOWNS)
         values[:unknowns] = covariance @ (regressors.T @ rows[:, -1])
-        return _Answer(values, covariance_found, covariance @ (regressors.T @ earth))
+        return values, covariance_found, covariance @ (regressors.T @ earth)
 
-    def noise(self, answer: _Answer) -> tuple[Waves, Waves]:
+    def noise(self, values: Array) -> tuple[Waves, Waves]:
         """Fit the residuals as waves: the two levels together, the heading."""
-        left = self.readings - self.columns[..., :_UNKNOWNS] @ answer.values
+        left = self.readings - self.columns[..., :_UNKNOWNS] @ values
         heading = left[2][np.isfinite(left[2])]
         if len(heading) == 0:
             heading = np.zeros(1)
@@ -286,6 +280,8 @@ class Passage(NamedTuple):
     """(3,) integral of the specific force in the axes of the start."""
     velocity_by_bias: Matrix
     """(3, 3) d velocity / d (gyro bias): m/s per rad/s."""
+    white2: float
+    """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
 
 
 def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
@@ -303,10 +299,12 @@ def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passag
     turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(half, axis=0)])
     felt = np.einsum("nij,nj->ni", whole, forces_m_s2)
     by_bias = skew(felt) @ turned
+    bends = np.diff(rates_rad_s, 2, axis=0)
     return Passage(
         span_s=float(times_s[-1] - times_s[0]),
         turn=turns[-1],
         turned=turned[-1],
         velocity_m_s=((felt[1:] + felt[:-1]) / 2.0 * steps[:, None]).sum(axis=0),
         velocity_by_bias=((by_bias[1:] + by_bias[:-1]) / 2.0 * steps[:, None, None]).sum(axis=0),
+        white2=float(np.square(bends).mean()) / 6.0 * float(np.median(steps)) if len(bends) else 0.0,
     )
