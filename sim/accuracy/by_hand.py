@@ -78,7 +78,7 @@ class _Stood:
     """Readings of the accelerometers (n, 3)."""
 
     def face(self) -> Face:
-        return Face(np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
+        return (np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
 
     def on_spot(self, turned: Counted, before: StandMeans | None) -> StandMeans:
         window, heading_rad = self.window, turned.angle_rad + (0.0 if before is None else before.heading_rad)

@@ -14,7 +14,6 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar, Final
 
-import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
@@ -29,7 +28,7 @@ from companion.daemon.stands.measuring import POLL_S, Measuring
 from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import Mounting
-from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, HeldPose, Hold, Wish, leaned_deg
+from companion.estimation.alignment.poses import AlignmentRequest, HeldPose, Wish, leaned_deg
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import HandRecord, completed
@@ -73,7 +72,7 @@ class SessionState:
     # The present pose
     number: int = 1
     total: int = 1
-    wish: Wish = dataclasses.field(default_factory=lambda: Wish("", Hold(LEVEL)))
+    wish: Wish = dataclasses.field(default_factory=lambda: Wish(""))
     words: str = ""
     objection: str = ""
     """Fault of the latest stand, if it was not the one asked for."""
@@ -109,7 +108,7 @@ class SessionState:
             "number": self.number,
             "total": self.total,
             "wish": self.wish.words,
-            "hold": msgspec.to_builtins(self.wish.hold),
+            "hold": {"up": list(self.wish.up), "turn_deg": self.wish.turn_deg},
             "unknown": list(self.wish.unknown),
             "words": self.words,
             "objection": self.objection or None,
@@ -296,7 +295,7 @@ class PoseSession:
 
     def _turned(self, state: SessionState, now_s: float) -> str:
         """Return the turn since the stand before, read once a second; says once when to stop."""
-        wanted_deg = state.wish.hold.turn_deg
+        wanted_deg = state.wish.turn_deg
         if not state.windows or not wanted_deg:
             return ""
         if now_s - state.turn_read_s >= 1.0:

@@ -26,10 +26,8 @@ from companion.estimation.alignment.align_model import Ground, ImuStand, StandMe
 from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, mounting, seen_before
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
-    LEVEL,
     AlignmentRequest,
     HeldPose,
-    Hold,
     Wish,
     asked_turn_deg,
     objection,
@@ -304,7 +302,7 @@ def _temperatures(window: Window) -> dict[str, float | None]:
 EXPECTED: Final = 12
 """Usual number of stands."""
 MOST: Final = 24
-_FIRST: Final = Wish("any side down, propped up, hands off", Hold(LEVEL))
+_FIRST: Final = Wish("any side down, propped up, hands off")
 
 
 class SidesTask(PoseTask):
@@ -325,7 +323,7 @@ class SidesTask(PoseTask):
         if imu is None or self._missing is None:
             return pose, None
         found = self._by_imu[imu.name]
-        up = self._face(imu).accel_m_s2 - found.figures[BIAS]
+        up = self._face(imu)[0] - found.figures[BIAS]
         again = seen_before(found, up / np.linalg.norm(up), self._imus[imu.name].in_force.orientation)
         return pose, None if again is None else f"it stands as in stand {again + 1}: {self._missing.words}"
 
@@ -402,7 +400,7 @@ class SidesTask(PoseTask):
     def _face(self, imu: ImuWindow) -> Face:
         """Return a mean in the sensor's own axes, in which firmwares scale."""
         turn = self._imus[imu.name].in_force.orientation.T
-        return Face(turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2)))
+        return turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2))
 
     def _scales_left(self) -> Iterator[str]:
         for name, found in self._by_imu.items():

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ import numpy as np
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import ImuAlignment, widened_by
 from companion.estimation.alignment.align_model import LEVEL, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, fit, response
-from companion.estimation.alignment.poses import Hold, Wish
+from companion.estimation.alignment.poses import Wish
 from companion.physics.frames import Array, Floats, Matrix, roll_pitch_from_up, vector
 from companion.physics.units import MG
 
@@ -62,12 +62,8 @@ _SIDES: Final = {
 """Up in the aircraft's axes, forward, right, down."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Face:
-    """The mean of one still stand in the sensor's axes, with one sigma per axis; m/s^2, shapes (3,)."""
-
-    accel_m_s2: Array
-    sigma_m_s2: Array
+Face = tuple[Array, Array]
+"""The mean of one still stand in the sensor's axes, and one sigma per axis; m/s^2, shapes (3,)."""
 
 
 class Sides(msgspec.Struct, frozen=True):
@@ -125,27 +121,28 @@ def faces(
     """
     everyone = tuple(range(len(stands)))
     gravity = (gravity_m_s2, gravity_sigma_m_s2)
-    fit = _fit(stands, everyone, gravity)
+    figures, covariance, _, fits = _fit(stands, everyone, gravity)
     left_out: tuple[int, ...] = ()
     in_doubt: tuple[int, ...] = ()
-    while not fit.fits:
+    while not fits:
         kept = tuple(k for k in everyone if k not in left_out)
         if 4 * (len(left_out) + 1) > len(stands):
             in_doubt = kept
             break
         without = {k: _fit(stands, tuple(j for j in kept if j != k), gravity) for k in kept}
-        mended = [k for k in kept if without[k].fits]
+        mended = [k for k in kept if without[k][3]]
         if len(mended) > 1 or len(kept) - FIGURES < LEAST_SPARE:
             in_doubt = tuple(mended) or kept
             break
-        worst = mended[0] if mended else min(kept, key=lambda k: without[k].chi_square)
-        left_out, fit = (*left_out, worst), without[worst]
-    stretch, bias = response(fit.figures[SCALE], fit.figures[SHEAR]), fit.figures[BIAS]
-    inside = np.linalg.solve(stretch, np.array([stand.accel_m_s2 - bias for stand in stands]).T).T
+        worst = mended[0] if mended else min(kept, key=lambda k: without[k][2])
+        left_out = (*left_out, worst)
+        figures, covariance, _, fits = without[worst]
+    stretch = response(figures[SCALE], figures[SHEAR])
+    inside = np.linalg.solve(stretch, np.array([mean - figures[BIAS] for mean, _ in stands]).T).T
     lengths = np.linalg.norm(inside, axis=1)
     return FacesEstimate(
-        figures=fit.figures,
-        by_stands=fit.covariance,
+        figures=figures,
+        by_stands=covariance,
         wander_m_s2=np.zeros(3) if wander_m_s2 is None else wander_m_s2,
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
@@ -156,17 +153,11 @@ def faces(
     )
 
 
-class _Fit(NamedTuple):
-    figures: Array
-    covariance: Matrix
-    chi_square: float
-    fits: bool
-
-
-def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]) -> _Fit:
-    """Estimate the figures and gravity."""
-    force = np.array([stands[k].accel_m_s2 for k in which])
-    variance = np.array([stands[k].sigma_m_s2 for k in which]) ** 2
+def _fit(
+    stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]
+) -> tuple[Array, Matrix, float, bool]:
+    """Estimate the figures and gravity: figures, covariance, chi-square, and whether every stand fits."""
+    force, sigmas = (np.array([stands[k][part] for k in which]) for part in (0, 1))
     prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
 
     def residuals(at: Floats) -> Floats:
@@ -175,7 +166,7 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
         lengths = np.linalg.norm(inside, axis=-1)
         across = inside / lengths[..., None] @ inverse
         """Derivative of each length by its reading."""
-        sigma = np.sqrt(np.einsum("mki,ki->mk", across**2, variance))
+        sigma = np.sqrt(np.einsum("mki,ki->mk", across**2, sigmas**2))
         return np.asarray((lengths - gravity[0] - at[:, FIGURES:]) / sigma)
 
     try:
@@ -190,12 +181,8 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
     w = residual / np.sqrt(np.maximum(found.redundancy[:count], _LEAST_REDUNDANCY))
     # Compared with the scatter of the other stands, where that exceeds their sigmas.
     others = np.maximum((chi_square - w**2) / (freedom - 1), 1.0) if freedom > 1 else np.ones(count)
-    return _Fit(
-        figures=found.values[:FIGURES],
-        covariance=widened_by(chi_square, freedom) * found.covariance[:FIGURES, :FIGURES],
-        chi_square=chi_square,
-        fits=bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all()),
-    )
+    covariance = widened_by(chi_square, freedom) * found.covariance[:FIGURES, :FIGURES]
+    return found.values[:FIGURES], covariance, chi_square, bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all())
 
 
 def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
@@ -222,8 +209,8 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
     else:
         why = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
     side, up = sides[best]
-    hold = Hold(vector(vehicle_from_sensor @ up))
-    return Wish(f"{side}: {why}", hold, tuple(_figure(sigma, which) for which in worst_first))
+    unknown = tuple(_figure(sigma, which) for which in worst_first)
+    return Wish(f"{side}: {why}", vector(vehicle_from_sensor @ up), unknown=unknown)
 
 
 def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:

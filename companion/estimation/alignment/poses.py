@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 
 from companion.physics.frames import Array, wrap_deg
@@ -65,21 +64,15 @@ class AlignmentRequest(NamedTuple):
         return self.on_spot + (TILTS if self.action == "tilts" else 0)
 
 
-class Hold(msgspec.Struct, frozen=True):
-    """Attitude in which to hold the aircraft, for a picture."""
-
-    up: Vector
-    """Up in its axes, forward, right, down; length 1."""
-    turn_deg: float = 0.0
-    """Turn on its spot, clockwise from above."""
-
-
 class Wish(NamedTuple):
     """The pose that is asked for next."""
 
     words: str
     """Spoken up to a colon; the rest need not be heard."""
-    hold: Hold
+    up: Vector = LEVEL
+    """Up in the aircraft's axes, forward, right, down; length 1."""
+    turn_deg: float = 0.0
+    """Turn on its spot, clockwise from above."""
     unknown: tuple[str, ...] = ()
     """Figures that the stands so far leave open, the worst first."""
 
@@ -99,19 +92,18 @@ class HeldPose(NamedTuple):
 def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> Wish:
     """Return what the operator should do after these poses of an alignment on a spot."""
     if not poses:
-        return Wish("stand it on a firm, marked spot", Hold(LEVEL))
+        return Wish("stand it on a firm, marked spot")
     if len(poses) >= request.on_spot:
         done = [_side(poses[0].up, pose.up) for pose in poses[request.on_spot :]]
-        hold = Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
+        up = next((up for side, up in _TILTED.items() if side not in done), LEVEL)
         if done:
-            return Wish(f"tilt it to another side, prop it up: not {' or '.join(done)} again", hold)
-        return Wish("tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", hold)
-    hold = Hold(LEVEL, asked_turn_deg(request, poses))
+            return Wish(f"tilt it to another side, prop it up: not {' or '.join(done)} again", up)
+        return Wish("tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", up)
+    turn_deg = asked_turn_deg(request, poses)
+    words = "turn it by 180 degrees, onto its marks" if len(poses) == 1 else "turn it the same way to its first marks"
     if request.on_spot >= HEADINGS:
-        return Wish(f"turn it by {hold.turn_deg:.0f} degrees on its spot", hold)
-    if len(poses) == 1:
-        return Wish("turn it by 180 degrees, onto its marks", hold)
-    return Wish("turn it the same way to its first marks", hold)
+        words = f"turn it by {turn_deg:.0f} degrees on its spot"
+    return Wish(words, turn_deg=turn_deg)
 
 
 def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> float:

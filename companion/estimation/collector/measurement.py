@@ -19,7 +19,6 @@ from companion.estimation.collector.outlook import (
     CollectorObstacle,
     CollectorStatus,
     Settings,
-    Stillness,
     expected_s,
     is_enough,
 )
@@ -129,8 +128,8 @@ class WindowSource(ABC):
 
     @property
     @abstractmethod
-    def stillness(self) -> Stillness:
-        """Return how still it has been."""
+    def stillness(self) -> CollectorStatus:
+        """How still it has been, without an estimate."""
 
     def good_slots(self, since_s: float | None) -> list[int]:
         """Return the seconds that count of those that wait for a pose sensor to settle."""
@@ -228,11 +227,11 @@ class GroundWindows(WindowSource):
         return self._stretch.add(slot, good=good)
 
     @property
-    def stillness(self) -> Stillness:
+    def stillness(self) -> CollectorStatus:
         """The stretch under way."""
         stretch = self._stretch
         left_s = 0 if stretch.begun else self._min_good - stretch.good
-        return Stillness(
+        return CollectorStatus(
             still_s=float(stretch.good),
             steady_s=float(stretch.steady),
             good_now=stretch.good_now,
@@ -269,9 +268,7 @@ class GroundWindows(WindowSource):
         """Return the progress of the stretch, by an estimate that may be a second old."""
         stretch = self._stretch
         share = 0.0 if stretch.start is None else stretch.good / self._max_slots
-        status = CollectorStatus(
-            still_s=float(stretch.good), enough=False, progress=share, measuring=f"still for {stretch.good} s"
-        )
+        status = msgspec.structs.replace(self.stillness, progress=share, measuring=f"still for {stretch.good} s")
         if not stretch.begun or waits:
             return status
         estimates = self.estimate_later(self.slots(None), None, late=1)()

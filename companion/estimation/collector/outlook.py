@@ -27,18 +27,24 @@ class CollectorObstacle(msgspec.Struct, frozen=True):
 
 
 class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of the collector, with the progress of the estimate."""
+    """State of the collector; a glance leaves out what an estimate tells."""
 
     still_s: float
     """Good seconds, common to all sources, of the stretch under way."""
+    steady_s: float
+    """Seconds that count without a bad one until now."""
+    good_now: bool
+    """True if the latest second counts."""
+    hold_still_s: int = 0
+    """Seconds to stand still yet before a window is possible."""
     obstacle: CollectorObstacle | None = None
-    """None when still long enough and nothing is in the way."""
-    enough: bool
+    """A movement now, or a source that is silent or stuck; by an estimate, too, what it still waits for."""
+    enough: bool = False
     """The stop rule is met: `window` gives a result that more seconds would not better."""
-    progress: float
+    progress: float = 0.0
     """0..1 towards `enough`; falls to 0 when the stretch breaks."""
     sources: tuple[SourceStatus, ...] = ()
-    measuring: str
+    measuring: str = ""
     """Words for a measurement under way."""
     left: str = ""
     """Part of `measuring` that says how much longer it takes, where that is minutes."""
@@ -47,21 +53,6 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
     def waiting_for(self) -> str | None:
         """The obstacle's words."""
         return None if self.obstacle is None else self.obstacle.words
-
-
-class Stillness(msgspec.Struct, frozen=True, kw_only=True):
-    """Stillness until now, without any estimate."""
-
-    still_s: float
-    """Seconds that count so far."""
-    steady_s: float
-    """Seconds that count without a bad one until now."""
-    good_now: bool
-    """True if the latest second counts."""
-    hold_still_s: int = 0
-    """Seconds to stand still yet before a window is possible."""
-    obstacle: CollectorObstacle | None = None
-    """A movement now, or a source that is silent or stuck."""
 
     @property
     def moving(self) -> bool:

@@ -15,7 +15,7 @@ import msgspec
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.intake import ImuSource, PoseKind, PoseSource, Source
 from companion.estimation.collector.measurement import MIN_BATCHES, GroundWindows, Measurement, WindowSource, Work
-from companion.estimation.collector.outlook import CollectorObstacle, CollectorStatus, Settings, Stillness
+from companion.estimation.collector.outlook import CollectorObstacle, CollectorStatus, Settings
 from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
@@ -222,7 +222,7 @@ class RollingCollector:
         """Return the last whole second of the gradienter."""
         return None if self._tilt is None else self._tilt.newest
 
-    def glance(self, now_s: float) -> Stillness:
+    def glance(self, now_s: float) -> CollectorStatus:
         """Return the stillness at `now_s`; costs a small part of what `status` does."""
         return msgspec.structs.replace(self._windows.stillness, obstacle=self._obstacle(now_s))
 

@@ -12,11 +12,12 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Measurement, WindowSource, Work
-from companion.estimation.collector.outlook import CollectorStatus, Settings, Stillness
+from companion.estimation.collector.outlook import CollectorStatus, Settings
 from companion.estimation.deck.estimate import (
     MAX_S,
     MIN_LOOK_S,
@@ -178,10 +179,10 @@ class Deck(WindowSource):
         return min((len(stream.seconds) for stream in self._streams.values()), default=0)
 
     @property
-    def stillness(self) -> Stillness:
+    def stillness(self) -> CollectorStatus:
         """Every second counts."""
         seconds = float(self.seconds)
-        return Stillness(still_s=seconds, steady_s=seconds, good_now=self._is_good)
+        return CollectorStatus(still_s=seconds, steady_s=seconds, good_now=self._is_good)
 
     def common(self, since_s: float | None = None) -> range:
         """Return the seconds of all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
@@ -241,7 +242,7 @@ class Deck(WindowSource):
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
         """Return the progress of the newest estimate towards good enough."""
         found, seconds = self.known(0, None), self.seconds
-        status = functools.partial(CollectorStatus, still_s=float(seconds))
+        status = functools.partial(msgspec.structs.replace, self.stillness)
         if found is None or seconds < MIN_S:
             left = self._at_least(MIN_S)
             return status(enough=False, progress=min(seconds / MIN_S, 1.0) / 4.0, measuring=left, left=left)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Face, FacesEstimate, faces, missing, seen_before
-from companion.estimation.alignment.poses import LEVEL, Hold, Wish
+from companion.estimation.alignment.poses import Wish
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import MG
 from sim.aircraft import Pose, VirtualAircraft
@@ -51,7 +51,7 @@ class Sensor:
 
     def read(self, force_m_s2: Floats) -> Face:
         noise = self.rng.normal(size=3) * self.noise
-        return Face(self.response @ force_m_s2 + self.truth[BIAS] + noise, np.full(3, max(self.noise, 1e-6)))
+        return (self.response @ force_m_s2 + self.truth[BIAS] + noise, np.full(3, max(self.noise, 1e-6)))
 
     def held(self, poses: list[tuple[float, float]]) -> list[Face]:
         return [self.read(self.up(*pose)) for pose in poses]
@@ -96,7 +96,7 @@ def test_a_stand_given_twice_adds_nothing_and_is_known_again() -> None:
     stands = sensor.held(poses)
     before = solved(stands)
     again = sensor.read(sensor.up(*poses[2]))
-    up = np.linalg.solve(sensor.response, again.accel_m_s2 - sensor.truth[BIAS])
+    up = np.linalg.solve(sensor.response, again[0] - sensor.truth[BIAS])
     assert seen_before(before, up / np.linalg.norm(up), np.eye(3)) == 2
     assert seen_before(before, np.array([0.0, 1.0, 0.0]), np.eye(3)) is None
     # Two stands that are 5 deg apart tell a little, and no more than that.
@@ -110,8 +110,8 @@ def test_a_wrong_stand_is_named_and_left_out(off_mg: float) -> None:
         sensor = Sensor(seed)
         stands = sensor.held(TWELVE)
         bad = seed % 12
-        up = stands[bad].accel_m_s2 / np.linalg.norm(stands[bad].accel_m_s2)
-        stands[bad] = Face(stands[bad].accel_m_s2 + off_mg * MG * up, stands[bad].sigma_m_s2)
+        up = stands[bad][0] / np.linalg.norm(stands[bad][0])
+        stands[bad] = (stands[bad][0] + off_mg * MG * up, stands[bad][1])
         found = solved(stands)
         named += found.left_out == (bad,)
         wrong += bool(found.left_out) and found.left_out != (bad,)
@@ -128,7 +128,7 @@ def test_scatter_beyond_the_sigmas_widens_them() -> None:
     poses = [*TWELVE, *((30.0 * k, 47.0 * k) for k in range(20))]
     stands = sensor.held([(float(pitch), float(roll)) for pitch, roll in poses])
     honest = solved(stands)
-    proud = solved([Face(stand.accel_m_s2, stand.sigma_m_s2 / 5.0) for stand in stands])
+    proud = solved([(stand[0], stand[1] / 5.0) for stand in stands])
     assert not proud.left_out
     np.testing.assert_allclose(proud.sigma[BIAS], honest.sigma[BIAS], rtol=0.5)
 
@@ -142,9 +142,7 @@ def test_what_the_biases_do_until_they_are_used_widens_theirs_alone() -> None:
 
 
 def test_readings_that_are_no_gravity_are_refused() -> None:
-    stands = [
-        Face(np.array(force), np.full(3, NOISE)) for force in ((30.0, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.2))
-    ]
+    stands = [(np.array(force), np.full(3, NOISE)) for force in ((30.0, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.2))]
     with pytest.raises(CalibrationRefusedError, match="no gravity"):
         solved(stands)
 
@@ -156,7 +154,7 @@ def test_it_says_which_stand_is_missing_until_nothing_is(mounting: str) -> None:
     sensor = Sensor(8)
     obeyed: list[str] = []
     stands: list[Face] = []
-    wish: Wish | None = Wish("level: ", Hold(LEVEL))
+    wish: Wish | None = Wish("level: ")
     while wish is not None:
         side = wish.words.partition(":")[0]
         assert side not in obeyed
@@ -188,7 +186,7 @@ def test_where_every_side_has_been_seen_a_side_may_be_held_again() -> None:
     edges = [f"between {a} and {b}" for a, b in itertools.combinations(HELD, 2) if (a, b) not in opposite]
     stands = sensor.held([*HELD.values(), *map(_middle, edges)])
     # So noisy that something stays open.
-    stands = [Face(one.accel_m_s2, 100.0 * one.sigma_m_s2) for one in stands]
+    stands = [(one[0], 100.0 * one[1]) for one in stands]
     found = solved(stands)
     wish = missing(found, turned)
     assert wish is not None

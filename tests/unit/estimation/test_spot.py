@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.estimation.alignment.align import Alignment, Complaint, in_words, turned
 from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
-from companion.estimation.alignment.faces import Face, Sides, faces, mounting
+from companion.estimation.alignment.faces import Sides, faces, mounting
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
 from sim.aircraft import Pose, VirtualAircraft
@@ -133,7 +133,7 @@ def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NON
     for k, (pitch, roll) in enumerate(TWELVE):
         aircraft = VirtualAircraft(Pose(pitch + 3.0 * math.sin(k), roll + 4.0 * math.cos(k), 30.0 * k), SITE)
         # In the sensor's axes, as `ImuModel` gives them.
-        stands.append(Face(model(aircraft, board_deg).expected(0.0)[3:], np.full(3, SIGMA)))
+        stands.append((model(aircraft, board_deg).expected(0.0)[3:], np.full(3, SIGMA)))
     found = faces(stands, G, 0.0)
     return Sides(found.figures, found.sigma, rotation_matrix(orientation))
 

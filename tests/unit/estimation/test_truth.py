@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.faces import BIAS, Face, Sides, faces
+from companion.estimation.alignment.faces import BIAS, Sides, faces
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
 from companion.estimation.request import What
@@ -60,7 +60,7 @@ class Wandering(Sensor):
         )
 
     def known(self) -> Sides:
-        stands = [Face(self.mean(EVERY_S * k, self.up(*pose)), self.use) for k, pose in enumerate(TWELVE)]
+        stands = [(self.mean(EVERY_S * k, self.up(*pose)), self.use) for k, pose in enumerate(TWELVE)]
         found = faces(stands, SITE.gravity_m_s2, 3e-4, self.wander)
         return Sides(found.figures, found.sigma, TURN)
 
