@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.measurement import Stretch
 from companion.estimation.noise.allan import AxisFit, curve, fit_axis
 from companion.estimation.seconds.batch import Batch, summary
 from companion.estimation.stillness.gates import ImuGate
 from companion.estimation.stillness.own_noise import learned_of
-from companion.estimation.stillness.stretch import Stretch
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, rows_of
 

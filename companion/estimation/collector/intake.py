@@ -1,4 +1,10 @@
-"""One stream into the collector: its seconds, its gate and its verdict."""
+"""One stream into the collector: its seconds, its gate and its verdict.
+
+A gradienter, or a compass that averages, goes on moving after the aircraft has stopped: both follow the truth with a
+time constant; the fluid of a field gradienter keeps a tenth of its error after every second (BEI INC manual; sensors
+2.2 and 2.7). The gate sees only the steep beginning of that. So after every second that was not still by the IMUs, its
+seconds count again once the largest error has died away to a tenth of its sigma. Those of the IMUs count meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +20,6 @@ from companion.estimation.means.windows import ImuInput, integer_steps
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.seconds.counting import Counted, TurnCounter
 from companion.estimation.stillness.gates import STILL, GateVerdict, ImuGate, PoseGate
-from companion.estimation.stillness.stretch import Settling
 from companion.physics.frames import Array
 from companion.samples import ImuSample
 
@@ -31,6 +36,11 @@ _LIMITS_TILT: Final = (180.0,) * 2
 _LIMITS_HEADING: Final = (1e3,)
 
 
+OFF_DEG: Final = 5.0
+"""Largest error that a movement leaves in a pose sensor."""
+_SHARE: Final = 0.1
+
+
 class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of one source."""
 
@@ -44,6 +54,28 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
     dropped: dict[str, int]
     lost: int
     """Samples that never came, by the device's counter or clock."""
+
+
+class Settling:
+    """Knows which seconds of a pose sensor are still the tail of a movement.
+
+    The sensor follows the truth with the time constant `lag_s`, 0 for none; a tenth of `sigma_deg` may remain.
+    """
+
+    def __init__(self, lag_s: float, sigma_deg: float) -> None:
+        self.left_s = 0
+        """Seconds until its readings count again, as of the last second judged."""
+        # Without a lag nothing follows, however exact the sensor is said to be.
+        self._tail_s = math.ceil(lag_s * math.log(max(OFF_DEG / (_SHARE * sigma_deg), 1.0))) if lag_s > 0.0 else 0
+        self._moved: int | None = None
+        """Last second in which the aircraft moved."""
+
+    def judge(self, slot: int, *, moved: bool) -> bool:
+        """Judge whether the second counts, seconds ascending; `moved`: the IMUs were not still."""
+        if moved:
+            self._moved = slot
+        self.left_s = 0 if self._moved is None else max(self._moved + 1 + self._tail_s - slot, 0)
+        return self._tail_s == 0 or self._moved is None or slot > self._moved + self._tail_s
 
 
 class Source:

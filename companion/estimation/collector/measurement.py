@@ -1,5 +1,8 @@
 """Seconds from which windows are made, and the newest estimates of them: the interface, and that of the ground.
 
+A stretch begins with `min_still_s` good seconds in a row. From then on up to 20 % of the seconds of a window may be
+rejected (a gust, a knock), for which the mean is robust. More than three in a row end it: the aircraft was moved.
+
 Choosing the seconds of a window costs a small part of working it out. Estimates are kept while they are of use; one
 that is due can be packed up and worked out in another thread.
 """
@@ -9,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -25,11 +29,12 @@ from companion.estimation.collector.outlook import (
 from companion.estimation.means.pose import FieldWindow, heading_window, tilt_window
 from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, Window, imu_estimates
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.estimation.stillness.stretch import Stretch
 from companion.estimation.turning.turn import Turn
 
 MIN_BATCHES: Final = 5
 """Seconds of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
+MAX_REJECTED: Final = 0.20
+MAX_REJECTED_RUN: Final = 3
 
 
 class Work(NamedTuple):
@@ -199,6 +204,56 @@ class WindowSource(ABC):
             return found
 
         return estimate
+
+
+class Stretch:
+    """Counts good and rejected seconds, and knows where the still stretch begins."""
+
+    def __init__(self, min_good: int, max_slots: int) -> None:
+        self._min_good = min_good
+        self.flags: deque[bool] = deque(maxlen=max_slots)
+        self.clear()
+
+    def clear(self) -> None:
+        """End the stretch."""
+        self.start: int | None = None
+        self.good = 0
+        self.begun = False
+        self.flags.clear()
+        self._run = 0
+        self._steady = 0
+
+    def add(self, slot: int, *, good: bool) -> bool:
+        """Add the next second; False when the stretch ends with it."""
+        self._steady = self._steady + 1 if good else 0
+        self.flags.append(good)
+        if good:
+            self.start = slot if self.start is None else self.start
+            self.good, self._run = self.good + 1, 0
+            self.begun = self.begun or self.good >= self._min_good
+            return True
+        self._run += 1
+        rejected = self.flags.count(False)
+        if not self.begun or self._run > MAX_REJECTED_RUN or rejected > MAX_REJECTED * len(self.flags):
+            was = self.start is not None
+            self.clear()
+            return not was
+        return True
+
+    @property
+    def steady(self) -> int:
+        """Good seconds in a row until now."""
+        return min(self._steady, len(self.flags))
+
+    @property
+    def good_now(self) -> bool:
+        """True if the latest second was good."""
+        return bool(self.flags) and self.flags[-1]
+
+    @property
+    def full(self) -> bool:
+        """True if it fills the longest window."""
+        return len(self.flags) == self.flags.maxlen
 
 
 class GroundWindows(WindowSource):

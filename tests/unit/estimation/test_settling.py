@@ -15,11 +15,11 @@ from companion.config.sections import Compass, Config, Imu, Mavlink
 from companion.config.sections import Gradienter as Section
 from companion.configured.models import compass_model, gradienter_model
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.intake import OFF_DEG, Settling
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.pose import GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.stillness.stretch import OFF_DEG, Settling
 from companion.physics.frames import wrap_deg
 from companion.physics.gradienter import attitude_from_readings
 from companion.protocols.registry import PROTOCOLS

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.estimation.collector.measurement import Stretch
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.stillness.gates import GateVerdict, ImuGate, PoseGate
-from companion.estimation.stillness.stretch import Stretch
 from companion.physics.units import DEG, MG
 
 Floats = NDArray[np.float64]
