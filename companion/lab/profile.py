@@ -20,7 +20,7 @@ from companion.estimation.collector.measurement import Stretch
 from companion.estimation.noise.allan import AxisFit, curve, fit_axis
 from companion.estimation.seconds.batch import Batch, summary
 from companion.estimation.stillness.gates import ImuGate
-from companion.estimation.stillness.own_noise import learned_of
+from companion.estimation.stillness.own_noise import OwnNoise
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, rows_of
 
@@ -86,7 +86,10 @@ def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> Re
     out. `profile` is the noise that the gate allows before it has learned.
     """
     batches = seconds_of(t_s, readings)
-    gate = ImuGate(name, profile, own=learned_of(batches))
+    own = OwnNoise(at_rest=True)
+    for batch in batches:
+        own.add(batch)
+    gate = ImuGate(name, profile, own=own)
     stretch = Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []

@@ -141,42 +141,35 @@ def _mean_square(prior: Floats | float, measured: Floats | float, variance: Floa
 
 def temperature(batches: Sequence[Batch]) -> tuple[tuple[float, float] | None, Path | None]:
     """Return `rate` and `path` of a `Warming`."""
-    line, bent = _fitted(batches, 1), _fitted(batches, 2)
-    if line is None:
+    known = [(batch.slot + 0.5, batch.temperature_degc) for batch in batches if batch.temperature_degc is not None]
+    if len(known) < 3:
         return None, None
-    rate = float(line[0][1]), float(line[1][1])
-    if abs(rate[0]) < 2.0 * math.sqrt(rate[1]):
-        return rate, None
-    is_bent = bent is not None and abs(bent[0][2]) > _BENT_SIGMAS * math.sqrt(bent[1][2])
-    (level, k_s, bend), (_, of_k_s, of_bend) = bent if bent is not None and is_bent else line
+    times, degc = np.array(known, dtype=np.float64).T
     half_s = (batches[-1].slot + 1.0 - batches[0].slot) / 2.0
+    times -= batches[0].slot + half_s
+    (k_s, level), (of_k_s, _) = _fitted(times, degc, 1)
+    rate = k_s, of_k_s
+    if abs(k_s) < 2.0 * math.sqrt(of_k_s):
+        return rate, None
+    bend = of_bend = 0.0
+    if len(known) > 3:
+        bent, of_bent = _fitted(times, degc, 2)
+        if abs(bent[0]) > _BENT_SIGMAS * math.sqrt(of_bent[0]):
+            (bend, k_s, level), (of_bend, of_k_s, _) = bent, of_bent
     start, middle, end = (
-        (float(level + k_s * at_s + bend * at_s**2), float(k_s + 2.0 * bend * at_s)) for at_s in (-half_s, 0.0, half_s)
+        (level + k_s * at_s + bend * at_s**2, k_s + 2.0 * bend * at_s) for at_s in (-half_s, 0.0, half_s)
     )
-    variance = float(of_k_s * half_s**2 + of_bend * (2.0 / 3.0 * half_s**2) ** 2)
+    variance = of_k_s * half_s**2 + of_bend * (2.0 / 3.0 * half_s**2) ** 2
     return rate, Path(states=(start, middle, end), span_s=2.0 * half_s, variance=variance)
 
 
-def _fitted(batches: Sequence[Batch], degree: int) -> tuple[Floats, Floats] | None:
-    """Fit a line or a parabola about the middle of the window: (3,) coefficients, lowest first, and variances."""
-    known = [(batch.slot + 0.5, batch.temperature_degc) for batch in batches if batch.temperature_degc is not None]
-    if len(known) < degree + 2:
-        return None
-    times, degc = np.array(known, dtype=np.float64).T
+def _fitted(times: Floats, degc: Floats, degree: int) -> tuple[list[float], list[float]]:
+    """Fit a line or a parabola: coefficients, highest first, and their variances."""
+    found, covariance = np.polyfit(times, degc, degree, cov=True)
     half_s = (times[-1] - times[0] + 1.0) / 2.0
-    terms = ((times - (batches[0].slot + batches[-1].slot + 1.0) / 2.0) / half_s)[:, None] ** np.arange(degree + 1)
-    inverse = np.linalg.inv(terms.T @ terms)
-    mean = degc.mean()
-    found = inverse @ terms.T @ (degc - mean)
-    residual = degc - mean - terms @ found
-    scatter = float(residual @ residual) / max(len(known) - degree - 1, 1)
     # A step q of the thermometer hides up to q / 2 at each end: q sqrt(3) / 4 as one sigma of each coefficient.
-    hidden = 3.0 * (_resolution_k(degc) / 4.0) ** 2
-    unit = half_s ** np.arange(3.0)
-    value, variance = np.zeros(3), np.zeros(3)
-    found[0] += mean
-    value[: degree + 1], variance[: degree + 1] = found, scatter * np.diag(inverse) + hidden
-    return value / unit, variance / np.square(unit)
+    hidden = 3.0 * (_resolution_k(degc) / 4.0) ** 2 / half_s ** (2.0 * np.arange(degree, -1.0, -1.0))
+    return found.tolist(), (np.diag(covariance) + hidden).tolist()
 
 
 def _resolution_k(degc: Floats) -> float:

@@ -211,7 +211,9 @@ class ImuGate:
             bounds = (known, _STATIONARY * known if known > 0.0 else shaking**2)
             found, allowed = _slow_part(batch, triad, max(motion, noise), bounds)
             if own is not None:
-                allowed = math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance)
+                allowed = math.sqrt(
+                    motion**2 + max(float((own.variance - own.white).mean()), 0.0) + _CHANCE * own.chance
+                )
             hint = self._own.hint(number)
             if found > allowed:
                 return _words(f"{part} {self._name} moves", found / unit, allowed / unit, unit_name, hint)

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from typing import Final
 
 import msgspec
@@ -70,11 +69,6 @@ class Known(msgspec.Struct, frozen=True):
     """Part of it in successive differences (`Batch.white`)."""
     density: Floats
     """N^2 at low frequencies: the variance of a second's mean."""
-
-    @property
-    def slow(self) -> float:
-        """Mean of what looks like motion."""
-        return float((self.variance - self.white).mean())
 
     @property
     def chance(self) -> float:
@@ -150,14 +144,6 @@ class OwnNoise:
                 if found is not None:
                     self._too_much[triad] = bool(found.density.mean() > self._most2[part][0])
                     self.known[triad] = self.known[triad] if self._too_much[triad] else found
-
-
-def learned_of(batches: Iterable[Batch]) -> OwnNoise:
-    """Learn from all seconds of a recording at rest."""
-    own = OwnNoise(at_rest=True)
-    for batch in batches:
-        own.add(batch)
-    return own
 
 
 def _noise(seconds: list[Batch], part: slice) -> Known | None:
