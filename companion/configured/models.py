@@ -124,7 +124,6 @@ def imu_input(imu: Imu, kind: ImuMessage | None) -> ImuInput:
         profile=noise_profile(imu.profile),
         gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
         accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,
-        truncates=kind is not None and kind.integers,
         clock_from_start=imu.protocol is None or PROTOCOLS["imu"][imu.protocol].decoder.clock_from_start,
     )
 

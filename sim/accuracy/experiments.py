@@ -208,7 +208,6 @@ def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
         profile=noise_profile("icm42688p"),
         gyro_step_rad_s=STEP_RAD_S,
         accel_step_m_s2=MG,
-        truncates=True,
     )
     times, exact = samples(standing, SPANS_S[-1])
     rows = np.trunc(exact / steps) * steps

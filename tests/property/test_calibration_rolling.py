@@ -56,7 +56,8 @@ def test_nothing_that_arrives_raises(events: list[object]) -> None:
             case ("reset", name):
                 collector.reset("property", name)  # type: ignore[arg-type]
             case ("again", bool(known)):
-                collector.set_imu(still.imu(gyro_step_rad_s=1e-3 if known else 0.0))
+                step = 1e-3 if known else 0.0
+                collector.set_imu(still.imu(gyro_step_rad_s=step, accel_step_m_s2=step))
         check(collector, feed.now_s)
         assert sum(len(source.batches.batches) for source in collector._sources()) <= 3 * 30
 

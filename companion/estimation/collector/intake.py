@@ -16,7 +16,7 @@ from typing import Final, Literal
 import msgspec
 
 from companion.estimation.means.pose import CompassModel, GradienterModel
-from companion.estimation.means.windows import ImuInput, integer_steps
+from companion.estimation.means.windows import ImuInput
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.seconds.counting import Counted, TurnCounter
 from companion.estimation.stillness.gates import STILL, GateVerdict, ImuGate, PoseGate
@@ -173,7 +173,7 @@ class ImuSource(Source):
     """The stream of one IMU, with what is known of its device."""
 
     def __init__(self, imu: ImuInput, keep: int) -> None:
-        batches = BatchSource(LIMITS_IMU, keep, steps=integer_steps(imu))
+        batches = BatchSource(LIMITS_IMU, keep, steps=imu.steps)
         super().__init__("imu", imu.name, batches, _gate(imu))
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
@@ -189,7 +189,7 @@ class ImuSource(Source):
     def replace(self, imu: ImuInput) -> None:
         """Set the new kind of the stream."""
         self.imu, self.gate = imu, _gate(imu)
-        self.batches.steps = integer_steps(imu)
+        self.batches.steps = imu.steps
 
     def add_raw(self, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
         """Add a mean that tells more than the stream."""
@@ -242,10 +242,9 @@ class ImuSource(Source):
 
     def counted(self, start_s: float, end_s: float, bias_rad_s: Array) -> Counted | None:
         """Return `TurnCounter.counted`; None where nothing was kept."""
-        cut_rad_s = self.imu.gyro_step_rad_s if self.imu.truncates else 0.0
         if self.counter is None:
             return None
-        return self.counter.counted(start_s, end_s, bias_rad_s, self.imu.rotation, cut_rad_s)
+        return self.counter.counted(start_s, end_s, bias_rad_s, self.imu.rotation, self.imu.gyro_step_rad_s)
 
 
 def _gate(imu: ImuInput) -> ImuGate:

@@ -101,10 +101,9 @@ class Stream:
 
     def _in_vehicle(self, rows: Floats) -> Floats:
         imu = self.imu
-        if imu.truncates:
+        if imu.steps is not None:
             # Toward zero: on a platform that moves by more than a step, half a step was cut off.
-            steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-            rows = rows + np.sign(rows) * steps / 2.0
+            rows = rows + np.sign(rows) * imu.steps / 2.0
         return np.hstack([rows[:, :3] @ imu.rotation.T, rows[:, 3:] @ imu.rotation.T])
 
 

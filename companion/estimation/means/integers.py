@@ -21,7 +21,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.estimation.noise.robust import HUBER_C as FLOAT_HUBER_C
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
@@ -166,35 +165,18 @@ def shape_variance(found: Fit) -> Floats:
     return np.asarray(EDGE_RMS**2 * sensitivity)
 
 
-class IntegerColumns(msgspec.Struct, frozen=True):
-    """Figures of the truncated columns of one stream; (c,) or (m, c), SI units. Those of other columns are neutral."""
+def integer_columns(
+    batches: Sequence[Batch], steps: Floats
+) -> tuple[Floats, Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Estimate the means of truncated columns from their good seconds, at least one; `steps` (c,) is their LSB.
 
-    of: NDArray[np.bool_]
-    """True: the column is truncated."""
-    values: Floats
-    """(m, c) mean of every second."""
-    huber_c: Floats
-    least: Floats
-    """Sigma of one second's mean, from the Fisher information."""
-    hidden: Floats
-    """Sigma that no averaging reduces: of a mean that is not identified, or by the shape of the noise."""
-    unknown: NDArray[np.bool_]
-    """The mean is not identified by its own readings, but by the noise of the triad's other axes, or not at all."""
-    useless: NDArray[np.bool_]
-    """Zero is among the readings, too: the mean could be anything within a step of it."""
-
-
-def integer_columns(batches: Sequence[Batch], steps: Floats, *, truncates: bool) -> IntegerColumns:
-    """Estimate the means of a stream from its good seconds, at least one.
-
-    `steps`, (c,), is the step of each column, 0 for floats.
+    Returns, in the unit of `steps`:
+        (m, c) mean of every second;
+        (c,) sigma of one second's mean, from the Fisher information;
+        (c,) sigma that no averaging reduces: of a mean that is not identified, or by the shape of the noise;
+        (c,) whether the mean is not identified by its own readings, but by the triad's other axes, or not at all;
+        (c,) whether zero is among the readings, too: the mean could be anything within a step of it.
     """
-    of = (steps > 0.0) & truncates
-    if not of.any():
-        neutral = np.zeros(len(steps))
-        return IntegerColumns(of, neutral, np.full(len(steps), FLOAT_HUBER_C), neutral, neutral, of, of)
-    # One triad of a stream may be floats; its columns are estimated with any step and not used.
-    steps = np.where(of, steps, 1.0)
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
     start, tables = _aligned(batches, plain, steps)
@@ -225,14 +207,13 @@ def integer_columns(batches: Sequence[Batch], steps: Floats, *, truncates: bool)
     has_zero = ((integers == 0) & (pooled > 0.0)).any(axis=0)
     half_off = plain + HALF_STEP * np.sign(plain.mean(axis=0))
     unknown = np.where(has_zero, NEAR_ZERO, HALF_STEP)
-    return IntegerColumns(
-        of=of,
-        values=np.where(known, values, half_off) * steps,
-        huber_c=np.where(of, HUBER_C, FLOAT_HUBER_C),
-        least=np.where(of & known, second, 0.0) * steps,
-        hidden=np.where(known, np.sqrt(shape_variance(found) + np.square(by_sigma)), unknown) * steps,
-        unknown=of & ~own.identified,
-        useless=of & ~known & has_zero,
+    hidden = np.where(known, np.sqrt(shape_variance(found) + np.square(by_sigma)), unknown)
+    return (
+        np.where(known, values, half_off) * steps,
+        np.where(known, second, 0.0) * steps,
+        hidden * steps,
+        ~own.identified,
+        ~known & has_zero,
     )
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from companion.config.sections import NoiseProfile
 from companion.errors import CalibrationRefusedError
+from companion.estimation.means.integers import HUBER_C as INTEGERS_HUBER_C
 from companion.estimation.means.integers import integer_columns
 from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import UNKNOWN, Warming, drifting, temperature
@@ -27,7 +28,7 @@ from companion.estimation.noise.allan import (
     slope_variance,
     white_noise,
 )
-from companion.estimation.noise.robust import RAMP_BATCHES, huber_line, is_ramp, robust_mean
+from companion.estimation.noise.robust import HUBER_C, RAMP_BATCHES, huber_line, is_ramp, robust_mean
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Floats, vector
@@ -57,20 +58,15 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     """3x3, sensor to vehicle FRD."""
     profile: NoiseProfile
     gyro_step_rad_s: float = 0.0
-    """Quantisation of the stream; 0 for floats."""
+    """Step of integers that are truncated toward zero; 0 for floats. Both triads are one or the other."""
     accel_step_m_s2: float = 0.0
-    truncates: bool = False
-    """True: the stream truncates toward zero instead of rounding."""
     clock_from_start: bool = False
     """True: the time in its samples (`t_device_s`) counts from the switch-on of the device."""
 
-
-def integer_steps(imu: ImuInput) -> Floats | None:
-    """Return the steps (6,) of a stream of truncated integers, whose seconds keep their counts; None for others."""
-    if not imu.truncates or imu.gyro_step_rad_s == imu.accel_step_m_s2 == 0.0:
-        return None
-    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    return np.where(steps > 0.0, steps, 1.0)
+    @property
+    def steps(self) -> Floats | None:
+        """Steps (6,) of a stream of integers, whose seconds keep their counts; None for floats."""
+        return np.repeat([self.gyro_step_rad_s, self.accel_step_m_s2], 3) if self.gyro_step_rad_s else None
 
 
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
@@ -142,42 +138,48 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     walk: Floats
     warming: Warming
     half_step: NDArray[np.bool_]
-    """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
+    """Floats with fewer than 3 distinct readings."""
     undecided: NDArray[np.bool_]
     """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
     useless: NDArray[np.bool_]
     """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
 
 
-def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float) -> Estimate:
+def estimate(
+    imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float, rounding: float = 0.0
+) -> Estimate:
     """Estimate one IMU over its good seconds, at least 2.
 
-    A ramp is evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
+    A ramp is evaluated at the end of the window, `end_s`, and never later. `horizon_s` is H of V(T, H), `rounding` the
+    step of floats that were rounded.
     """
     models = imu.profile.gyro, imu.profile.accel
     slots = np.array([batch.slot for batch in batches], dtype=np.int64)
     seconds = float(len(slots))
-    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    whole = integer_columns(batches, steps, truncates=imu.truncates)
-    values = np.where(whole.of, whole.values, [batch.mean for batch in batches])
+    huber_c, least, useless = HUBER_C, np.zeros(6), np.zeros(6, dtype=np.bool_)
+    undecided = half_step = useless
+    if imu.steps is not None:
+        huber_c = INTEGERS_HUBER_C
+        values, least, quantum, undecided, useless = integer_columns(batches, imu.steps)
+    else:
+        values = np.array([batch.mean for batch in batches])
+        quantum, half_step = _quantisation(batches, rounding)
     flicker = np.repeat([model.flicker for model in models], 3)
     walk = np.repeat([model.walk for model in models], 3)
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
     wander = slope_variance(flicker, walk, end_s - slots[0]) if imu.profile.is_named else np.zeros(6)
-    mean, leverage = robust_mean(values, whole.huber_c, whole.least), np.full(6, 1.0 / seconds)
+    mean, leverage = robust_mean(values, huber_c, least), np.full(6, 1.0 / seconds)
     slope, ramp, level = np.zeros(6), np.zeros(6), values
     if is_long := len(slots) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
-        line = huber_line(times, values, end_s, whole.huber_c, whole.least)
+        line = huber_line(times, values, end_s, huber_c, least)
         ramps = is_ramp(line, len(slots), wander)
         slope, ramp = line.slope, np.where(ramps, line.slope, 0.0)
         level = values - ramp * (times - times.mean())[:, None]
         mean, leverage = np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage)
-    measured = np.maximum(white_noise(slots, level), whole.least)
+    measured = np.maximum(white_noise(slots, level), least)
     white = np.maximum(measured, np.repeat([model.white for model in models], 3))
     flicker = _flicker(slots, level, measured, flicker)
-    quantum, half_step = _quantisation(batches, steps)
-    quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
     quantum = np.sqrt(np.square(quantum) + np.mean([batch.shared_variance for batch in batches], axis=0))
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
@@ -206,8 +208,8 @@ def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s
             path=path,
         ),
         half_step=half_step,
-        undecided=whole.unknown,
-        useless=whole.useless,
+        undecided=undecided,
+        useless=useless,
     )
 
 
@@ -222,23 +224,22 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
     return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
 
 
-def _quantisation(batches: Sequence[Batch], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _quantisation(batches: Sequence[Batch], step: float) -> tuple[Floats, NDArray[np.bool_]]:
     """Return one sigma a column that rounding may hide, and where there are fewer than 3 distinct values.
 
     Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
-    sigma^2 / q^2) (method 2.2 and 2.5).
+    sigma^2 / q^2) (method 2.2 and 2.5), with q the `step`, 0 where it is unknown.
     """
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
     distinct = np.max([batch.distinct for batch in batches], axis=0)
-    known = steps > 0.0
-    few = np.where(known, high - low < 1.5 * steps, distinct < 3)
-    # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
-    half = np.where(known, steps, high - low) / 2.0
+    if step == 0.0:
+        # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
+        few = distinct < 3
+        return np.where(few, (high - low) / 2.0, 0.0), few
+    few = high - low < 1.5 * step
     variance = np.mean([batch.variance for batch in batches], axis=0)
-    divisor = np.where(known, steps, 1.0)
-    bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
-    return np.where(few, half, bound), few
+    return np.where(few, step / 2.0, step / math.pi * np.exp(-2.0 * math.pi**2 * variance / step**2)), few
 
 
 def imu_estimates(
@@ -263,8 +264,8 @@ def imu_estimates(
     for imu, seconds, means in zip(imus, batches, raw or [()] * len(imus), strict=True):
         used, by, own = imu, seconds, estimate(imu, seconds, end_s=end_s, horizon_s=horizon_s)
         if len(means) >= RAW_BATCHES:
-            floats = msgspec.structs.replace(imu, gyro_step_rad_s=RAW_STEP, accel_step_m_s2=RAW_STEP, truncates=False)
-            better = estimate(floats, means, end_s=end_s, horizon_s=horizon_s)
+            floats = msgspec.structs.replace(imu, gyro_step_rad_s=0.0, accel_step_m_s2=0.0)
+            better = estimate(floats, means, end_s=end_s, horizon_s=horizon_s, rounding=RAW_STEP)
             if better.use_variance[:3].sum() < own.use_variance[:3].sum():
                 used, by, own = floats, means, better
         found.append((own, _imu_window(used, by, own, rejected)))
@@ -322,7 +323,7 @@ def _axes(which: NDArray[np.bool_]) -> str:
 def _warnings(imu: ImuInput, batches: Sequence[Batch], own: Estimate, rejected: int) -> list[str]:
     found: list[str] = []
     for part in TRIADS:
-        if axes := _axes((own.half_step & ~own.undecided)[rows_of(part)]):
+        if axes := _axes(own.half_step[rows_of(part)]):
             found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
     if (share := lost(batches)) > _LOST_WARNING:
         found.append(f"imu {imu.name} lost {share:.0%} of its samples")
@@ -334,8 +335,7 @@ def _warnings(imu: ImuInput, batches: Sequence[Batch], own: Estimate, rejected: 
 def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
-    floats = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3) == 0.0
-    for column in np.flatnonzero((low == high) & floats).tolist():
+    for column in np.flatnonzero(low == high).tolist() if imu.steps is None else ():
         part = f"{TRIADS[column // 3]} {imu.name}"
         raise CalibrationRefusedError(f"{part} is stuck: axis {'xyz'[column % 3]} did not change in {len(batches)} s")
     if (share := lost(batches)) > _LOST_REFUSAL:

@@ -135,7 +135,7 @@ def _add(playback: Playback, topic: str, t_s: float, data: bytes, found: dict[st
         if isinstance(part, ImuSample):
             state = playback.state(role.name)
             columns = found[role.name]
-            if state is not None and state.input.truncates:
+            if state is not None and state.input.steps is not None:
                 columns.truncated = True
             else:
                 columns.add(part)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from companion.config.sections import NoiseProfile
 from companion.estimation.collector.outlook import is_enough
 from companion.estimation.means.integers import MIN_BEYOND_TWO, fit, shape_variance, truncation_edges
-from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, imu_estimates, integer_steps
+from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, imu_estimates
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu, settings
@@ -28,13 +28,13 @@ GRAVITY_LSB = np.array([0.0, 0.0, 0.0, 87.3, 52.4, -995.2])
 
 
 def stream(profile: NoiseProfile = QUIET) -> ImuInput:
-    return imu("fc2", profile, gyro_step_rad_s=MRAD, accel_step_m_s2=MG, truncates=True)
+    return imu("fc2", profile, gyro_step_rad_s=MRAD, accel_step_m_s2=MG)
 
 
 def batches_of(exact_lsb: Floats, rate_hz: int = 100) -> list[Batch]:
     """(n, 6) exact readings in LSB, cut and collected second by second; the first second is not whole and is lost."""
     source = BatchSource((1e3,) * 3 + (1e4,) * 3, 4000)
-    source.steps = integer_steps(stream())
+    source.steps = stream().steps
     cut = np.where(exact_lsb < 0.0, -np.floor(-exact_lsb), np.floor(exact_lsb)) * STEPS
     times = 99.5 + (np.arange(len(cut)) + 0.5) / rate_hz
     for t_s, row in zip(times.tolist(), cut.tolist(), strict=True):

@@ -195,7 +195,7 @@ def test_reset_forgets_one_imu_or_all_and_the_stretch() -> None:
 def test_another_stream_is_not_mixed_with_the_old_one() -> None:
     feed = feeder(SILENT)
     feed.run(20.0)
-    feed.collector.set_imu(imu("fc", gyro_step_rad_s=1e-3, accel_step_m_s2=1e-3 * 9.80665, truncates=True))
+    feed.collector.set_imu(imu("fc", gyro_step_rad_s=1e-3, accel_step_m_s2=1e-3 * 9.80665))
     steps = np.repeat([1e-3, 9.80665e-3], 3)
     feed.change = lambda _name, _t, rows: np.trunc(rows / steps) * steps
     feed.run(12.0)

@@ -13,7 +13,7 @@ from companion.config import parse
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.configured.models import gyro_sigmas_deg_h
 from companion.estimation.means.pose import heading_window, tilt_window
-from companion.estimation.means.windows import ImuInput, imu_estimates
+from companion.estimation.means.windows import ImuInput, estimate, imu_estimates
 from companion.estimation.noise.allan import noise_profile, predicted_sigma
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
@@ -123,12 +123,11 @@ def test_rounding_with_enough_noise_costs_nothing_and_seconds_without_counts_cos
     rng = np.random.default_rng(8)
     batches = batches_of(rng.normal(30.0, 0.01, (30, 6)), spread=2.0)
     exact = window_of(imu("fc", QUIET), batches)
-    rounded = window_of(imu("fc", QUIET, gyro_step_rad_s=1.0), batches)
-    truncated = window_of(imu("fc", QUIET, gyro_step_rad_s=1.0, truncates=True), batches)
-    assert rounded.gyro_sigma_stat_rad_s == pytest.approx(exact.gyro_sigma_stat_rad_s)
+    rounded = estimate(imu("fc", QUIET), batches, end_s=30.0, horizon_s=180.0, rounding=1.0)
+    truncated = window_of(imu("fc", QUIET, gyro_step_rad_s=1.0, accel_step_m_s2=1.0), batches)
+    assert np.sqrt(rounded.stat_variance[:3]) == pytest.approx(exact.gyro_sigma_stat_rad_s)
     assert min(truncated.gyro_sigma_stat_rad_s) > 0.5
     assert np.subtract(truncated.gyro_rad_s, exact.gyro_rad_s) == pytest.approx([0.5] * 3, abs=0.01)
-    assert truncated.accel_sigma_stat_m_s2 == exact.accel_sigma_stat_m_s2
     assert "half a step" in truncated.hidden["gyro"]
 
 
@@ -143,9 +142,10 @@ def test_the_bound_for_rounding_covers_its_bias() -> None:
         worst = max(abs(mean_of_rounded(true, sigma) - true) for true in np.linspace(0.0, 1.0, 41).tolist())
         batches = batches_of(np.zeros((30, 6)), spread=sigma)
         batches = [msgspec.structs.replace(batch, low=np.full(6, -1.0), high=np.full(6, 1.0)) for batch in batches]
-        window = window_of(imu("fc", QUIET, gyro_step_rad_s=1.0), batches)
-        assert worst <= 1.02 * window.gyro_sigma_stat_rad_s[0]
-        assert window.gyro_sigma_stat_rad_s[0] < 1.1 * worst
+        found = estimate(imu("fc", QUIET), batches, end_s=30.0, horizon_s=180.0, rounding=1.0)
+        sigma_stat = math.sqrt(found.stat_variance[0])
+        assert worst <= 1.02 * sigma_stat
+        assert sigma_stat < 1.1 * worst
 
 
 @pytest.mark.parametrize("mounting", ["ROTATION_YAW_90", "ROTATION_ROLL_180", "ROTATION_PITCH_270"])
