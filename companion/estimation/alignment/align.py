@@ -91,13 +91,8 @@ class ImuAlignment:
     gyro_bias_rad_s: Figures
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Complaint:
-    """The residual that fits worst: in its own sigmas, and in SI units."""
-
-    label: ResidualLabel
-    sigmas: float
-    size: float
+Complaint = tuple[ResidualLabel, float, float]
+"""The residual that fits worst: its label, how far it is off in its own sigmas, and in SI units."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -195,12 +190,12 @@ _UNKNOWN: Final = "the stands do not fit what is known of the sensors ({by}): be
 
 def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
     """Say why the stands do not fit together, and what to do, in one line; `gradienter`: whether there was one."""
-    group, stand, name = complaint.label
+    (group, stand, name), sigmas, size = complaint
     words = _COMPLAINTS.get(group, _UNKNOWN)
     if group == "accelerometer" and not gradienter:
         words = _LOOSE
-    by = f"{complaint.sigmas:.0f} sigma"
-    return words.format(stand=stand, name=name, by=by, deg=complaint.size / DEG, mg=complaint.size / MG)
+    by = f"{sigmas:.0f} sigma"
+    return words.format(stand=stand, name=name, by=by, deg=size / DEG, mg=size / MG)
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
@@ -234,7 +229,7 @@ def _worst(found: LeastSquares, model: Model) -> Complaint | None:
     alone = labels[k][0] in ("zero", "prior")
     axes = [k] if alone else [j for j, label in enumerate(labels) if label == labels[k] and usable[j]]
     size = float(np.linalg.norm(residual[axes] * model.row_sigma[axes] / redundancy[axes]))
-    return Complaint(labels[k], abs(float(w[k])), size)
+    return labels[k], abs(float(w[k])), size
 
 
 def _imu(model: Model, at: Array, covariance: Matrix, ground: Ground, k: int) -> ImuAlignment:

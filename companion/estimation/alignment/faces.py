@@ -267,17 +267,12 @@ def _two_digits(value: float) -> str:
 class Mounting:
     """Tilt of the board against the base: the attitude that its corrected accelerometers show on a level base.
 
-    Roll is right side down, pitch nose up; the covariance (2, 2) is of both.
+    Roll is right side down, pitch nose up; `sigma_rad` is one sigma of each, (2,).
     """
 
     roll_rad: float
     pitch_rad: float
-    covariance_rad2: Matrix
-
-    @property
-    def sigma_rad(self) -> Array:
-        """One sigma of roll and of pitch, (2,)."""
-        return np.sqrt(np.diag(self.covariance_rad2))
+    sigma_rad: Array
 
 
 def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting:
@@ -299,4 +294,4 @@ def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting
     # A change d of the reading turns up by up x d / |up|^2, and so do roll and pitch, to first order.
     x, y, z = up / (up @ up)
     tilt = np.array([[0.0, z, -y], [-z, 0.0, x]]) @ vehicle_from_sensor
-    return Mounting(roll, pitch, tilt @ inside @ tilt.T)
+    return Mounting(roll, pitch, np.sqrt(np.diag(tilt @ inside @ tilt.T)))
