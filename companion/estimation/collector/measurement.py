@@ -134,7 +134,7 @@ class WindowSource(ABC):
     @property
     @abstractmethod
     def stillness(self) -> CollectorStatus:
-        """How still it has been, without an estimate."""
+        """The stillness so far, without an estimate."""
 
     def good_slots(self, since_s: float | None) -> list[int]:
         """Return the seconds that count of those that wait for a pose sensor to settle."""

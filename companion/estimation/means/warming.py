@@ -165,8 +165,8 @@ def temperature(batches: Sequence[Batch]) -> tuple[tuple[float, float] | None, P
 
 def _fitted(times: Floats, degc: Floats, degree: int) -> tuple[list[float], list[float]]:
     """Fit a line or a parabola: coefficients, highest first, and their variances."""
-    found, covariance = np.polyfit(times, degc - degc.mean(), degree, cov=True)
-    found[-1] += degc.mean()
+    found, covariance = np.polyfit(times, degc - degc[0], degree, cov=True)
+    found[-1] += degc[0]
     half_s = (times[-1] - times[0] + 1.0) / 2.0
     # A step q of the thermometer hides up to q / 2 at each end: q sqrt(3) / 4 as one sigma of each coefficient.
     hidden = 3.0 * (_resolution_k(degc) / 4.0) ** 2 / half_s ** (2.0 * np.arange(degree, -1.0, -1.0))
