@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from companion.config.sections import AllanModel
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import Pose, PoseSigma, SiteRecord
-from companion.estimation.solution.joint import Weighed, weigh
+from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, PoseEffect, expect, pose_effect
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.samples import TRIADS
@@ -135,7 +135,7 @@ def axes(values: Array) -> tuple[float, float, float]:
 
 def one_trial(
     case: Case, random: np.random.Generator, effect: PoseEffect
-) -> tuple[Array, Array, Array, Array, Weighed]:
+) -> tuple[Array, Array, Array, Array, Solution]:
     """Errors without and with what was known, the sigmas claimed with it, and errors of what was expected by its sigma.
 
     Each (imus, 3), the errors in the case's unit.
@@ -213,13 +213,13 @@ def one_trial(
     def of(imus: Sequence[ImuSolution]) -> Array:
         return np.array([imu.gyro_rad_s if case.triad == "gyro" else imu.accel_m_s2 for imu in imus]) / unit
 
-    sigma = np.array([np.sqrt(np.diag(imu.covariance)[part]) for imu in weighed.solution.imus]) / unit
+    sigma = np.array([np.sqrt(np.diag(imu.covariance)[part]) for imu in weighed.imus]) / unit
     truth = np.array(truths)
     known = [each.earlier["gyro" if case.triad == "gyro" else "accel"] for each in expected]
     nothing = np.full(3, np.nan)
     foretold = np.array([nothing if one is None else np.array(one.value) / unit for one in known]) - truth
     said_by = np.array([nothing if one is None else np.sqrt(one.variance) / unit for one in known])
-    return of(found) - truth, of(weighed.solution.imus) - truth, sigma, np.array([foretold, said_by]), weighed
+    return of(found) - truth, of(weighed.imus) - truth, sigma, np.array([foretold, said_by]), weighed
 
 
 def study(case: Case, trials: int, seed: int = 1) -> Outcome:
@@ -232,8 +232,8 @@ def study(case: Case, trials: int, seed: int = 1) -> Outcome:
         without.append(before)
         having.append(after)
         sigmas.append(sigma)
-        priors = [imu.prior for imu in weighed.solution.imus]
-        used += any(p is not None and ((p.gyro and p.gyro.used) or (p.accel and p.accel.used)) for p in priors)
+        priors = [imu.prior for imu in weighed.imus]
+        used += any(one["used"] for prior in priors if prior for one in prior.values() if one)
         doubted += bool(weighed.doubts)
     errors = np.array(having)
     foretold, said_by = np.moveaxis(np.array(ahead), 1, 0)

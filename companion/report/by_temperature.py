@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
+
 from companion.estimation.solution.by_temperature import ByTemperature
 from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, Plot, linear, tag
@@ -42,9 +44,7 @@ def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
     if not power_ups:
         return None
     seen = [dot for dots in power_ups.values() for dot in dots]
-    rows: list[_Dot] = [(row.degc, row.gyro_deg_h, row.sigma_deg_h) for row in imu.curve]
-    if not gyro:
-        rows = [(row.degc, row.accel_mg, row.sigma_mg) for row in imu.accel_curve]
+    rows: list[_Dot] = [msgspec.structs.astuple(row) for row in (imu.curve if gyro else imu.accel_curve)]
     now = imu.now if gyro else None
     across = linear([*(degc for degc, _, _ in seen), *([now.degc] if now else [])], least=_LEAST_K)
     plots = []

@@ -25,8 +25,8 @@ from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import Point, by_power_up, kept
-from companion.estimation.solution.doubt import Doubt, points
-from companion.estimation.solution.joint import Weighed, Whole, weigh
+from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.joint import Whole, weigh
 from companion.estimation.solution.prior import (
     Expectation,
     ExpectedImu,
@@ -36,6 +36,7 @@ from companion.estimation.solution.prior import (
     expect_today,
     pose_effect,
 )
+from companion.estimation.solution.results import points
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, moved
 from companion.estimation.temperature.curve import Along, Curve, settling
 from companion.formats import Object
@@ -274,7 +275,7 @@ class BiasMemory:
         except AutopilotError:
             return
         expectation = await self._offload(self.expectation, solution, unix_s)
-        weighed: Weighed = await self._offload(weigh, solution, whole, expectation)
+        weighed: Solution = await self._offload(weigh, solution, whole, expectation)
         found = self.measured(solution, whole, weighed.doubts, "", unix_s)
         for name in news:
             point = found[name]

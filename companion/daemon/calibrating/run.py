@@ -45,7 +45,7 @@ from companion.estimation.records.history import Point
 from companion.estimation.records.record import AlignmentUsed, ImuRecord, Record
 from companion.estimation.request import What
 from companion.estimation.solution.doubt import Doubt
-from companion.estimation.solution.joint import Weighed, weigh
+from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn, when_warm
 from companion.estimation.solution.site import Whereabouts
@@ -209,12 +209,12 @@ class CalibrationRun(Job):
         self._parts.on_solved.tell(where, otherwise, self.what, expectation)
         self.device_ids = memory.device_ids()
         whole = memory.whole(solution)
-        weighed: Weighed = await core.offload(weigh, solution, whole, expectation)
+        weighed: Solution = await core.offload(weigh, solution, whole, expectation)
         # From here on nobody can adopt this run: a request must not get half of a result.
         if self.automatic and core.wanted.push:
             written = {i.name for i in core.config.imu if i.source == "autopilot" or i.autopilot_instance}
             self.held_back = {key: doubt for key, doubt in weighed.doubted.items() if key[0] in written}
-        self.solution = weighed.solution
+        self.solution = weighed
         points = memory.measured(solution, whole, weighed.doubts, self.log.started, unix_s)
         self.points = _less(points, self.held_back)
         for doubt in weighed.doubts:

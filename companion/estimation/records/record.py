@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -122,37 +122,13 @@ class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
     outcome: Outcome
 
 
-class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one gyro from earlier power-ups."""
+Prior = dict[Triad, dict[str, Any] | None]
+"""Predictions for one IMU from earlier power-ups; None: fewer than three of them.
 
-    used: bool
-    """True if it took part in the estimate; it guards in any case."""
-    power_ups: int
-    temperature_model: bool
-    expected_rad_s: Vector
-    sigma_rad_s: Vector
-    """One sigma of today's bias about the prediction."""
-    measured_rad_s: Vector
-    shift_sigma: Vector
-
-
-class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one accelerometer from earlier power-ups; fields as in `GyroPrior`."""
-
-    used: bool
-    power_ups: int
-    temperature_model: bool
-    expected_m_s2: Vector
-    sigma_m_s2: Vector
-    measured_m_s2: Vector
-    shift_sigma: Vector
-
-
-class Prior(msgspec.Struct, frozen=True, kw_only=True):
-    """Predictions for one IMU; None: fewer than three earlier power-ups."""
-
-    gyro: GyroPrior | None
-    accel: AccelPrior | None
+`used`: it took part in the estimate; it guards in any case. `power_ups`: their number. `temperature_model`: by a curve.
+`expected_rad_s` or `expected_m_s2`, with `sigma_…` of today's bias about it. `measured_…`: the bias by the readings
+alone. `shift_sigma`: their difference in sigmas.
+"""
 
 
 class Effective(msgspec.Struct, frozen=True, kw_only=True):

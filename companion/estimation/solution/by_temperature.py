@@ -42,7 +42,7 @@ class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_mg: Vector | None
 
 
-class Expected(msgspec.Struct, frozen=True, kw_only=True):
+class Expected(msgspec.Struct, frozen=True):
     """Expected gyro biases at a temperature; one sigma."""
 
     degc: float
@@ -50,7 +50,7 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True):
     sigma_deg_h: Vector
 
 
-class ExpectedForces(msgspec.Struct, frozen=True, kw_only=True):
+class ExpectedForces(msgspec.Struct, frozen=True):
     """Expected accelerometer biases at a temperature; one sigma."""
 
     degc: float
@@ -98,8 +98,7 @@ def by_temperature(
     seen = [_window(point, k) for k, group in enumerate(groups) for point in group]
     same = (k for k, group in enumerate(groups) for p in group if power_up is not None and p.power_up.is_same(power_up))
     today = next(same, None)
-    of_today = [one for one in seen if one.power_up == today]
-    last = max(of_today, key=lambda one: one.at_unix_s, default=None)
+    last = max((one for one in seen if one.power_up == today), key=lambda one: one.at_unix_s, default=None)
     degc = now_degc if now_degc is not None or last is None else last.degc
     degcs = [one.degc for one in seen]
     days = len({math.floor(one.at_unix_s / _DAY_S) for one in seen})
@@ -110,53 +109,46 @@ def by_temperature(
         power_ups=len(groups),
         days=days,
         points=tuple(sorted(seen, key=lambda one: one.at_unix_s)),
-        curve=() if curve is None else tuple(_expected(curve, step) for step in _steps(*curve.span_degc)),
-        accel_curve=() if accel is None else tuple(_forces(accel, step) for step in _steps(*accel.span_degc)),
+        curve=() if curve is None else tuple(Expected(*_at(curve, step, DEG_H)) for step in _steps(curve)),
+        accel_curve=() if accel is None else tuple(ExpectedForces(*_at(accel, step, MG)) for step in _steps(accel)),
         needs=None if curve is not None else _needs(len(points), len(groups), degcs),
         today=today,
         now=None if last is None or degc is None else _moved(last, curve, degc),
-        at_power_up=None if curve is None or degc is None else _expected(curve, degc),
+        at_power_up=None if curve is None or degc is None else Expected(*_at(curve, degc, DEG_H)),
     )
 
 
 def _window(point: Point, power_up: int) -> WindowBias:
+    gyro, accel = point.measured("gyro"), point.accel
     assert point.temperature_degc is not None
-    assert point.gyro is not None
     return WindowBias(
         at_unix_s=round(point.unix_s),
         started_at=point.started_at,
         power_up=power_up,
         degc=point.temperature_degc,
-        gyro_deg_h=_in(DEG_H, point.gyro.bias),
-        sigma_deg_h=_in(DEG_H, point.gyro.sigma_use),
-        accel_mg=None if point.accel is None else _in(MG, point.accel.bias),
-        accel_sigma_mg=None if point.accel is None else _in(MG, point.accel.sigma_use),
+        gyro_deg_h=_in(DEG_H, gyro.bias),
+        sigma_deg_h=_in(DEG_H, gyro.sigma_use),
+        accel_mg=None if accel is None else _in(MG, accel.bias),
+        accel_sigma_mg=None if accel is None else _in(MG, accel.sigma_use),
     )
 
 
-def _expected(curve: Curve, degc: float) -> Expected:
+def _at(curve: Curve, degc: float, unit: float) -> tuple[float, Vector, Vector]:
     bias, variance = curve.at(degc)
-    return Expected(degc=round(degc, 2), gyro_deg_h=_in(DEG_H, bias), sigma_deg_h=_in(DEG_H, map(math.sqrt, variance)))
-
-
-def _forces(curve: Curve, degc: float) -> ExpectedForces:
-    bias, variance = curve.at(degc)
-    return ExpectedForces(degc=round(degc, 2), accel_mg=_in(MG, bias), sigma_mg=_in(MG, map(math.sqrt, variance)))
+    return round(degc, 2), _in(unit, bias), _in(unit, map(math.sqrt, variance))
 
 
 def _moved(last: WindowBias, curve: Curve | None, degc: float) -> Expected:
     """Move the last measured bias to another temperature; without a curve it stays at its own."""
     if curve is None:
-        return Expected(degc=last.degc, gyro_deg_h=last.gyro_deg_h, sigma_deg_h=last.sigma_deg_h)
+        return Expected(last.degc, last.gyro_deg_h, last.sigma_deg_h)
     change, variance = curve.change((last.degc, 0.0), (degc, 0.0))
-    return Expected(
-        degc=round(degc, 2),
-        gyro_deg_h=_in(1.0, last.gyro_deg_h + change / DEG_H),
-        sigma_deg_h=_in(1.0, map(math.hypot, last.sigma_deg_h, map(math.sqrt, variance / DEG_H**2))),
-    )
+    sigma = map(math.hypot, last.sigma_deg_h, map(math.sqrt, variance / DEG_H**2))
+    return Expected(round(degc, 2), _in(1.0, last.gyro_deg_h + change / DEG_H), _in(1.0, sigma))
 
 
-def _steps(low: float, high: float) -> Iterable[float]:
+def _steps(curve: Curve) -> Iterable[float]:
+    low, high = curve.span_degc
     step = max(STEP_K, (high - low) / MOST_ROWS)
     inner = (step * k for k in range(math.floor(low / step) + 1, math.ceil(high / step)))
     return (low, *inner, high)

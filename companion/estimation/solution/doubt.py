@@ -1,4 +1,4 @@
-"""Names what contradicts earlier calibrations, and marks it as suspect in the history.
+"""Names what contradicts earlier calibrations.
 
 One tilt, one gravity and one rotation are behind the readings of all IMUs. What has changed alike in all of them is
 the gradienter (or its zero), the gravity that the place was believed to have, or a turn; what has changed in one of
@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
 
-from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.solution.prior import Prediction
-from companion.estimation.solution.solve import ImuSolution, Pair, Solution
-from companion.physics.frames import Array, Matrix, vector
+from companion.physics.frames import Array, Matrix
 from companion.physics.units import DEG, DEG_H, MG, UNITS
-from companion.samples import TRIADS, Triad, Vector, rows_of
+from companion.samples import TRIADS, Triad, rows_of
 
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
@@ -211,55 +209,3 @@ def _of_all(cause: Cause, size: Array, names: str, against: Sequence[Witness]) -
         f"the gradienter's zero differs from the one before by {by} more than it should: all accelerometers"
         f" ({names}) say so; companion align zero"
     )
-
-
-def points(
-    solution: Solution,
-    whole: Mapping[str, Pair],
-    doubts: Iterable[Doubt],
-    *,
-    started_at: str,
-    unix_s: float,
-    power_ups: Mapping[str, PowerUp],
-    zero: str | None,
-) -> dict[str, Point]:
-    """Make each IMU's point of the history from the readings alone; what is doubted is marked as suspect."""
-    shared = solution.shared
-    doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
-    common = np.diag(shared.covariance).copy()
-    common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
-
-    def measured(imu: ImuSolution, triad: Triad) -> MeasuredBias | None:
-        bias = whole[imu.name][TRIADS.index(triad)]
-        if bias is None:
-            return None
-        part = rows_of(triad)
-        return MeasuredBias(
-            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
-            sigma_stat=_short(imu.sigma_stat[part]),
-            sigma_use=_short(np.sqrt(imu.own_variance(shared)[part])),
-            sigma_shared=_short(np.sqrt(common[part])),
-            suspect=(triad, imu.name) in doubted,
-        )
-
-    return {
-        imu.name: Point(
-            started_at=started_at,
-            unix_s=unix_s,
-            power_up=power_ups[imu.name],
-            temperature_degc=imu.mean_degc,
-            k_s=imu.k_s,
-            up=_short(shared.up),
-            zero=zero if whole[imu.name][1] is not None else None,
-            zero_sigma_rad=shared.zero_sigma_rad,
-            gyro=measured(imu, "gyro"),
-            accel=measured(imu, "accel"),
-        )
-        for imu in solution.imus
-        if imu.name in whole
-    }
-
-
-def _short(values: Array) -> Vector:
-    """Round to 9 decimals, 2e-4 deg/h."""
-    return vector(np.round(values, 9))

@@ -24,13 +24,13 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from companion.estimation.means.warming import NEXT_S
-from companion.estimation.records.record import AccelPrior, GyroPrior, Prior, WhenWarm
-from companion.estimation.solution.doubt import Doubt, Witness, contradictions
+from companion.estimation.records.record import Prior, WhenWarm
+from companion.estimation.solution.doubt import Witness, contradictions
 from companion.estimation.solution.prior import Expectation, ExpectedImu
 from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solution, moved
 from companion.estimation.turning.turn import CHANCE_SIGMAS, Turn
@@ -51,35 +51,19 @@ _END_OF_RAMP: Final = 0.25
 """Variance of a mean over that of the end of a line through the same values (`robust.Line.end_leverage`)."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Weighed:
-    """A solution that earlier calibrations have taken part in, and what contradicts them."""
-
-    solution: Solution
-    doubts: tuple[Doubt, ...]
-
-    @property
-    def doubted(self) -> dict[tuple[str, Triad], Doubt]:
-        """Contradictions by IMU and triad; a tilt or a turn is in all IMUs, whether each shows it or not."""
-        return {
-            (name, doubt.triad): doubt
-            for doubt in reversed(self.doubts)
-            for name in ([imu.name for imu in self.solution.imus] if doubt.of_all else doubt.names)
-        }
-
-
-def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
+def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Solution:
     """Check a solution against earlier calibrations, and let them take part where they may."""
     shared, by_name = solution.shared, {each.name: each for each in expectation.imus}
     expected = [by_name.get(imu.name) or ExpectedImu(name=imu.name) for imu in solution.imus]
     ends = [at_end(imu, known, shared) for imu, known in zip(solution.imus, expected, strict=True)]
     whole = {imu.name: moved(whole[imu.name], shift) for imu, shift, _ in ends if imu.name in whole}
     imus = tuple(_with_effect(imu, known, shared) for (imu, _, _), known in zip(ends, expected, strict=True))
-    solution = dataclasses.replace(solution, imus=imus)
-    earlier, today = (_witnesses(solution, whole, expected, today=today) for today in (False, True))
-    doubts = contradictions(earlier, today, len(imus), shared.up, shared.by_reading)
-    doubted = Weighed(solution, tuple(doubts)).doubted
-    used = [one for one in earlier if one.expected.weighs and (one.name, one.triad) not in doubted and one.agrees]
+    earlier, today = (_witnesses(imus, shared, whole, expected, today=today) for today in (False, True))
+    doubts = tuple(contradictions(earlier, today, len(imus), shared.up, shared.by_reading))
+    solution = dataclasses.replace(solution, imus=imus, doubts=doubts)
+    used = [
+        one for one in earlier if one.expected.weighs and (one.name, one.triad) not in solution.doubted and one.agrees
+    ]
     combined, shift = _combined(solution, used, zero_is_known=expectation.zero_is_known)
     combined = _grounded(combined, earlier, today)
     final = []
@@ -91,8 +75,7 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
             imu = with_warm(imu, now, expected[k], followed)
         final.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
     common = [doubt.words for doubt in doubts if doubt.of_all]
-    combined = dataclasses.replace(combined, imus=tuple(final), warnings=(*solution.warnings, *common))
-    return Weighed(combined, tuple(doubts))
+    return dataclasses.replace(combined, imus=tuple(final), warnings=(*solution.warnings, *common))
 
 
 # --- a window that warmed
@@ -177,10 +160,12 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> Imu
     return dataclasses.replace(imu, effective=effect.effective(*figures), warnings=warnings)
 
 
-def _witnesses(solution: Solution, whole: Whole, expected: Sequence[ExpectedImu], *, today: bool) -> list[Witness]:
+def _witnesses(
+    imus: Sequence[ImuSolution], shared: Shared, whole: Whole, expected: Sequence[ExpectedImu], *, today: bool
+) -> list[Witness]:
     """Pair each prediction with its measurement."""
-    shared, found = solution.shared, []
-    for triad, (k, imu) in itertools.product(TRIADS, enumerate(solution.imus)):
+    found = []
+    for triad, (k, imu) in itertools.product(TRIADS, enumerate(imus)):
         known = (expected[k].today if today else expected[k].earlier).get(triad)
         measured = whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
         if measured is None or known is None:
@@ -268,17 +253,16 @@ def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Wi
 
 def _prior(known: Sequence[Witness], used: Sequence[Witness]) -> Prior | None:
     """Make the record's entry of one IMU's predictions."""
-    found: dict[str, Any] = dict.fromkeys(TRIADS)
+    found: Prior = dict.fromkeys(TRIADS)
     for one in known:
-        expected = one.expected
-        kind, unit = (GyroPrior, "rad_s") if one.triad == "gyro" else (AccelPrior, "m_s2")
-        figures: dict[str, Any] = {
-            f"expected_{unit}": expected.value,
-            f"sigma_{unit}": vector(np.sqrt(np.array(expected.variance))),
-            f"measured_{unit}": vector(one.measured),
-            "shift_sigma": vector(one.difference / one.sigma),
+        expected, unit = one.expected, "rad_s" if one.triad == "gyro" else "m_s2"
+        found[one.triad] = {
+            "used": one in used,
+            "power_ups": expected.power_ups,
+            "temperature_model": expected.by_temperature,
+            f"expected_{unit}": list(expected.value),
+            f"sigma_{unit}": np.sqrt(expected.variance).tolist(),
+            f"measured_{unit}": one.measured.tolist(),
+            "shift_sigma": (one.difference / one.sigma).tolist(),
         }
-        found[one.triad] = kind(
-            used=one in used, power_ups=expected.power_ups, temperature_model=expected.by_temperature, **figures
-        )
-    return Prior(**found) if known else None
+    return found if known else None

@@ -1,18 +1,20 @@
-"""A solution as a calibration's record, and in words."""
+"""A solution as a calibration's record, as points of the history, and in words."""
 
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import ImuRecord, PlatformTurn, Record
+from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG
-from companion.samples import TRIADS, Vector
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 
 def record_of(
@@ -128,3 +130,55 @@ def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
     kept = any(imu.unchanged for imu in imus) and not any(imu.written for imu in imus)
     begin = "unchanged," if kept else "sigma"
     return f"{begin} {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
+
+
+def points(
+    solution: Solution,
+    whole: Mapping[str, Pair],
+    doubts: Iterable[Doubt],
+    *,
+    started_at: str,
+    unix_s: float,
+    power_ups: Mapping[str, PowerUp],
+    zero: str | None,
+) -> dict[str, Point]:
+    """Make each IMU's point of the history from the readings alone; what is doubted is marked as suspect."""
+    shared = solution.shared
+    doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
+    common = np.diag(shared.covariance).copy()
+    common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
+
+    def measured(imu: ImuSolution, triad: Triad) -> MeasuredBias | None:
+        bias = whole[imu.name][TRIADS.index(triad)]
+        if bias is None:
+            return None
+        part = rows_of(triad)
+        return MeasuredBias(
+            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
+            sigma_stat=_short(imu.sigma_stat[part]),
+            sigma_use=_short(np.sqrt(imu.own_variance(shared)[part])),
+            sigma_shared=_short(np.sqrt(common[part])),
+            suspect=(triad, imu.name) in doubted,
+        )
+
+    return {
+        imu.name: Point(
+            started_at=started_at,
+            unix_s=unix_s,
+            power_up=power_ups[imu.name],
+            temperature_degc=imu.mean_degc,
+            k_s=imu.k_s,
+            up=_short(shared.up),
+            zero=zero if whole[imu.name][1] is not None else None,
+            zero_sigma_rad=shared.zero_sigma_rad,
+            gyro=measured(imu, "gyro"),
+            accel=measured(imu, "accel"),
+        )
+        for imu in solution.imus
+        if imu.name in whole
+    }
+
+
+def _short(values: Array) -> Vector:
+    """Round to 9 decimals, 2e-4 deg/h."""
+    return vector(np.round(values, 9))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Collection, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
@@ -32,6 +32,9 @@ from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
 from companion.physics.units import DEG
 from companion.samples import Triad
+
+if TYPE_CHECKING:
+    from companion.estimation.solution.doubt import Doubt
 
 Pair = tuple[Array | None, Array | None]
 """Biases of gyro and accelerometer, (3,) each, rad/s and m/s^2; None: unknown."""
@@ -134,6 +137,17 @@ class Solution:
     magnetic: Magnetic | None = None
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
+    doubts: tuple[Doubt, ...] = ()
+    """Contradictions to earlier calibrations."""
+
+    @property
+    def doubted(self) -> dict[tuple[str, Triad], Doubt]:
+        """Contradictions by IMU and triad; a tilt or a turn is in all IMUs, whether each shows it or not."""
+        return {
+            (name, doubt.triad): doubt
+            for doubt in reversed(self.doubts)
+            for name in ([imu.name for imu in self.imus] if doubt.of_all else doubt.names)
+        }
 
 
 def moved(biases: Pair, shift: Array) -> Pair:

@@ -177,7 +177,7 @@ class Replay:
                 otherwise=detail.otherwise,
             )  # fmt: skip
             whole = {found.name: self._whole(found) for found in solution.imus}
-            self._solution = weigh(solution, whole, detail.expectation).solution
+            self._solution = weigh(solution, whole, detail.expectation)
         except CalibrationRefusedError as error:
             self._not_recomputed = f"refused here: {error}"
 

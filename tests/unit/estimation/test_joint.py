@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from companion.estimation.records.history import PowerUp
-from companion.estimation.solution.doubt import points
-from companion.estimation.solution.joint import Weighed, Whole, weigh
+from companion.estimation.solution.joint import Whole, weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
+from companion.estimation.solution.results import points
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.estimation.turning.turn import Turn
 from companion.samples import Triad
@@ -51,13 +51,20 @@ def whole_of(of: Solution) -> Whole:
     return {imu.name: (imu.gyro_rad_s, imu.accel_m_s2) for imu in of.imus}
 
 
-def weighed(of: Solution, known: Sequence[ExpectedImu]) -> Weighed:
+def weighed(of: Solution, known: Sequence[ExpectedImu]) -> Solution:
     return weigh(of, whole_of(of), Expectation(imus=tuple(known), zero_is_known=True))
 
 
 def accel_of(imu: ImuSolution) -> Array:
     assert imu.accel_m_s2 is not None
     return imu.accel_m_s2
+
+
+def accel_prior(imu: ImuSolution) -> dict[str, Any]:
+    assert imu.prior is not None
+    found = imu.prior["accel"]
+    assert found is not None
+    return found
 
 
 def gyro_of(imu: ImuSolution) -> Array:
@@ -101,29 +108,28 @@ def test_it_is_the_least_squares_solution_of_the_stacked_system(same: float) -> 
     stacked = np.vstack(rows)
     best = linalg.lstsq(stacked, np.concatenate(right))[0]
     covariance = linalg.inv(stacked.T @ stacked)
-    for k, imu in enumerate(found.solution.imus):
+    for k, imu in enumerate(found.imus):
         np.testing.assert_allclose(accel_of(imu), best[3 * k : 3 * k + 3], atol=1e-6 * MG)
         np.testing.assert_allclose(
             imu.covariance[3:, 3:], covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], atol=1e-6 * MG**2
         )
-        assert imu.prior is not None
-        assert imu.prior.accel is not None
-        assert imu.prior.accel.used
-        np.testing.assert_allclose(imu.prior.accel.measured_m_s2, accel_of(of.imus[k]))
+        prior = accel_prior(imu)
+        assert prior["used"]
+        np.testing.assert_allclose(prior["measured_m_s2"], accel_of(of.imus[k]))
     if same == 1.0:
         # What is the same in all of them is not averaged away: the zero's error stays as it was.
-        assert found.solution.imus[0].accel_sigma_use_m_s2[0] > 0.95 * G * ZERO_RAD
+        assert found.imus[0].accel_sigma_use_m_s2[0] > 0.95 * G * ZERO_RAD
     if same == 0.0:
         # Three IMUs tell the tilt better than the gradienter does.
-        assert found.solution.imus[0].accel_sigma_use_m_s2[0] < 0.4 * G * ZERO_RAD
+        assert found.imus[0].accel_sigma_use_m_s2[0] < 0.4 * G * ZERO_RAD
 
 
 def test_a_cautious_sigma_of_the_zero_is_no_reason_to_believe_the_past() -> None:
     shared = shared_errors(ZERO_RAD)
     of = solution(imus([np.array([1.5, 0.0, 0.0]) * MG], shared), shared)
     known = (ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.4 * MG, other_zero_rad=0.01 * DEG)}),)
-    guessed = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=False)).solution
-    vouched = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=True)).solution
+    guessed = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=False))
+    vouched = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=True))
     assert accel_of(guessed.imus[0])[0] > 1.49 * MG
     assert accel_of(vouched.imus[0])[0] < 0.2 * MG
 
@@ -140,7 +146,7 @@ def test_what_a_compass_does_not_know_of_a_turn_earlier_power_ups_know_better() 
         of = solution(imus([np.zeros(3)] * 2, shared, gyros=read), shared)
         of = dataclasses.replace(of, turn=Turn(sigma_rad_s=turns, by="compass"))
         known = [ExpectedImu(name=f"imu{k}", earlier={"gyro": expected(np.zeros(3), scatter)}) for k in range(2)]
-        for imu, bias in zip(weighed(of, known).solution.imus, biases, strict=True):
+        for imu, bias in zip(weighed(of, known).imus, biases, strict=True):
             errors.append((gyro_of(imu) - bias)[2])
             sigmas.append(imu.gyro_sigma_use_rad_s[2])
     rms = float(np.sqrt(np.mean(np.square(errors))))
@@ -155,7 +161,7 @@ def test_what_a_compass_does_not_know_of_a_turn_earlier_power_ups_know_better() 
 
 def doubted(
     shifts: Sequence[Array], *, triad: Triad = "accel", sigmas: Sequence[float] | None = None, **others: Any
-) -> Weighed:
+) -> Solution:
     """IMUs whose readings differ by these shifts (mg, or deg/h) from what was known of each."""
     unit = MG if triad == "accel" else DEG_H
     shared = shared_errors(0.05 * DEG, gravity_sigma=0.03 * MG)
@@ -188,9 +194,8 @@ def test_all_accelerometers_off_by_one_tilt_are_the_gradienters_fault() -> None:
     assert "x +0.2" in doubt.words
     assert "y -0.2" in doubt.words
     assert "align zero" in doubt.words
-    assert doubt.words in found.solution.warnings
-    assert all(imu.prior is not None and imu.prior.accel is not None for imu in found.solution.imus)
-    assert not any(imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel)
+    assert doubt.words in found.warnings
+    assert not any(accel_prior(imu)["used"] for imu in found.imus)
 
 
 def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
@@ -198,8 +203,8 @@ def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
     (doubt,) = found.doubts
     assert (doubt.cause, doubt.names) == ("imu", ("imu0",))
     assert "imu1, imu2 agrees" in doubt.words
-    assert doubt.words in found.solution.imus[0].warnings
-    assert found.solution.imus[1].warnings == ()
+    assert doubt.words in found.imus[0].warnings
+    assert found.imus[1].warnings == ()
     # Of two, too: the other one knows that the tilt has not changed.
     (doubt,) = doubted([np.zeros(3), tilted(0.3, 0.0)]).doubts
     assert (doubt.cause, doubt.names) == ("imu", ("imu1",))
@@ -208,10 +213,8 @@ def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
 def test_what_is_unusual_and_no_contradiction_yet_takes_no_part() -> None:
     usual, unusual = doubted([np.full(3, 80.0)], triad="gyro"), doubted([np.full(3, 160.0)], triad="gyro")
     assert usual.doubts == unusual.doubts == ()
-    used = [
-        imu.prior.gyro.used for found in (usual, unusual) for imu in found.solution.imus if imu.prior and imu.prior.gyro
-    ]
-    assert used == [True, False]
+    priors = [imu.prior["gyro"] for found in (usual, unusual) for imu in found.imus if imu.prior]
+    assert [prior["used"] for prior in priors if prior] == [True, False]
 
 
 def test_where_the_others_cannot_tell_both_are_said() -> None:
@@ -247,7 +250,7 @@ def test_what_is_remembered_is_what_was_measured_not_what_became_of_it() -> None
     of = solution(imus([np.ones(3) * MG], shared), shared)
     known = [ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.3 * MG)})]
     found = weighed(of, known)
-    assert abs(accel_of(found.solution.imus[0])[0]) < 0.9 * MG
+    assert abs(accel_of(found.imus[0])[0]) < 0.9 * MG
     kept = points(
         of,
         whole_of(of),
