@@ -47,7 +47,7 @@ from companion.estimation.request import What
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation
-from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn, when_warm
+from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn
 from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.estimation.solution.truth import Otherwise
@@ -220,7 +220,8 @@ class CalibrationRun(Job):
         for doubt in weighed.doubts:
             core.say(Severity.WARNING, doubt.words)
         if not self.automatic:
-            for words in (*unseen_turn(self.solution), *when_warm(self.solution)):
+            warm = [words for imu in self.solution.imus if imu.when_warm for words in imu.when_warm.words]
+            for words in (*unseen_turn(self.solution), *warm):
                 core.say(Severity.NOTICE, words)
         if self.held_back:
             kept = in_short(self.held_back)

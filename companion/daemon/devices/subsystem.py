@@ -130,18 +130,20 @@ class Devices(Subsystem):
         counts = {source.name: {"lost": source.lost, "dropped": source.dropped} for source in sources}
         roles = [role for sensor in self.sensors for role in sensor.roles]
         found: list[AutopilotImu | SensorRole] = [*self.imus.values(), *roles]
-        devices = []
+        devices, thermometers = [], self._core.collector.thermometers
         for device in found:
             said = device.status() | counts.get(device.name, {})
             if (words := self._misplaced(device.name)) is not None:
                 said |= {"good": False, "summary": f"{said['summary']}; {words}"}
-            elif self._core.collector.thermometers.has_none(device.name):
+            elif thermometers[device.name].none:
                 said |= {"summary": f"{said['summary']}, without a temperature"}
             devices.append(said)
         return {
             "devices": devices,
             "warnings": [
-                words for imu in self._core.config.imu if (words := self._core.collector.thermometers.trouble(imu.name))
+                f"imu {imu.name}: its thermometer {wrong}; nothing is learned by it"
+                for imu in self._core.config.imu
+                if (wrong := thermometers[imu.name].wrong)
             ],
             "profiles": self._core.profiles.status(),
             "ground_stations": dict(zip(("good", "summary"), self.reach.text(), strict=True)),

@@ -7,6 +7,7 @@ when every source was still in it. Method 2.4, 3.1 and 3.2.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -20,8 +21,8 @@ from companion.estimation.means.pose import CompassModel, FieldHeading, Gradient
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
+from companion.estimation.seconds.thermometer import Thermometer
 from companion.estimation.stillness.gates import GateVerdict
-from companion.estimation.temperature.thermometer import Thermometers
 from companion.estimation.turning.turn import Turn
 from companion.estimation.turning.watch import TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
@@ -62,7 +63,7 @@ class RollingCollector:
         self._heading = None if compass is None else self._pose_source("compass")
         self._field = None if compass is None else FieldHeading(compass, gradienter, self._keep)
         self._turns = TurnWatch(settings.max_slots)
-        self.thermometers = Thermometers()
+        self.thermometers: defaultdict[str, Thermometer] = defaultdict(Thermometer)
         self._next: int | None = None
         self._now_s = -math.inf
         self._restarts = 0
@@ -143,7 +144,7 @@ class RollingCollector:
         self._turns.set_imu(name, imu.rotation, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         if known is None:
             self.imus[name] = source = ImuSource(imu, self._keep)
-            source.batches.believed = lambda slot, degc: self.thermometers.believed(name, slot, degc)
+            source.batches.believed = self.thermometers[name].believed
             self._windows.set_imu(imu, source.batches, source.raw)
             # It has no share in the seconds so far.
             self._break()

@@ -54,9 +54,7 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
 
     def is_same(self, other: PowerUp) -> bool:
         """Return False only if the power was surely off in between."""
-        if self.host == other.host:
-            return True
-        return self.started_with(other)
+        return self.host == other.host or self.started_with(other)
 
     def started_with(self, other: PowerUp) -> bool:
         """Return True if both tell the same start: the power was on all the while."""
@@ -113,12 +111,9 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
 
     def as_chosen(self, *, gyro: bool = True) -> Point:
         """Mark a contradiction as decided for: its calibration was requested and is in force; `gyro`: gyros too."""
-        rates = _as_chosen(self.gyro) if gyro else self.gyro
-        return msgspec.structs.replace(self, gyro=rates, accel=_as_chosen(self.accel))
-
-
-def _as_chosen(found: MeasuredBias | None) -> MeasuredBias | None:
-    return msgspec.structs.replace(found, chosen=True) if found is not None and found.suspect else found
+        found: dict[Triad, MeasuredBias | None] = {"gyro": self.gyro if gyro else None, "accel": self.accel}
+        chosen = {t: msgspec.structs.replace(one, chosen=True) for t, one in found.items() if one and one.suspect}
+        return msgspec.structs.replace(self, **chosen)
 
 
 def by_power_up(points: Sequence[Point]) -> list[list[Point]]:

@@ -165,18 +165,17 @@ def expect(
     if len(groups) < GUARDS_FROM:
         return None
     # Where a temperature is missing, all count as measured at the same one.
-    by_degc = now.temperature_degc is not None and _have_temperatures(groups)
+    known = None if now.temperature_degc is None else _states(groups)
     nodes, poses = [], []
-    for group in groups:
+    for group, states in zip(groups, known or [np.zeros((len(group), 2)) for group in groups], strict=True):
         bias, pose, white = _here(group, triad, now.up, effect)
         zero = group[-1].zero_sigma_rad * G if triad == "accel" else 0.0
-        states = _states(group) if by_degc else np.zeros((len(group), 2))
         nodes.append(PowerUpNodes(states, bias, white, float(np.square(pose).mean()) + zero**2))
         poses.append(pose.mean(axis=0))
     curve = fit(nodes, in_run_variance(model), CATALOGUE_PER_K[triad])
     assert curve is not None
-    degc = now.temperature_degc or 0.0
-    value, variance = curve.at(degc, now.k_s) if by_degc else curve.at(0.0)
+    degc, k_s = (now.temperature_degc, now.k_s) if known and now.temperature_degc is not None else (0.0, 0.0)
+    value, variance = curve.at(degc, k_s)
     # An error that all power-ups share, of one attitude or one place, does not average out.
     shared = [point.measured(triad).sigma_shared for group in groups for point in group]
     together = np.square(curve.shares @ np.array(poses)) + np.max(np.square(shared), axis=0)
@@ -186,7 +185,7 @@ def expect(
         variance=vector(variance + together),
         limit=student_quantile(GATE_SIGMAS, curve.freedom),
         power_ups=len(groups),
-        weighs=len(groups) >= WEIGHS_FROM and (not by_degc or curve.beyond_k(degc) == 0.0),
+        weighs=len(groups) >= WEIGHS_FROM and curve.beyond_k(degc) == 0.0,
         by_temperature=curve.order > 0,
         same_zero=same,
         other_zero_rad=other,
@@ -205,12 +204,9 @@ def expect_today(
         return None
     (bias,), (pose,), _ = _here([last], triad, now.up, effect)
     then_degc, now_degc = last.temperature_degc, now.temperature_degc
-    change = np.zeros(3)
-    if then_degc is None or now_degc is None:
-        of_change = np.full(3, (CATALOGUE_PER_K[triad] * TEMPERATURE_SIGMA_K) ** 2)
-    elif curve is None:
-        of_change = np.full(3, (CATALOGUE_PER_K[triad] * (now_degc - then_degc)) ** 2)
-    else:
+    kelvin = TEMPERATURE_SIGMA_K if then_degc is None or now_degc is None else now_degc - then_degc
+    change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * kelvin) ** 2)
+    if curve is not None and then_degc is not None and now_degc is not None:
         change, of_change = curve.change((then_degc, last.k_s), (now_degc, now.k_s))
     drift = in_run_variance(model, abs(now.unix_s - last.unix_s))
     same = triad == "accel" and last.zero == now.zero
@@ -233,26 +229,26 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
     An accelerometer's variance grows with the change of attitude from the first point of the power-up.
     """
     groups = believed(points, triad)
-    if len(groups) < WEIGHS_FROM or not _have_temperatures(groups):
+    known = _states(groups)
+    if len(groups) < WEIGHS_FROM or known is None:
         return None
     nodes = []
-    for group in groups:
+    for group, states in zip(groups, known, strict=True):
         bias, pose, white = _here(group, triad, group[0].up, _ASSUMED)
-        nodes.append(PowerUpNodes(_states(group), bias, white + np.square(pose).mean(axis=1)))
+        nodes.append(PowerUpNodes(states, bias, white + np.square(pose).mean(axis=1)))
     curve = fit(nodes, in_run_variance(model), CATALOGUE_PER_K[triad], may_be_mean=False)
     assert curve is not None
     low, high = curve.span_degc
     _, of_kelvin = curve.change((low, 0.0), (low + 1.0, 0.0))
-    known = high > low and of_kelvin.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
-    return curve if known and curve.unexplained < _UNEXPLAINED else None
+    is_known = high > low and of_kelvin.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
+    return curve if is_known and curve.unexplained < _UNEXPLAINED else None
 
 
-def _have_temperatures(groups: Sequence[Sequence[Point]]) -> bool:
-    return all(point.temperature_degc is not None for group in groups for point in group)
-
-
-def _states(group: Sequence[Point]) -> Floats:
-    return np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64)
+def _states(groups: Sequence[Sequence[Point]]) -> list[Floats] | None:
+    """Give the temperature and its rate of every point by power-up, (n, 2) each; None: one is not known."""
+    if any(point.temperature_degc is None for group in groups for point in group):
+        return None
+    return [np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64) for group in groups]
 
 
 def _here(points: Sequence[Point], triad: Triad, up: Vector, effect: PoseEffect) -> tuple[Floats, Floats, Floats]:

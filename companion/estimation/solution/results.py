@@ -100,11 +100,6 @@ def unseen_turn(solution: Solution) -> tuple[str, ...]:
     return ()
 
 
-def when_warm(solution: Solution) -> list[str]:
-    """Predict the biases of the warm IMUs, where a temperature curve is known."""
-    return [words for imu in solution.imus if imu.when_warm is not None for words in imu.when_warm.words]
-
-
 def _where_known(matrix: Matrix, known: list[bool]) -> tuple[tuple[float | None, ...], ...] | None:
     if not any(known):
         return None

@@ -233,21 +233,20 @@ def solve(
 
 
 def _pose(truth: Truth) -> Pose:
-    gamma, theta = roll_pitch_from_up(truth.up)
-    up, covariance, heading = truth.up, truth.up_covariance, truth.heading_rad
-    by_gamma = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
-    known = truth.tilt_from is not None
+    up, covariance, heading, sigma = truth.up, truth.up_covariance, truth.heading_rad, truth.heading_sigma_rad
+    theta = gamma = of_theta = of_gamma = None
+    if truth.tilt_from is not None:
+        gamma, theta = (angle / DEG for angle in roll_pitch_from_up(up))
+        by_gamma = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
+        of_theta = math.sqrt(covariance[0, 0] / (1.0 - up[0] ** 2)) / DEG
+        of_gamma = math.sqrt(by_gamma @ covariance @ by_gamma) / DEG
     return Pose(
         tilt_from=truth.tilt_from,
         heading_from=truth.heading_from,
-        theta_deg=theta / DEG if known else None,
-        gamma_deg=gamma / DEG if known else None,
-        psi_deg=(heading / DEG) % 360.0 if heading is not None else None,
-        sigma_deg=PoseSigma(
-            theta=math.sqrt(covariance[0, 0] / (1.0 - up[0] ** 2)) / DEG if known else None,
-            gamma=math.sqrt(by_gamma @ covariance @ by_gamma) / DEG if known else None,
-            psi=truth.heading_sigma_rad / DEG if truth.heading_sigma_rad is not None else None,
-        ),
+        theta_deg=theta,
+        gamma_deg=gamma,
+        psi_deg=None if heading is None else (heading / DEG) % 360.0,
+        sigma_deg=PoseSigma(theta=of_theta, gamma=of_gamma, psi=None if sigma is None else sigma / DEG),
     )
 
 

@@ -88,20 +88,6 @@ class Truth:
         """Give the Earth's rate in the vehicle's axes, and its covariance."""
         return local.rate_in_body(self.body_from_ned, heading_known=self.heading_rad is not None)
 
-    def with_heading(self, own: OwnHeading, warnings: list[str]) -> Truth:
-        """Add the autopilot's heading."""
-        warnings.append(
-            f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg"
-        )
-        sigma_rad = own.sigma_deg * DEG
-        return dataclasses.replace(
-            self,
-            attitude_covariance_rad2=self.attitude_covariance_rad2 + np.outer(self.up, self.up) * sigma_rad**2,
-            heading_rad=own.heading_deg * DEG,
-            heading_from="autopilot",
-            heading_sigma_rad=sigma_rad,
-        )
-
 
 def attitude_error_jacobian(up: Array) -> Matrix:
     """Give the derivative of the attitude by `up`, at a fixed heading: eps = jacobian @ d up, (3, 3).
@@ -145,7 +131,18 @@ def truth_of(
     jacobian = attitude_error_jacobian(up)
     without = Truth(up, up_covariance, jacobian @ up_covariance @ jacobian.T, by_reading, reading_sigma, tilt_from)
     if compass is None or window.heading is None:
-        return without if otherwise.heading is None else without.with_heading(otherwise.heading, warnings)
+        if (own := otherwise.heading) is None:
+            return without
+        warnings.append(
+            f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg"
+        )
+        return dataclasses.replace(
+            without,
+            attitude_covariance_rad2=without.attitude_covariance_rad2 + np.outer(up, up) * (own.sigma_deg * DEG) ** 2,
+            heading_rad=own.heading_deg * DEG,
+            heading_from="autopilot",
+            heading_sigma_rad=own.sigma_deg * DEG,
+        )
     tilt_covariance = None if tilt_from is None else up_covariance
     may_turn_deg = window.turn.at_most_rad_s / DEG * (window.end_s - window.start_s)
     found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance, may_turn_deg)

@@ -191,7 +191,7 @@ ACCEL_LIMIT_M_S2 = 2000.0
 """204 g; the widest range of a part with a gyro in it is 200 g."""
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Limit for an IMU, in kelvin or tenths too: `estimation/temperature/thermometer.py` names what cannot be degC."""
+"""Limit for an IMU, in kelvin or tenths too: `estimation/seconds/thermometer.py` names what cannot be degC."""
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware import imu_messages
-from companion.estimation.temperature.thermometer import Thermometers
+from companion.estimation.seconds.thermometer import Thermometer
 
 Degc = Callable[[int], float | None]
 
@@ -20,12 +20,11 @@ def warm(t_s: int) -> float:
     return round(31.0 - 20.0 * math.exp(-t_s / 300.0) + 0.02 * math.sin(37.0 * t_s), 2)
 
 
-def shown(seconds: int, **by: Degc) -> tuple[Thermometers, dict[str, list[float | None]]]:
-    thermometers = Thermometers()
-    found: dict[str, list[float | None]] = {name: [] for name in by}
-    for slot in range(seconds):
-        for name, degc in by.items():
-            found[name].append(thermometers.believed(name, slot, degc(slot)))
+def shown(seconds: int, **by: Degc) -> tuple[dict[str, Thermometer], dict[str, list[float | None]]]:
+    thermometers = {name: Thermometer() for name in by}
+    found = {
+        name: [thermometers[name].believed(slot, degc(slot)) for slot in range(seconds)] for name, degc in by.items()
+    }
     return thermometers, found
 
 
@@ -39,15 +38,13 @@ def shown(seconds: int, **by: Degc) -> tuple[Thermometers, dict[str, list[float 
 )
 def test_a_bad_one_is_named_with_what_was_found_and_not_believed(degc: Degc, words: str) -> None:
     thermometers, found = shown(1000, fc=degc, own=warm)
-    line = thermometers.trouble("fc")
-    assert line.startswith("imu fc: its thermometer ")
-    assert line.endswith("; nothing is learned by it")
+    line = thermometers["fc"].wrong
     assert "\n" not in line
-    assert len(line) < 130
+    assert len(line) < 80
     assert re.search(words, line), line
     assert found["fc"][-1] is None
     assert found["own"][5:] == [warm(t_s) for t_s in range(5, 1000)]
-    assert thermometers.trouble("own") == ""
+    assert thermometers["own"].wrong == ""
 
 
 def test_jumps_are_forgiven_after_ten_minutes() -> None:
@@ -55,29 +52,26 @@ def test_jumps_are_forgiven_after_ten_minutes() -> None:
     assert found["fc"][100:102] == [None, None]
     assert found["fc"][600] is None
     assert found["fc"][799] == warm(799)
-    assert thermometers.trouble("fc") == ""
+    assert thermometers["fc"].wrong == ""
 
 
 def test_without_a_temperature_an_imu_is_named_after_seconds() -> None:
     thermometers, _ = shown(10, fc=lambda t_s: None)
-    assert not thermometers.has_none("fc")
-    assert thermometers.believed("fc", 11, None) is None
-    assert thermometers.has_none("fc")
-    assert not thermometers.has_none("own")
-    assert thermometers.trouble("fc") == ""
-    assert thermometers.believed("fc", 12, 20.0) == 20.0
-    assert not thermometers.has_none("fc")
+    found = [
+        (thermometers["fc"].believed(*shown), thermometers["fc"].none) for shown in ((9, None), (11, None), (12, 20.0))
+    ]
+    assert found == [(None, False), (None, True), (20.0, False)]
+    assert thermometers["fc"].wrong == ""
 
 
 def test_nothing_from_the_wire_makes_it_raise() -> None:
     random = np.random.default_rng(0)
-    thermometers = Thermometers()
+    thermometers = {name: Thermometer() for name in ("fc", "own", "third")}
     odd = [None, math.nan, math.inf, -math.inf, 1e308, -1e308, 0.0, -0.0, 5e-324, 31.0]
     for _ in range(3000):
         slot, name = int(random.integers(-5, 5000)), str(random.choice(["fc", "own", "third"]))
-        found = thermometers.believed(name, slot, odd[random.integers(len(odd))])
+        found = thermometers[name].believed(slot, odd[random.integers(len(odd))])
         assert found is None or -40.0 <= found <= 105.0
-        thermometers.trouble(name)
 
 
 def test_of_the_autopilots_messages_only_those_that_carry_the_imus_temperature_give_one() -> None:
