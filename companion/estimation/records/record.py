@@ -144,7 +144,7 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
     """Sigma of the bias as the sensor's own, in its own axes, whatever its attitude."""
 
 
-class WhenWarm(msgspec.Struct, frozen=True, kw_only=True):
+class WhenWarm(msgspec.Struct, frozen=True):
     """Whole biases that the curve over temperature predicts for the warm board."""
 
     degc: float

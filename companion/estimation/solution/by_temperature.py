@@ -63,7 +63,6 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
 
     imu: str
     summary: str = ""
-    """Amount of data, in words."""
     power_ups: int = 0
     days: int = 0
     points: tuple[WindowBias, ...] = ()

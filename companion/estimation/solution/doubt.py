@@ -71,8 +71,10 @@ class Witness:
         return bool((np.abs(self.difference) > self.expected.limit * self.sigma).any())
 
     @property
-    def agrees(self) -> bool:
-        """Return True if the prediction may take part."""
+    def may_weigh(self) -> bool:
+        """Return True if the prediction may take part in the estimate."""
+        if not self.expected.weighs:
+            return False
         covariance = np.diag(self.own_variance) + self.common
         return float(self.difference @ np.linalg.solve(covariance, self.difference)) < AGREES
 

@@ -61,9 +61,7 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Solutio
     earlier, today = (_witnesses(imus, shared, whole, expected, today=today) for today in (False, True))
     doubts = tuple(contradictions(earlier, today, len(imus), shared.up, shared.by_reading))
     solution = dataclasses.replace(solution, imus=imus, doubts=doubts)
-    used = [
-        one for one in earlier if one.expected.weighs and (one.name, one.triad) not in solution.doubted and one.agrees
-    ]
+    used = [one for one in earlier if one.may_weigh and (one.name, one.triad) not in solution.doubted]
     combined, shift = _combined(solution, used, zero_is_known=expectation.zero_is_known)
     combined = _grounded(combined, earlier, today)
     final = []
@@ -134,15 +132,8 @@ def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu, followed: Co
             )
     if "gyro" not in figures:
         return imu
-    (gyro, of_gyro), (accel, of_accel) = figures["gyro"], figures.get("accel", (None, None))
-    when = WhenWarm(
-        degc=round(degc, 1),
-        gyro_bias_rad_s=gyro,
-        gyro_sigma_rad_s=of_gyro,
-        accel_bias_m_s2=accel,
-        accel_sigma_m_s2=of_accel,
-        words=tuple(words),
-    )
+    accel, of_accel = figures.get("accel", (None, None))
+    when = WhenWarm(round(degc, 1), *figures["gyro"], accel, of_accel, tuple(words))
     return dataclasses.replace(imu, when_warm=when, drifting=tuple(words))
 
 

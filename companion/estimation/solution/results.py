@@ -32,7 +32,15 @@ def record_of(
     `reason` None: the figures in words. `imus`: their records, where the plain ones of the solution are not all.
     """
     imus = imu_records(solution, {}) if imus is None else tuple(imus)
-    told = solution is not None and solution.turn.is_told
+    standing = None
+    if solution is not None:
+        turn = solution.turn if solution.turn.is_told else None
+        standing = PlatformTurn(
+            platform=solution.platform,
+            turn_deg_s=None if turn is None else round(turn.rate_rad_s / DEG, 6),
+            turn_sigma_deg_s=None if turn is None else round(turn.sigma_rad_s / DEG, 6),
+            told_by=None if turn is None else turn.by,
+        )
     return Record(
         state=state,
         reason=in_words(solution, imus) if reason is None else reason,
@@ -42,14 +50,7 @@ def record_of(
         pose=None if solution is None else solution.pose,
         site=None if solution is None else solution.site,
         magnetic=None if solution is None else solution.magnetic,
-        standing=None
-        if solution is None
-        else PlatformTurn(
-            platform=solution.platform,
-            turn_deg_s=round(solution.turn.rate_rad_s / DEG, 6) if told else None,
-            turn_sigma_deg_s=round(solution.turn.sigma_rad_s / DEG, 6) if told else None,
-            told_by=solution.turn.by if told else None,
-        ),
+        standing=standing,
         imus=imus,
     )
 

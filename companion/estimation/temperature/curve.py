@@ -364,8 +364,7 @@ class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
 
     def zero_at(self, degc: float) -> Polynomial:
         """Return the polynomial with the constant that makes it zero at this temperature."""
-        c0, *others = self.coefficients
-        first, second, third = others
+        c0, first, second, third = self.coefficients
         constant = vector(np.subtract(c0, self.at(degc)))
         return msgspec.structs.replace(self, coefficients=(constant, first, second, third))
 
