@@ -141,9 +141,7 @@ class Devices(Subsystem):
         return {
             "devices": devices,
             "warnings": [
-                f"imu {imu.name}: its thermometer {wrong}; nothing is learned by it"
-                for imu in self._core.config.imu
-                if (wrong := thermometers[imu.name].wrong)
+                f"imu {imu.name}: {wrong}" for imu in self._core.config.imu if (wrong := thermometers[imu.name].wrong)
             ],
             "profiles": self._core.profiles.status(),
             "ground_stations": dict(zip(("good", "summary"), self.reach.text(), strict=True)),

@@ -31,7 +31,7 @@ class Thermometer:
         self.none = False
         """True for an IMU whose messages carry no temperature."""
         self.wrong = ""
-        """Reason why it is not believed; empty: it is, or there is none."""
+        """Reason in one line why it is not believed; empty: it is, or there is none."""
         self._slot = slot
         """Second of the latest reading, or the first second."""
         self._degc: float | None = None
@@ -47,10 +47,11 @@ class Thermometer:
         jumped = self._degc is not None and abs(degc - self._degc) > JUMP_K and slot - self._slot <= _ADJACENT_S
         if jumped:
             self._jumps.append(slot)
-        self._slot, self._degc, self.none, self.wrong = slot, degc, False, ""
+        self._slot, self._degc, self.none, wrong = slot, degc, False, ""
         if not LOWEST_DEGC <= degc <= HIGHEST_DEGC:
             allowed = f"{LOWEST_DEGC:g} to {HIGHEST_DEGC:g} degC"
-            self.wrong = f"shows {degc:.2f}, allowed {allowed}: in another unit?"
+            wrong = f"shows {degc:.2f}, allowed {allowed}: in another unit?"
         elif len(self._jumps) == _JUMPS and slot - self._jumps[0] <= _WITHIN_S:
-            self.wrong = f"jumps: more than {JUMP_K:g} K within a second, again and again"
-        return None if self.wrong or jumped else degc
+            wrong = f"jumps: more than {JUMP_K:g} K within a second, again and again"
+        self.wrong = f"its thermometer {wrong}; nothing is learned by it" if wrong else ""
+        return None if wrong or jumped else degc
