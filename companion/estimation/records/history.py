@@ -24,8 +24,6 @@ _MOST: Final = 100.0
 _Bias = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 _Sigma = Annotated[float, msgspec.Meta(ge=0.0, le=_MOST)]
 _Sigmas = tuple[_Sigma, _Sigma, _Sigma]
-GUARDS_FROM: Final = 3
-"""Least earlier power-ups of a guard."""
 WEIGHS_FROM: Final = 5
 """Least earlier power-ups that take part in the estimate."""
 NEW_AFTER: Final = 3

@@ -17,7 +17,7 @@ import numpy as np
 from companion.estimation.solution.prior import Prediction
 from companion.physics.frames import Array, Matrix
 from companion.physics.units import DEG, DEG_H, MG, UNITS
-from companion.samples import TRIADS, Triad, rows_of
+from companion.samples import TRIADS, Triad
 
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
@@ -48,12 +48,6 @@ class Witness:
     """Variance of the difference that other IMUs do not share, (3,)."""
     common: Matrix
     """Covariance of the difference that all IMUs share, (3, 3)."""
-
-    @property
-    def rows(self) -> slice:
-        """Rows of this triad among the six of each IMU."""
-        start = 6 * self.imu + rows_of(self.triad).start
-        return slice(start, start + 3)
 
     @property
     def difference(self) -> Array:

@@ -176,7 +176,7 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
     shared, count = solution.shared, len(solution.imus)
     if not used:
         return solution, np.zeros(6 * count)
-    index = np.concatenate([np.arange(one.rows.start, one.rows.stop) for one in used])
+    index = np.concatenate([6 * one.imu + np.arange(6)[rows_of(one.triad)] for one in used])
     innovation = -np.concatenate([one.difference for one in used])
     parts = [slice(6 * k, 6 * k + 6) for k in range(count)]
     s_d = np.kron(np.ones((count, count)), shared.covariance)

@@ -26,7 +26,7 @@ import numpy as np
 from companion.config.sections import AllanModel
 from companion.estimation.alignment.align_model import Priors
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
-from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, Point, believed
+from companion.estimation.records.history import WEIGHS_FROM, Point, believed
 from companion.estimation.records.record import Effective
 from companion.estimation.temperature.curve import CATALOGUE_PER_K, Along, Curve, PowerUpNodes, fit, in_run_variance
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
@@ -39,7 +39,6 @@ WORTH_SAYING_M_S2: Final = 1.0 * MG
 """Least effect of the attitude in a warning; a wheel on a stone makes less."""
 _SIGMAS: Final = 2.0
 _PRIORS: Final = Priors()
-_MISALIGNMENT_RAD: Final = _PRIORS.misalignment_deg * DEG
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Temperature change between two calibrations of one power-up, where no temperature is known."""
@@ -106,7 +105,7 @@ def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
 
     scale, scale_sigma = known(aligned.accel_scale if aligned else None, 1.0, _PRIORS.scale)
     shear, shear_sigma = known(aligned.accel_shear if aligned else None, 1.0, _PRIORS.shear)
-    turn, turn_sigma = known(aligned.misalignment_deg if aligned else None, DEG, _MISALIGNMENT_RAD)
+    turn, turn_sigma = known(aligned.misalignment_deg if aligned else None, DEG, _PRIORS.misalignment_deg * DEG)
     return PoseEffect(
         mean=np.diag(scale) + symmetric(shear),
         sigma=np.diag(scale_sigma) + symmetric(shear_sigma),
@@ -162,8 +161,6 @@ def expect(
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
-    if len(groups) < GUARDS_FROM:
-        return None
     # Where a temperature is missing, all count as measured at the same one.
     known = None if now.temperature_degc is None else _states(groups)
     nodes, poses = [], []
@@ -173,7 +170,8 @@ def expect(
         nodes.append(PowerUpNodes(states, bias, white, float(np.square(pose).mean()) + zero**2))
         poses.append(pose.mean(axis=0))
     curve = fit(nodes, in_run_variance(model), CATALOGUE_PER_K[triad])
-    assert curve is not None
+    if curve is None:
+        return None
     degc, k_s = (now.temperature_degc, now.k_s) if known and now.temperature_degc is not None else (0.0, 0.0)
     value, variance = curve.at(degc, k_s)
     # An error that all power-ups share, of one attitude or one place, does not average out.
@@ -208,13 +206,11 @@ def expect_today(
     change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * kelvin) ** 2)
     if curve is not None and then_degc is not None and now_degc is not None:
         change, of_change = curve.change((then_degc, last.k_s), (now_degc, now.k_s))
-    drift = in_run_variance(model, abs(now.unix_s - last.unix_s))
+    variance = np.square([found.sigma_use, found.sigma_shared, pose]).sum(axis=0) + of_change
     same = triad == "accel" and last.zero == now.zero
     return Prediction(
         value=vector(bias + change),
-        variance=vector(
-            np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose) + of_change + drift
-        ),
+        variance=vector(variance + in_run_variance(model, abs(now.unix_s - last.unix_s))),
         limit=GATE_SIGMAS,
         power_ups=1,
         weighs=False,
@@ -264,10 +260,9 @@ def _here(points: Sequence[Point], triad: Triad, up: Vector, effect: PoseEffect)
 
 def _zeros(points: Sequence[Point], share: Floats, today: str | None) -> tuple[float, float]:
     """Give the share that was measured with today's zero, and one sigma of the error of the others."""
-    shares: dict[str | None, float] = {}
-    sigmas: dict[str | None, float] = {}
-    for point, part in zip(points, share, strict=True):
-        shares[point.zero] = shares.get(point.zero, 0.0) + float(part)
-        sigmas[point.zero] = point.zero_sigma_rad
+    shares = dict.fromkeys((point.zero for point in points), 0.0)
+    for point, part in zip(points, share.tolist(), strict=True):
+        shares[point.zero] += part
+    sigmas = {point.zero: point.zero_sigma_rad for point in points}
     same = shares.pop(today, 0.0)
     return same, math.hypot(*(part * sigmas[zero] for zero, part in shares.items()), 0.0)

@@ -41,7 +41,7 @@ LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
 """Kelvins beyond the temperatures seen within which the model is valid (method 3.3)."""
 FEWEST: Final = 3
-"""Least power-ups of a fit."""
+"""Least power-ups of a fit, and of a guard."""
 _CUBIC: Final = 3
 _BETTER: Final = 0.9
 """Largest mean square error of a cubic, as a share of that of a mean, at which the cubic is used."""
@@ -78,7 +78,6 @@ class PowerUpNodes(NamedTuple):
     states: Floats
     """(n, 2): temperature in degC and its rate in K/s."""
     bias: Floats
-    """(n, 3)."""
     variance: Floats
     """(n,): variance of the white noise, mean over the axes."""
     common_variance: float = 0.0
