@@ -38,14 +38,14 @@ _SHELLS: Final = Interface.COMMAND_LINE | Interface.GROUND
 _ALL: Final = _SHELLS | Interface.MQTT | Interface.PAGE
 
 
-class Option(NamedTuple):
-    """Everything about a field but its type."""
+class Field(NamedTuple):
+    """A field of a command; its type is filled in from the class."""
 
     help: str = ""
     by: Interface = _SHELL
     """The interfaces that may set the field."""
     metavar: str | None = None
-    allowed: str = ""
+    allowed_words: str = ""
     """The allowed values in words, where the type does not tell them."""
     flags: Mapping[str, str] = {}
     """Values that the command line takes as options of their own (--gyros), with their help."""
@@ -56,14 +56,7 @@ class Option(NamedTuple):
     """The value for the command line where none is given."""
     group: str = ""
     """Options of the same group exclude each other."""
-
-
-class Field(NamedTuple):
-    """A field of a command."""
-
-    name: str
-    type: Any
-    option: Option
+    type: Any = None
 
     @property
     def values(self) -> tuple[Any, ...]:
@@ -81,10 +74,10 @@ class Field(NamedTuple):
 
     @property
     def allowed(self) -> str:
-        """The allowed values in words."""
+        """The allowed values in words, as of the type where `allowed_words` says none."""
         if self.type is bool:
             return "true or false"
-        return self.option.allowed or ", ".join(map(shown, self.values))
+        return self.allowed_words or ", ".join(map(shown, self.values))
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
@@ -105,7 +98,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
     def fields(cls, by: Interface | None = None) -> dict[str, Field]:
         """Return the fields by name; only those that an interface may set, if one is given."""
         fields = _fields(cls)
-        return {name: field for name, field in fields.items() if by is None or by in field.option.by}
+        return {name: field for name, field in fields.items() if by is None or by in field.by}
 
     @classmethod
     def read(cls, request: Object) -> Self:
@@ -132,7 +125,7 @@ def _fields(kind: type[Command]) -> dict[str, Field]:
     found = {}
     for name in kind.__struct_fields__:
         inner, *notes = typing.get_args(hints[name])
-        found[name] = Field(name, inner, next(note for note in notes if isinstance(note, Option)))
+        found[name] = next(note for note in notes if isinstance(note, Field))._replace(type=inner)
     return found
 
 
@@ -147,7 +140,7 @@ def shown(value: object) -> str:
 
 
 _Seconds = Annotated[float, msgspec.Meta(gt=0.0, lt=LONGEST_S)]
-_SECONDS: Final = Option(metavar="S", allowed="a number of seconds above 0")
+_SECONDS: Final = Field(metavar="S", allowed_words="a number of seconds above 0")
 _Count = Annotated[int, msgspec.Meta(ge=1, le=10**6)]
 
 
@@ -162,7 +155,7 @@ class Monitor(Command, frozen=True, tag="monitor"):
     """The status of the daemon, until the client goes away."""
 
     help = "watch the daemon until Ctrl-C"
-    pose: Annotated[bool, Option("attitude, and records as they end, too", by=Interface.MQTT)] = False
+    pose: Annotated[bool, Field("attitude, and records as they end, too", by=Interface.MQTT)] = False
 
 
 class Calibrate(Command, frozen=True, tag="calibrate"):
@@ -172,9 +165,9 @@ class Calibrate(Command, frozen=True, tag="calibrate"):
     by = _ALL
     what: Annotated[
         Literal["both", "gyros", "accelerometers"],
-        Option(by=_ALL, flags={"gyros": "gyros only", "accelerometers": "accelerometers only"}),
+        Field(by=_ALL, flags={"gyros": "gyros only", "accelerometers": "accelerometers only"}),
     ] = "both"
-    wait: Annotated[bool, Option("wait for the end, show progress, print the record")] = False
+    wait: Annotated[bool, Field("wait for the end, show progress, print the record")] = False
     timeout_s: Annotated[
         _Seconds | None,
         _SECONDS._replace(
@@ -182,7 +175,7 @@ class Calibrate(Command, frozen=True, tag="calibrate"):
         ),
     ] = None
     reboot: Annotated[
-        bool, Option("restart the autopilot afterwards (PX4's attitude needs it)", by=_SHELLS | Interface.MQTT)
+        bool, Field("restart the autopilot afterwards (PX4's attitude needs it)", by=_SHELLS | Interface.MQTT)
     ] = False
 
     @classmethod
@@ -203,7 +196,7 @@ class Align(Command, frozen=True, tag="align"):
     by = _SHELL | Interface.PAGE
     action: Annotated[
         Literal["zero", "tilts", "turn", "faces", "show", "forget"] | None,
-        Option(
+        Field(
             "zero: on one spot; tilts: that, and 4 tilts; without a gradienter, turn: level on one spot;"
             " faces: accelerometers, about 12 stands on any side",
             by=by,
@@ -216,13 +209,13 @@ class Align(Command, frozen=True, tag="align"):
     ] = None
     headings: Annotated[
         Literal[2, 4] | None,
-        Option(
+        Field(
             "2: there, turned by 180 deg, on the same way (zero without it); 4: every 90 deg (turn without it)", by=by
         ),
     ] = None
-    level: Annotated[bool, Option("turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)", by=by)] = False
-    write: Annotated[bool, Option("turn, faces: write what was found to the autopilot", by=by)] = False
-    wait: Annotated[bool, Option(by=Interface(0))] = True
+    level: Annotated[bool, Field("turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)", by=by)] = False
+    write: Annotated[bool, Field("turn, faces: write what was found to the autopilot", by=by)] = False
+    wait: Annotated[bool, Field(by=Interface(0))] = True
     timeout_s: Annotated[_Seconds | None, _SECONDS._replace(help="give up after so long (default 900)")] = None
 
 
@@ -241,7 +234,7 @@ class Undo(Command, frozen=True, tag="undo"):
     by = _ALL
     force: Annotated[
         bool,
-        Option(
+        Field(
             "leave what somebody else has changed since, and put the rest back",
             by=_SHELL | Interface.MQTT | Interface.PAGE,
         ),
@@ -260,8 +253,12 @@ class History(Command, frozen=True, tag="history"):
     help = "list past calibrations"
     limit: Annotated[
         _Count | None,
-        Option(
-            "the latest N (default 20)", metavar="N", short="-n", default=20, allowed="a whole number from 1 to 1000000"
+        Field(
+            "the latest N (default 20)",
+            metavar="N",
+            short="-n",
+            default=20,
+            allowed_words="a whole number from 1 to 1000000",
         ),
     ] = None
 
@@ -272,7 +269,7 @@ class Temperature(Command, frozen=True, tag="temperature"):
     help = "how the gyros' biases follow the temperature, as far as seen"
     action: Annotated[
         Literal["write", "undo"] | None,
-        Option(
+        Field(
             flags={
                 "write": "write the curves into the autopilot (disarmed and still)",
                 "undo": "put back what was there before the curves",
@@ -282,7 +279,7 @@ class Temperature(Command, frozen=True, tag="temperature"):
     ] = None
     overwrite: Annotated[
         bool,
-        Option("as --write, also over a temperature calibration that is not the companion's", group="action"),
+        Field("as --write, also over a temperature calibration that is not the companion's", group="action"),
     ] = False
 
 
@@ -292,18 +289,18 @@ class RecordInputs(Command, frozen=True, tag="record"):
     help = "record everything to a file until Ctrl-C (the last hour is kept anyway)"
     file: Annotated[
         str | None,
-        Option("default: one beside the daemon's own", metavar="FILE", positional=True, allowed="a path"),
+        Field("default: one beside the daemon's own", metavar="FILE", positional=True, allowed_words="a path"),
     ] = None
     seconds: Annotated[_Seconds | None, _SECONDS._replace(help="default: until Ctrl-C, --stop or 1 GB")] = None
-    stop: Annotated[bool, Option("end a recording that runs")] = False
+    stop: Annotated[bool, Field("end a recording that runs")] = False
 
 
 class Answer(Command, frozen=True, tag="answer"):
     """Answer a question of the first-run set-up, which a page asks before there is a daemon."""
 
     by = Interface.PAGE
-    number: Annotated[int | None, Option(by=by, allowed="a whole number")] = None
-    words: Annotated[str | None, Option(by=by, allowed="a text")] = None
+    number: Annotated[int | None, Field(by=by, allowed_words="a whole number")] = None
+    words: Annotated[str | None, Field(by=by, allowed_words="a text")] = None
 
 
 ALL: Final = {

@@ -8,10 +8,6 @@ from typing import Any
 import msgspec
 
 
-class _Versioned(msgspec.Struct):
-    format_version: int = 0
-
-
 def decode(data: bytes, kind: Any, newest: int | None) -> Any:
     """JSON as that type; `newest` is the latest version of it that is known, None where it has none.
 
@@ -19,8 +15,8 @@ def decode(data: bytes, kind: Any, newest: int | None) -> Any:
         msgspec.MsgspecError: it is nothing of the kind, or of a newer companion.
     """
     if newest is not None:
-        version = msgspec.json.decode(data, type=_Versioned).format_version
-        if version > newest:
+        said = msgspec.json.decode(data, type=dict[str, msgspec.Raw]).get("format_version")
+        if said is not None and (version := msgspec.json.decode(said, type=int)) > newest:
             raise msgspec.ValidationError(
                 f"found format {version}; allowed: up to {newest} (a newer companion has saved it)"
             )

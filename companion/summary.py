@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from companion.formats import Object
 
@@ -10,12 +10,8 @@ _HEARTBEAT_S: Final = 2.0
 """An older heartbeat is a lost link."""
 
 
-class StatusRow(NamedTuple):
-    """One part that the companion is connected to, or one warning."""
-
-    verdict: Literal["ok", "warning", "wrong"]
-    name: str
-    words: str
+StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str]
+"""One part that the companion is connected to, or one warning: verdict, name and words."""
 
 
 def headline(status: Object) -> str:
@@ -32,21 +28,21 @@ def rows(status: Object) -> list[StatusRow]:
         found.append(_row(signing["good"], f"signing ({signing['mode']})", signing["summary"]))
     found += [_row(device["good"], device["name"], device["summary"] + _counts(device)) for device in status["devices"]]
     if not status["ground_stations"]["good"]:
-        found.append(StatusRow("wrong", "ground stations", status["ground_stations"]["summary"]))
+        found.append(("wrong", "ground stations", status["ground_stations"]["summary"]))
     found += [
         _row(one["good"], name, one["summary"]) for name in ("mqtt", "fleet") if (one := status[name]) is not None
     ]
     if recording["fault"] is not None:
-        found.append(StatusRow("wrong", "recordings", f"none at present: {recording['fault']}"))
+        found.append(("wrong", "recordings", f"none at present: {recording['fault']}"))
     if gate is not None and gate["problem"]:
-        found.append(StatusRow("wrong", "arming", gate["problem"]))
+        found.append(("wrong", "arming", gate["problem"]))
     if status["automatic"]["stopped"]:
-        found.append(StatusRow("wrong", "by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
-    return [*found, *(StatusRow("warning", "warning", words) for words in status["warnings"])]
+        found.append(("wrong", "by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
+    return [*found, *(("warning", "warning", words) for words in status["warnings"])]
 
 
 def _row(good: bool, name: str, words: str) -> StatusRow:  # noqa: FBT001 - the first column
-    return StatusRow("ok" if good else "wrong", name, words)
+    return "ok" if good else "wrong", name, words
 
 
 def _counts(device: Object) -> str:

@@ -20,9 +20,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.lab.logs.csv_log import read
 from companion.lab.logs.log_files import read_logs
 from companion.lab.logs.recording import Recording
+from companion.lab.logs.still_log import read_csv
 from companion.lab.replay.engine import replay
 from companion.lab.replay.estimate import Given, estimate
 from tests.support.long_recordings import write_log, write_recording
@@ -55,7 +55,7 @@ def _replayed(path: Path) -> None:
 
 
 def _estimated(path: Path) -> None:
-    record, _ = estimate(read(path), Given(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0))
+    record, _ = estimate(read_csv(path), Given(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0))
     assert record.state == "done", record.reason
 
 

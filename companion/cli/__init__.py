@@ -70,7 +70,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import client, fleet, flight, ground, local, monitor, profile, replay
+    from companion.cli import client, desk, ground, local, monitor, profile
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -109,9 +109,8 @@ def _parser() -> Parser:
     ):
         add_fields(add(kind.name(), command, kind.help), kind, commands.Interface.COMMAND_LINE)
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
-    replay.add_command(add)
-    flight.add_commands(add)
+    desk.add_commands(add)
     profile.add_command(add)
-    ground.add_commands(subcommands, common)
-    fleet.add_commands(subcommands, common)
+    ground.add_ground(subcommands, common)
+    ground.add_fleet(subcommands, common)
     return parser

@@ -223,15 +223,16 @@ async def report(options: argparse.Namespace) -> int:
     if options.output == "-" and options.json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
-    found = read_material(options.storage or storage_path(options), options.record)
-    content = calibration_page(found, datetime.datetime.now(tz=datetime.UTC)).encode("utf-8", "replace")
-    skipped = f"skipped: {'; '.join(found.damaged)}" if found.damaged else ""
+    records, armings, damaged = read_material(options.storage or storage_path(options), options.record)
+    made = calibration_page(records, armings, damaged, datetime.datetime.now(tz=datetime.UTC))
+    content = made.encode("utf-8", "replace")
+    skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
     if options.output == "-":
         # As the file says of itself, whatever the terminal speaks.
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
     else:
-        path = _save(options.output or "", f"companion-report-{found.number:06d}.html", content)
+        path = _save(options.output or "", f"companion-report-{records[-1][0]:06d}.html", content)
     if skipped:
         print_lines(f"companion: {skipped}", error=True)
     if options.json:

@@ -4,37 +4,27 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from companion.cli.replay import add_table_options
+from companion.cli.desk import add_table_options
 from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
-from companion.formats import utc_now
+from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
+from companion.samples import TRIADS, Triad
 
 if TYPE_CHECKING:
     from companion.config.sections import NoiseProfile
     from companion.estimation.noise.allan import AxisFit
-    from companion.lab.logs.log import StillLog
-    from companion.lab.profile import LearnedNoise, Rests
+    from companion.lab.logs.still_log import StillLog
+    from companion.storage.profiles import SavedProfile
 
 SHORT_S: Final = 1200
-_UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
-
-
-class Learned(NamedTuple):
-    """Noise of one IMU, and the recordings that it comes from."""
-
-    imu: str
-    logs: list[StillLog]
-    rests: list[Rests]
-    finding: LearnedNoise
-    compared: NoiseProfile
-    notes: list[str]
+_UNITS: Final[dict[Triad, tuple[float, str, int]]] = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
 def add_command(add: AddCommand) -> None:
@@ -51,8 +41,8 @@ def add_command(add: AddCommand) -> None:
 
 async def profile(options: argparse.Namespace) -> int:
     from companion.estimation.noise.allan import noise_profile
-    from companion.lab.logs.log import NAME
     from companion.lab.logs.log_files import read_logs
+    from companion.lab.logs.still_log import NAME
     from companion.storage.profiles import ProfileStore, check_name, given_profile
 
     store = compared = None
@@ -75,81 +65,116 @@ async def profile(options: argparse.Namespace) -> int:
     for words in refused:
         print_lines(f"companion: {words}", error=True)
     good = bool(results) and not refused
-    lines = [line for result in results for line in _lines(result)]
-    saved = None
+    lines = [line for _, found, _ in results for line in found]
+    file = None
     if store is not None and good:
         if len(results) > 1:
-            found = ", ".join(result.imu for result in results)
+            found = ", ".join(saved.imu for saved, _, _ in results)
             raise ConfigError(f"--save: found IMUs {found}; allowed: one; say which with --imu")
-        saved = store.write(_to_save(results[0], options.save))
-        lines.append(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
-        lines.append(f"check it: companion replay LOG --windows 60 --profile {saved}")
-    state, file = "done" if good else "failed", None if saved is None else str(saved)
-    answer = {"state": state, "reason": "; ".join(refused), "file": file}
-    return conclude(options, {**answer, "imus": [_object(result) for result in results]}, lines, good=good)
+        file = store.write(msgspec.structs.replace(results[0][0], name=options.save))
+        lines.append(f'saved: {file}; profile = "{options.save}" in [[imu]] takes it, after a restart')
+        lines.append(f"check it: companion replay LOG --windows 60 --profile {file}")
+    answer = {
+        "state": "done" if good else "failed",
+        "reason": "; ".join(refused),
+        "file": None if file is None else str(file),
+        "imus": [found for _, _, found in results],
+    }
+    return conclude(options, answer, lines, good=good)
 
 
-def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Learned:
-    """Estimate the noise of one IMU; raise CalibrationRefusedError where the recordings do not show it."""
+def _learn(
+    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float
+) -> tuple[SavedProfile, list[str], Object]:
+    """Estimate the noise of one IMU; return it for the disk, as lines for people, and as JSON.
+
+    Raises:
+        CalibrationRefusedError: the recordings do not show the noise.
+    """
     from companion.estimation.noise.allan import noise_profile
-    from companion.lab.profile import Rests, fit_profile, rests
+    from companion.lab.profile import fit_profile, rests, seconds_at_rest
+    from companion.storage.profiles import FORMAT_VERSION, ProfileSource, SavedProfile
 
-    whole = [log for log in logs if not log.truncated]
-    if not whole:
+    logs = [log for log in logs if not log.truncated]
+    if not logs:
         raise CalibrationRefusedError(
             "it was recorded in whole mrad/s and mg, cut toward zero: their steps hide the sensor's noise"
         )
-    against = compared or noise_profile(whole[-1].profile)
-    found = []
-    for log in whole:
-        parts = [rests(log.t_s[at], log.readings[at], imu, against) for at in log.pieces(skip_s)]
-        stretches = tuple(rest for part in parts for rest in part.stretches)
-        obstacle = next((part.obstacle for part in parts if part.obstacle), "")
-        found.append(Rests(stretches, sum(part.seconds for part in parts), obstacle))
-    obstacle = next((each.obstacle for each in found if each.obstacle), "")
+    against = compared or noise_profile(logs[-1].profile)
+    found = [[rests(log.t_s[at], log.readings[at], imu, against) for at in log.pieces(skip_s)] for log in logs]
+    obstacle = next((words for parts in found for *_, words in parts if words), "")
     try:
-        finding = fit_profile(imu, [stretch for each in found for stretch in each.stretches], against)
+        stretches = [stretch for parts in found for part, _, _ in parts for stretch in part]
+        learned, fits, kept = fit_profile(imu, stretches, against)
     except CalibrationRefusedError as error:
         in_the_way = f" (in the way: {obstacle})" if obstacle else ""
         raise CalibrationRefusedError(f"{error}{in_the_way}") from None
+    still_s = [sum(seconds_at_rest(part) for part, _, _ in parts) for parts in found]
+    seconds = [sum(number for _, number, _ in parts) for parts in found]
     notes = []
-    if finding.kept:
-        notes.append(
-            f"too short to tell {', '.join(finding.kept)}: as in {against.name!r}, as far as the recordings allow"
-        )
-    if finding.still_s < SHORT_S:
+    if kept:
+        notes.append(f"too short to tell {', '.join(kept)}: as in {against.name!r}, as far as the recordings allow")
+    if sum(still_s) < SHORT_S:
         notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
-    if moved_s := sum(each.seconds - each.still_s for each in found):
+    if moved_s := sum(seconds) - sum(still_s):
         notes.append(f"{moved_s} s were not at rest and are left out{f' ({obstacle})' if obstacle else ''}")
-    return Learned(imu, whole, found, finding, against, notes)
-
-
-def _named(finding: LearnedNoise) -> Iterator[tuple[str, AxisFit, float, str, int]]:
-    for column, fit in enumerate(finding.axes):
-        triad = "gyro" if column < 3 else "accel"
-        yield (f"{triad} {'xyz'[column % 3]}", fit, *_UNITS[triad])
-
-
-def _lines(result: Learned) -> list[str]:
-    finding = result.finding
-    recordings = f"{len(result.logs)} recording{'s' if len(result.logs) > 1 else ''}"
-    span = _temperatures(result.logs)
+    files, span = [", ".join(log.files) for log in logs], _temperatures(logs)
+    saved = SavedProfile(
+        format_version=FORMAT_VERSION,
+        name=imu,
+        saved_at=utc_now(),
+        imu=imu,
+        gyro=learned.gyro,
+        accel=learned.accel,
+        kept_from=against.name,
+        kept=tuple(kept),
+        sources=tuple(
+            ProfileSource(file=file, began_at=log.began_at, still_s=float(still), temperature_degc=_temperatures([log]))
+            for file, log, still in zip(files, logs, still_s, strict=True)
+        ),
+        notes=tuple(notes),
+        warm_up=learned.warm_up,
+    )
     degc = "" if span is None else f", {span[0]:.1f} to {span[1]:.1f} degC"
-    lines = [f"imu {result.imu}: {finding.still_s / 3600.0:.2f} h at rest in {recordings}{degc}"]
-    table = [("", ["N, x sqrt(s)", "floor A", "K, / sqrt(s)"])]
-    for name, fit, unit, unit_name, digits in _named(finding):
-        table.append((f"{name}, {unit_name}", [_cell(fit, which, unit, digits) for which in range(3)]))
-    for triad, (unit, _, digits) in _UNITS.items():
-        for name, noise in (("this profile", finding.profile), (result.compared.name, result.compared)):
-            model = noise.gyro if triad == "gyro" else noise.accel
-            figures = ((model.white, digits), (model.floor, digits), (model.walk, digits + 2))
-            table.append((f"{triad}: {name}", [f"{value / unit:.{places}f}" for value, places in figures]))
-    lines += [f"{first:24} " + " ".join(f"{cell:>16}" for cell in cells) for first, cells in table]
-    for log, found in zip(result.logs, result.rests, strict=True):
-        lines.append(f"used of {', '.join(log.files)}: {found.still_s} of {found.seconds} s")
+    recordings = f"{len(logs)} recording{'s' if len(logs) > 1 else ''}"
+    lines = [f"imu {imu}: {sum(still_s) / 3600.0:.2f} h at rest in {recordings}{degc}", *_table(fits, learned, against)]
+    used = []
+    for file, log, still, whole in zip(files, logs, still_s, seconds, strict=True):
+        lines.append(f"used of {file}: {still} of {whole} s")
         lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
         lines += [f"note: {note}" for note in log.notes]
-    return lines + [f"note: {note}" for note in result.notes]
+        used.append({"seconds": whole, "still_s": still, "left_out": log.left_out, "notes": log.notes})
+    answer = {
+        "name": imu,
+        "still_s": sum(still_s),
+        "seconds": sum(seconds),
+        "recordings": files,
+        "used": used,
+        "temperature_degc": span,
+        "profile": msgspec.to_builtins(learned),
+        "compared": msgspec.to_builtins(against),
+        "kept": kept,
+        # An upper limit that nobody knows is infinite; msgspec writes null for it.
+        "axes": [{"fit": msgspec.json.decode(msgspec.json.encode(fit))} for fit in fits],
+        "notes": notes,
+    }
+    return saved, lines + [f"note: {note}" for note in notes], answer
+
+
+def _table(fits: Sequence[AxisFit], learned: NoiseProfile, compared: NoiseProfile) -> list[str]:
+    """Show the fit of each axis, and both profiles."""
+    table = [("", ["N, x sqrt(s)", "floor A", "K, / sqrt(s)"])]
+    for column, fit in enumerate(fits):
+        triad = TRIADS[column // 3]
+        unit, name, digits = _UNITS[triad]
+        cells = [_cell(fit, which, unit, digits) for which in range(3)]
+        table.append((f"{triad} {'xyz'[column % 3]}, {name}", cells))
+    for triad, (unit, _, digits) in _UNITS.items():
+        for name, noise in (("this profile", learned), (compared.name, compared)):
+            model = noise.of(triad)
+            figures = ((model.white, digits), (model.floor, digits), (model.walk, digits + 2))
+            table.append((f"{triad}: {name}", [f"{value / unit:.{places}f}" for value, places in figures]))
+    return [f"{first:24} " + " ".join(f"{cell:>16}" for cell in cells) for first, cells in table]
 
 
 def _cell(fit: AxisFit, which: int, unit: float, digits: int) -> str:
@@ -171,52 +196,3 @@ def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
     degc = np.concatenate([log.temperature_degc for log in logs])
     known = degc[np.isfinite(degc)]
     return (float(known.min()), float(known.max())) if len(known) else None
-
-
-def _to_save(result: Learned, name: str) -> Any:
-    from companion.storage.profiles import FORMAT_VERSION, ProfileSource, SavedProfile
-
-    learned = result.finding.profile
-    sources = [
-        ProfileSource(
-            file=", ".join(log.files),
-            began_at=log.began_at,
-            still_s=float(rests.still_s),
-            temperature_degc=_temperatures([log]),
-        )
-        for log, rests in zip(result.logs, result.rests, strict=True)
-    ]
-    return SavedProfile(
-        format_version=FORMAT_VERSION,
-        name=name,
-        saved_at=utc_now(),
-        imu=result.imu,
-        gyro=learned.gyro,
-        accel=learned.accel,
-        kept_from=result.compared.name,
-        kept=result.finding.kept,
-        sources=tuple(sources),
-        notes=tuple(result.notes),
-        warm_up=learned.warm_up,
-    )
-
-
-def _object(result: Learned) -> dict[str, Any]:
-    finding = result.finding
-    return {
-        "name": result.imu,
-        "still_s": finding.still_s,
-        "seconds": sum(each.seconds for each in result.rests),
-        "recordings": [", ".join(log.files) for log in result.logs],
-        "used": [
-            {"seconds": found.seconds, "still_s": found.still_s, "left_out": log.left_out, "notes": log.notes}
-            for log, found in zip(result.logs, result.rests, strict=True)
-        ],
-        "temperature_degc": _temperatures(result.logs),
-        "profile": msgspec.to_builtins(finding.profile),
-        "compared": msgspec.to_builtins(result.compared),
-        "kept": list(finding.kept),
-        # An upper limit that nobody knows is infinite; msgspec writes null for it.
-        "axes": [{"fit": msgspec.json.decode(msgspec.json.encode(fit))} for fit in finding.axes],
-        "notes": result.notes,
-    }

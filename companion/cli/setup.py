@@ -5,21 +5,24 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import logging
 import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
+
 from companion import config
 from companion.cli.asking import Asking, PageAsking
-from companion.cli.setup_imus import ask_autopilot, daemon_status, parts_given
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
-from companion.config.sections import Config, Storage
+from companion.config.sections import Config, Imu, Storage
 from companion.config.words import shown
-from companion.errors import CompanionError, ConfigError
+from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
+from companion.formats import Object
 from companion.installation import install as installing
 from companion.links.serial.listening import ports_to_try
 from companion.links.serial.ports import list_ports
@@ -34,6 +37,8 @@ WITHOUT: Final = {
     "compass": "no compass: the gyros' sigmas are a little wider",
 }
 CHECK_S: Final = 10.0
+COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
+"""1 mrad/s and 1 mg: the steps of SCALED_IMU2 and SCALED_IMU3."""
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
@@ -105,18 +110,18 @@ class _Session:
             draft.keep_beside(self._path)
         if self._options.page is not None:
             draft.show_page(self._options.page)
-        given, parts = self._given(), parts_given(self._options.part)
+        given, parts = self._given(), _parts_given(self._options.part)
         found = await self._listen(draft)
         await self._take_autopilot(draft, found)
         for kind in KINDS:
             await self._take_device(draft, found, kind)
         await self._ask(draft, list(draft.questions()), given)
-        daemon = await daemon_status(draft.parsed())
+        daemon = await _daemon_status(draft.parsed())
         told: dict[str, str | None] = {}
         if daemon is not None:
             told = {one["imu"]: one["name"] for one in daemon.get("profiles", ()) if one["by_device_id"]}
         elif not self._options.no_check:
-            told = await ask_autopilot(self.asking, draft, by_default=is_new)
+            told = await _ask_autopilot(self.asking, draft, by_default=is_new)
         names = [imu["name"] for imu in draft.wanted["imu"]]
         to_ask = [name for name in names if told.get(name) is None or part_key(name) in parts]
         await self._ask(draft, list(draft.part_questions(to_ask)), parts)
@@ -209,10 +214,10 @@ class _Session:
         section, heard = draft.section(kind), found.devices(kind)
         if section is not None:
             port = section["port"]
-            again = [one for one in heard if same_port(one.port, port)]
+            again = [one for one in heard if same_port(one[0], port)]
             if again or not heard or not found.silent(port):
-                for one in again:
-                    draft.take(dataclasses.replace(one, port=port))
+                for _, protocol, line in again:
+                    draft.take(kind, port, protocol, line)
                 self.asking.say(f"{kind.capitalize()}: {section['protocol']} at {port}, as it was")
                 return
             self.asking.say(f"The {kind} is not heard at {port}.")
@@ -220,11 +225,11 @@ class _Session:
             if kind in WITHOUT:
                 self.asking.say(WITHOUT[kind].capitalize())
             return
-        names = [str(one) for one in heard] + ([section["port"]] if section is not None else [])
+        named = {f"{protocol}: {port}, {line}": (port, protocol, line) for port, protocol, line in heard}
+        names = [*named, *([section["port"]] if section is not None else [])]
         chosen = await self._choose(kind.capitalize() if kind != "imu" else "Own IMU", names)
-        draft_from = next((one for one in heard if str(one) == chosen), None)
-        if draft_from is not None:
-            draft.take(draft_from)
+        if chosen in named:
+            draft.take(kind, *named[chosen])
 
     async def _choose(self, what: str, names: Sequence[str]) -> str:
         """Ask for one of several names; a single one is taken."""
@@ -342,3 +347,63 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
         yield f"{command} align faces --write   (once: accelerometers too, held on all sides by hand, 5 min)"
+
+
+# --- the IMUs of the autopilot
+
+
+def _parts_given(options: Sequence[str]) -> dict[str, str]:
+    """Read the --part options: answers by the keys of their questions."""
+    given = {}
+    for words in options:
+        name, _, part = words.partition("=")
+        if not part:
+            raise ConfigError(f"--part: found {shown(words)}; allowed: IMU=PART, such as fc=icm42688p")
+        given[part_key(name)] = part
+    return given
+
+
+async def _daemon_status(config: Config) -> Object | None:
+    """Ask the running daemon for its status; None: none runs; empty: one runs and refuses to answer."""
+    from companion.links.system.control_client import ask
+
+    found: Object = {}
+    try:
+        async for reply in ask(config.control.path, {"command": "status"}):
+            found = reply.get("status", found)
+    except DaemonUnreachableError as error:
+        return {} if isinstance(error, DaemonDeniedError) else None
+    return found
+
+
+async def _ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
+    """Offer the IMUs that the autopilot has besides the configured ones; return the parts of all that answer, by name.
+
+    Nothing is written to the autopilot. `by_default`: the answer to the offer where nobody gives one.
+    """
+    asking.say("", "Asking the autopilot which IMUs it has: up to half a minute. Nothing is changed.")
+    from companion.daemon.process.check import answering_imus  # takes seconds on a small board
+
+    config = draft.parsed()
+    mine = [msgspec.structs.replace(imu, profile=None) for imu in config.imu if imu.source == "autopilot"]
+    others = {one["name"]: one for one in draft.other_imus()}
+    asked = [*mine, *(Imu(**one) for one in others.values())]
+    logging.disable(logging.WARNING)  # the IMUs that do not exist fail to answer
+    try:
+        parts = await answering_imus(config, asked)
+    finally:
+        logging.disable(logging.NOTSET)
+    for imu in asked:
+        if imu.name in parts:
+            part = parts[imu.name]
+            words = f"{part}, by its device id" if part else "its device id tells no part of the catalogue"
+            asking.say(f"  IMU {imu.instance or 1}: {words}")
+    if not parts:
+        asking.say("  no answer")
+    found = [one for name, one in others.items() if name in parts]
+    if found:
+        numbers = " and ".join(str(one["instance"]) for one in found)
+        question = f"It has IMU {numbers} too; calibrate that as well?"
+        if await asking.agrees(question, by_default=by_default, hint=COARSE):
+            draft.wanted["imu"] += found
+    return parts

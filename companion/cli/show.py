@@ -100,7 +100,7 @@ def status_lines(status: Object) -> list[str]:
         lines.append(f"recordings: {recording['lost']} messages lost so far, the disk is too slow")
     if (file := recording["file"]) is not None:
         lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")
-    lines += [f"{row.name}: {row.words}" for row in summary.rows(status)]
+    lines += [f"{name}: {words}" for _, name, words in summary.rows(status)]
     refused = status["vehicle"]["refused"].items()
     lines += [f"not allowed to ask: {sender} ({count} times)" for sender, count in refused]
     lines += _reading_lines(status)

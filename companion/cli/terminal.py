@@ -180,26 +180,25 @@ def add_fields(parser: argparse.ArgumentParser, kind: type[commands.Command], by
     """Add the options of a command, as far as an interface may set its fields."""
     groups: dict[str, argparse._ActionsContainer] = {}
     for name, field in kind.fields(by).items():
-        option = field.option
         to: argparse._ActionsContainer = parser
-        if group := option.group or (name if option.flags else ""):
-            to = groups.get(group) or parser.add_mutually_exclusive_group(required=option.positional)
+        if group := field.group or (name if field.flags else ""):
+            to = groups.get(group) or parser.add_mutually_exclusive_group(required=field.positional)
             groups[group] = to
-        values = [value for value in field.values if value not in option.flags]
-        if option.positional:
-            shape: dict[str, Any] = {"metavar": option.metavar or "|".join(values), "choices": values or None}
+        values = [value for value in field.values if value not in field.flags]
+        if field.positional:
+            shape: dict[str, Any] = {"metavar": field.metavar or "|".join(values), "choices": values or None}
             # The default of a positional argument would replace the value of a flag.
-            to.add_argument(name, nargs="?", default=argparse.SUPPRESS, help=option.help, **shape)
-        for value, words in option.flags.items():
+            to.add_argument(name, nargs="?", default=argparse.SUPPRESS, help=field.help, **shape)
+        for value, words in field.flags.items():
             to.add_argument(f"--{value}", dest=name, action="store_const", const=value, help=words)
-        if option.positional or option.flags:
+        if field.positional or field.flags:
             continue
         if field.kind is bool:
-            to.add_argument(f"--{name}", action="store_true", help=option.help)
+            to.add_argument(f"--{name}", action="store_true", help=field.help)
         else:
-            names = [each for each in (option.short, f"--{name.removesuffix('_s')}") if each]
-            shape = {"type": _ARGUMENTS[field.kind], "choices": values or None, "metavar": option.metavar}
-            to.add_argument(*names, dest=name, default=option.default, help=option.help, **shape)
+            names = [each for each in (field.short, f"--{name.removesuffix('_s')}") if each]
+            shape = {"type": _ARGUMENTS[field.kind], "choices": values or None, "metavar": field.metavar}
+            to.add_argument(*names, dest=name, default=field.default, help=field.help, **shape)
 
 
 def request_of(options: argparse.Namespace, kind: type[commands.Command]) -> Object:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,39 +31,9 @@ _MIN_GOOD: Final = 10
 _NAMES: Final = ("N", "B", "K")
 
 
-class Rest(msgspec.Struct, frozen=True):
-    """One stretch at rest; a second that the gate rejected is missing in `slots`."""
-
-    slots: NDArray[np.int64]
-    """(m,) ascending: seconds of the recording's clock."""
-    means: Floats
-    """(m, 6): gyro in rad/s, accelerometer in m/s^2, in the IMU's own axes."""
-
-
-class Rests(msgspec.Struct, frozen=True):
-    """Stretches at rest in one recording."""
-
-    stretches: tuple[Rest, ...]
-    seconds: int
-    """Whole seconds in the recording."""
-    obstacle: str
-    """Most frequent reason of the rejected seconds, in the words of the first; empty: none was rejected."""
-
-    @property
-    def still_s(self) -> int:
-        """Seconds in the stretches."""
-        return sum(len(rest.slots) for rest in self.stretches)
-
-
-class LearnedNoise(msgspec.Struct, frozen=True, kw_only=True):
-    """Noise of one IMU by its recordings."""
-
-    profile: NoiseProfile
-    axes: tuple[AxisFit, ...]
-    """Gyro x y z, accelerometer x y z, in rad/s or m/s^2."""
-    kept: tuple[str, ...]
-    """Figures borrowed from another profile, because the recordings do not show them: "gyro K"."""
-    still_s: int
+Rest = tuple[NDArray[np.int64], Floats]
+"""One stretch at rest: seconds (m,) of the recording's clock, ascending, without those that the gate rejected; means
+(m, 6), gyro in rad/s and accelerometer in m/s^2, in the IMU's own axes."""
 
 
 def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
@@ -79,11 +48,15 @@ def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
     ]
 
 
-def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> Rests:
+def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> tuple[list[Rest], int, str]:
     """Find the stretches of a recording in which the IMU lay still, by the daemon's gate.
 
     Times (n,) ascend; readings are (n, 6), gyro in rad/s and accelerometer in m/s^2; rows that are not finite are left
     out. `profile` is the noise that the gate allows before it has learned.
+
+    Returns:
+        The stretches, the number of whole seconds in the recording, and the most frequent reason of the rejected ones,
+        in the words of the first; empty: none was rejected.
     """
     batches = seconds_of(t_s, readings)
     own = OwnNoise(at_rest=True)
@@ -99,7 +72,7 @@ def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> Re
 
     def end() -> None:
         if len(kept) >= MIN_SECONDS:
-            stretches.append(Rest(np.array([each.slot for each in kept]), np.array([each.mean for each in kept])))
+            stretches.append((np.array([each.slot for each in kept]), np.array([each.mean for each in kept])))
         kept.clear()
         gate.new_stretch()
 
@@ -121,19 +94,30 @@ def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> Re
                 end()
     end()
     obstacle = words[obstacles.most_common(1)[0][0]] if obstacles else ""
-    return Rests(tuple(stretches), len(batches), obstacle)
+    return stretches, len(batches), obstacle
 
 
-def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> LearnedNoise:
+def seconds_at_rest(stretches: Iterable[Rest]) -> int:
+    """Count the seconds of stretches."""
+    return sum(len(slots) for slots, _ in stretches)
+
+
+def fit_profile(
+    name: str, stretches: Sequence[Rest], fallback: NoiseProfile
+) -> tuple[NoiseProfile, list[AxisFit], list[str]]:
     """Estimate the noise of one IMU from all its stretches at rest.
+
+    Returns:
+        The profile; the fits of gyro x y z and accelerometer x y z, in rad/s or m/s^2; the figures borrowed from
+        `fallback`, because the recordings do not show them, such as "gyro K".
 
     Raises:
         CalibrationRefusedError: too little at rest, or an axis that never changes.
     """
-    still_s = sum(len(rest.slots) for rest in rests)
+    still_s = seconds_at_rest(stretches)
     if still_s < LEAST_STILL_S:
         raise CalibrationRefusedError(f"only {still_s} s at rest; a profile needs {LEAST_STILL_S} s, better an hour")
-    found = curve((rest.slots, rest.means) for rest in rests)
+    found = curve(stretches)
     for column in np.flatnonzero((found.variance == 0.0).all(axis=0)).tolist():
         axis = f"{TRIADS[column // 3]} {'xyz'[column % 3]}"
         raise CalibrationRefusedError(f"{axis} never changes: its noise is below its last digit")
@@ -143,8 +127,7 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Lea
         model, unknown = _triad(axes[rows_of(triad)], fallback.of(triad))
         models.append(model)
         kept += [f"{triad} {_NAMES[which]}" for which in unknown]
-    profile = NoiseProfile(name, models[0], models[1], warm_up=fallback.warm_up)
-    return LearnedNoise(profile=profile, axes=tuple(axes), kept=tuple(kept), still_s=still_s)
+    return NoiseProfile(name, models[0], models[1], warm_up=fallback.warm_up), axes, kept
 
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:

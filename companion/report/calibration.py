@@ -8,8 +8,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
-import msgspec
-
 from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord, ImuRecord, Outcome, Record, outcome_word
 from companion.physics.units import UNITS
@@ -43,20 +41,17 @@ _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
 }
 
 
-class Material(msgspec.Struct, frozen=True, kw_only=True):
-    """Content of the page of one calibration."""
-
-    number: int
-    record: Record
-    earlier: Sequence[tuple[int, Record]]
-    """Calibrations of the same aircraft, oldest first, this one last."""
-    armings: Sequence[ArmingRecord]
-    """While it was in force, oldest first."""
-    damaged: Sequence[str]
+Numbered = Sequence[tuple[int, Record]]
+"""Calibrations of one aircraft with their numbers, oldest first; the page is of the last."""
 
 
-def read_material(directory: Path, wanted: int | None) -> Material:
-    """Read the content of a page by a calibration's number; None: the latest."""
+def read_material(directory: Path, wanted: int | None) -> tuple[Numbered, list[ArmingRecord], list[str]]:
+    """Read the content of a page by a calibration's number; None: the latest.
+
+    Returns:
+        That calibration, last, with the earlier ones; the armings while it was in force, oldest first; problems with
+        damaged files.
+    """
     store, records = RecordStore(directory), directory / "records"
     try:
         # Else a folder that only root may enter looks like one that is not there.
@@ -89,42 +84,38 @@ def read_material(directory: Path, wanted: int | None) -> Material:
     except StorageError as error:
         problems.append(str(error))
     earlier = [(k, one) for k, one in found.items() if k <= wanted and one.system_id == record.system_id]
-    return Material(
-        number=wanted,
-        record=record,
-        earlier=earlier[-MAX_EARLIER:],
-        armings=[arming for arming in armings if arming.calibration == record.started_at],
-        damaged=problems,
-    )
+    with_it = [arming for arming in armings if arming.calibration == record.started_at]
+    return earlier[-MAX_EARLIER:], with_it, problems
 
 
-def calibration_page(material: Material, now: datetime.datetime) -> str:
-    """Make the page."""
-    record = material.record
+def calibration_page(
+    records: Numbered, armings: Sequence[ArmingRecord], problems: Sequence[str], now: datetime.datetime
+) -> str:
+    """Make the page of the last of the records."""
+    number, record = records[-1]
     imus = record.imus[:MAX_IMUS]
     return page(
-        f"Calibration {material.number}, {moment(record.started_at)}",
+        f"Calibration {number}, {moment(record.started_at)}",
         now,
-        _headline(material),
-        damaged(material.damaged),
+        _headline(number, record),
+        damaged(problems),
         _warnings(record),
         *(_imu(imu) for imu in imus),
         card("caution", f"{len(record.imus) - MAX_IMUS} more IMUs are not shown.")
         if len(record.imus) > MAX_IMUS
         else None,
         _written(record),
-        join(tag("h2", "Armed with it"), arming_items(map(_ARMED, material.armings))) if material.armings else None,
+        join(tag("h2", "Armed with it"), arming_items(map(_ARMED, armings))) if armings else None,
         _pose(record),
-        _drift(material),
+        _drift(records),
     )
 
 
-def _headline(material: Material) -> Markup:
-    record = material.record
+def _headline(number: int, record: Record) -> Markup:
     vehicle = "vehicle not heard" if record.system_id is None else f"vehicle {record.system_id}"
     undone = record.undone_at
     return join(
-        tag("h1", f"Calibration {material.number}"),
+        tag("h1", f"Calibration {number}"),
         tag("p", f"{moment(record.started_at)}, {vehicle}, took {record.duration_s:.0f} s"),
         tag("p", tag("span", record.state.upper(), class_=f"state {record.state}")),
         tag("p", _in_short(record), class_="lead"),
@@ -258,19 +249,19 @@ def _angle(value: float | None, sigma: float | None, sign: str) -> str:
     return f"{value:{sign}.2f} deg" if sigma is None else f"{' ± '.join(with_sigma(value, sigma, 1.0, sign))} deg"
 
 
-def _drift(material: Material) -> Markup:
-    record = material.record
+def _drift(records: Numbered) -> Markup:
+    number, record = records[-1]
     names = [imu.name for imu in record.imus[:MAX_IMUS]] or list(
-        dict.fromkeys(imu.name for _, one in material.earlier for imu in one.imus)
+        dict.fromkeys(imu.name for _, one in records for imu in one.imus)
     )[:MAX_IMUS]
     parts: list[Child] = [tag("h2", "Biases up to now")]
     for name in names:
         figures: list[Child] = []
         for triad in TRIADS:
-            points = history(material.earlier, name, triad)
+            points = history(records, name, triad)
             if len(points) < 2:
                 continue
-            plots = drift(points, triad, name=f"{name} {NAMES[triad].lower()}", this=material.number)
+            plots = drift(points, triad, name=f"{name} {NAMES[triad].lower()}", this=number)
             figures.append(tag("div", tag("h3", NAMES[triad]), plots or card("", "No time is known of them.")))
         if figures:
             parts += [tag("h3", f"IMU {name}"), tag("div", *figures, class_="pairs")]

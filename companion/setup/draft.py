@@ -25,7 +25,6 @@ from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind
 from companion.rotations import ROTATIONS_DEG
 from companion.setup.document import Table, render
-from companion.setup.survey import FoundDevice
 from companion.storage.state import read_regular, write_atomically
 
 UNDOCUMENTED_LAW: Final = "axis"
@@ -108,28 +107,28 @@ class Draft:
         found: Table | None = self.wanted.get(kind)
         return found
 
-    def take(self, found: FoundDevice) -> None:
+    def take(self, kind: Kind, port: str, protocol: str, line: Line) -> None:
         """Put a device into its section; of another make than before, it keeps no setting of that one."""
-        section = self.section(found.kind)
+        section = self.section(kind)
         if section is None:
-            section = {"name": "own", "source": "serial"} if found.kind == "imu" else {}
-            if found.kind == "imu":
+            section = {"name": "own", "source": "serial"} if kind == "imu" else {}
+            if kind == "imu":
                 self.wanted["imu"].append(section)
             else:
-                self.wanted[found.kind] = section
-        elif section["protocol"] != found.protocol:
+                self.wanted[kind] = section
+        elif section["protocol"] != protocol:
             for key in section.keys() - _LASTING:
                 del section[key]
         is_there = "protocol" in section
-        section |= {"port": found.port, "protocol": found.protocol}
-        info = PROTOCOLS[found.kind][found.protocol]
-        for key in ("baud", "parity")[: 1 if found.kind == "imu" else 2]:
-            value = getattr(found.line, key)
+        section |= {"port": port, "protocol": protocol}
+        info = PROTOCOLS[kind][protocol]
+        for key in ("baud", "parity")[: 1 if kind == "imu" else 2]:
+            value = getattr(line, key)
             # A setting from the factory need not be written for a device that works without.
             if key in section or not is_there or value != getattr(info, key):
                 section[key] = value
-        if found.kind == "gradienter" and "law" not in section:
-            known = PROTOCOLS["gradienter"][found.protocol].law
+        if kind == "gradienter" and "law" not in section:
+            known = PROTOCOLS["gradienter"][protocol].law
             section["law"] = known or UNDOCUMENTED_LAW
             if known is None:
                 self.guessed.add("gradienter.law")

@@ -74,20 +74,6 @@ async def listen_udp(port: int) -> HeardUdp:
 
 
 @dataclass(frozen=True, slots=True)
-class FoundDevice:
-    """A device on a serial port."""
-
-    port: str
-    protocol: str
-    line: Line
-    kind: Kind
-
-    def __str__(self) -> str:
-        """Format it for people."""
-        return f"{self.protocol}: {self.port}, {self.line}"
-
-
-@dataclass(frozen=True, slots=True)
 class Survey:
     """Everything heard on every port."""
 
@@ -108,10 +94,10 @@ class Survey:
             if not isinstance(heard, str) and heard.autopilot is not None
         ]
 
-    def devices(self, kind: Kind) -> list[FoundDevice]:
-        """List the devices that are mainly bought as this kind."""
+    def devices(self, kind: Kind) -> list[tuple[str, str, Line]]:
+        """List port, protocol and line of the devices that are mainly bought as this kind."""
         return [
-            FoundDevice(port, heard.candidate.protocol, heard.line, kind)
+            (port, heard.candidate.protocol, heard.line)
             for port, heard in self.serial.items()
             if not isinstance(heard, str) and heard.candidate is not None and heard.line is not None
             if main_kind(heard.candidate.protocol) == kind

@@ -307,7 +307,7 @@ def file_name(record: Object) -> str:
 
 def _plots(imus: object) -> str:
     from companion.estimation.solution.by_temperature import ByTemperature
-    from companion.report.by_temperature import biases_by_temperature
+    from companion.report.page import biases_by_temperature
 
     return biases_by_temperature(msgspec.convert(imus, list[ByTemperature]))
 

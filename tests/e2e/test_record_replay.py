@@ -24,7 +24,7 @@ from companion.errors import StorageError
 from companion.estimation.records.record import Record, to_json
 from companion.formats import Object
 from companion.lab.logs.recording import MAGIC
-from companion.lab.replay.engine import TOLERANCE_SIGMAS, Result, replay
+from companion.lab.replay.engine import TOLERANCE_SIGMAS, Replay, replay
 from companion.recording import messages
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_script_floats import px4, three_imus
@@ -70,7 +70,7 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     return paths[0], records[0]
 
 
-def same(result: Result, records: list[Record]) -> None:
+def same(result: Replay, records: list[Record]) -> None:
     """Every calibration was recomputed and agrees within the tolerance, biases and sigmas."""
     assert [each.not_recomputed for each in result.calibrations] == [None] * len(records)
     assert [difference for each in result.calibrations for difference in each.differences] == []

@@ -225,8 +225,8 @@ def _where(task_name: str) -> str:
 
 def status_line(status: Object) -> str:
     """Return the status in one line, most important first."""
-    rows = [row for row in summary.rows(status) if row.name != "autopilot"]
+    rows = [row for row in summary.rows(status) if row[1] != "autopilot"]
     parts = [summary.headline(status), str(status["vehicle"]["summary"])]
-    parts += [f"{row.name}: {row.words}" for row in rows if row.verdict == "wrong"]
-    good = [row.name for row in rows if row.verdict == "ok"]
+    parts += [f"{name}: {words}" for verdict, name, words in rows if verdict == "wrong"]
+    good = [name for verdict, name, _ in rows if verdict == "ok"]
     return "; ".join([*parts, f"{', '.join(good)} good"] if good else parts)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.lab.flight.inertial import joined
-from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, changes, starts
-from companion.lab.logs.autopilot_logs import dataflash
+from companion.lab.flight.log import Boot, FlownImu, changes
+from companion.lab.logs.autopilot_logs import BootMessages, dataflash
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
 
@@ -21,10 +21,10 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T", "GH", "AH")),
     "VIBE": ("IMU", ("VibeX", "VibeY", "VibeZ")),
     "XKF1": ("C", ("VN", "VE", "VD", "PN", "PE", "PD", "GX", "GY", "GZ")),
-    "XKF2": ("C", ("AX", "AY", "AZ")),
+    "XKF2": ("C", ("AZ",)),
     "XKQ": ("C", ("Q1", "Q2", "Q3", "Q4")),
     "XKV1": ("C", ("V10", "V11")),
-    "XKV2": ("C", ("V12", "V13", "V14", "V15")),
+    "XKV2": ("C", ("V12", "V15")),
     "XKF4": ("C", ("PI",)),
     "XKT": ("C", ("EKFMin", "EKFMax")),
     "SIM": ("", ("Q1", "Q2", "Q3", "Q4")),
@@ -38,9 +38,8 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
 _IMUS: Final = 5
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
-_GYRO_STEP_RAD_S: Final = 0.01 * DEG
-_ACCEL_STEP_M_S2: Final = 0.01
-"""XKF1 and XKF2 hold biases in whole hundredths, cut off toward zero: zero is anything within one of them."""
+_STEPS: Final = np.array([*[0.01 * DEG] * 3, 0.01])
+"""XKF1 and XKF2 hold biases in whole hundredths of deg/s and m/s^2, cut toward zero: zero is anything within one."""
 _EVENTS: Final = {"armed": {10: True, 11: False}, "airborne": {28: True, 18: False}}
 _MOTOR_FUNCTIONS: Final = (*range(33, 41), *range(82, 86), 70)
 _TURNING_US: Final = 30.0
@@ -48,8 +47,7 @@ _TURNING_US: Final = 30.0
 
 def read(path: Path) -> Iterator[Boot]:
     """Each start of the autopilot in it, one after another: memory is that of one."""
-    fields = {name: len(columns) for name, (_, columns) in _ROWS.items()}
-    return map(_boot, starts(dataflash(path, _ROWS), fields))
+    return map(_boot, dataflash(path, _ROWS))
 
 
 def _boot(start: BootMessages) -> Boot:
@@ -116,41 +114,27 @@ def _imu(start: BootMessages, instance: int, parameters: dict[str, float], cores
     )  # fmt: skip
 
 
-def _estimated(start: BootMessages, core: int) -> Estimated | None:
+def _estimated(start: BootMessages, core: int) -> Floats | None:
     gyro, accel = start.rows("XKF1", core), start.rows("XKF2", core)
     if not len(gyro) or not len(accel):
         return None
     t_s = gyro[:, 0]
     steps = start.rows("XKT", core)
     step_s = float(steps[:, 1:3].mean()) if len(steps) else 0.01
-    gyro_rad_s = gyro[:, 7:10] * DEG
-    accel_m_s2 = np.column_stack([np.interp(t_s, accel[:, 0], column) for column in accel[:, 1:4].T])
+    biases = np.column_stack([gyro[:, 7:10] * DEG, np.interp(t_s, accel[:, 0], accel[:, 1])])
     # It logs those of the core that it flies by; the others are tuned alike.
     of = next((one for one in (core, *start.instances("XKV2")) if len(start.rows("XKV2", one))), core)
     first, second = start.rows("XKV1", of), start.rows("XKV2", of)
-    known = len(first) and len(second) and step_s > 0.0
-    gyro_sigma, accel_sigma = np.full(gyro_rad_s.shape, np.nan), np.full(gyro_rad_s.shape, np.nan)
-    if known:
+    sigmas = np.full(biases.shape, np.nan)
+    if len(first) and len(second) and step_s > 0.0:
         # Of increments of one step of the filter.
-        columns = [(first, 1), (first, 2), *((second, k) for k in range(1, 5))]
-        sigmas = [np.sqrt(np.maximum(np.interp(t_s, rows[:, 0], rows[:, k]), 0.0)) / step_s for rows, k in columns]
-        gyro_sigma, accel_sigma = np.column_stack(sigmas[:3]), np.column_stack(sigmas[3:])
-    return Estimated(
-        t_s,
-        _whole(gyro_rad_s, _GYRO_STEP_RAD_S),
-        np.hypot(gyro_sigma, _cut(gyro_rad_s, _GYRO_STEP_RAD_S)),
-        _whole(accel_m_s2, _ACCEL_STEP_M_S2),
-        np.hypot(accel_sigma, _cut(accel_m_s2, _ACCEL_STEP_M_S2)),
-    )
-
-
-def _whole(cut: Floats, step: float) -> Floats:
-    """Give the middle of the range that was cut off to a value."""
-    return np.asarray(cut + 0.5 * step * np.sign(cut))
-
-
-def _cut(cut: Floats, step: float) -> Floats:
-    return np.where(np.abs(cut) < 0.5 * step, 2.0 * step, step) / math.sqrt(12.0)
+        variances = [(first, 1), (first, 2), (second, 1), (second, 2)]
+        columns = [np.interp(t_s, rows[:, 0], rows[:, k]) for rows, k in variances]
+        sigmas = np.sqrt(np.maximum(np.column_stack(columns), 0.0)) / step_s
+    # A logged value is the end toward zero of the range that was cut off to it.
+    middle = biases + 0.5 * _STEPS * np.sign(biases)
+    cut = np.where(np.abs(biases) < 0.5 * _STEPS, 2.0 * _STEPS, _STEPS) / math.sqrt(12.0)
+    return np.column_stack([t_s, middle, np.hypot(sigmas, cut)])
 
 
 def _events(start: BootMessages, what: str) -> tuple[tuple[float, bool], ...]:

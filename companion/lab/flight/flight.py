@@ -24,10 +24,10 @@ from companion.estimation.records.flight_record import Drift, Flight, ImuFlight,
 from companion.estimation.records.record import Record
 from companion.estimation.solution.prior import curve_of
 from companion.lab.flight import ardupilot_log, inertial, px4_log
-from companion.lab.flight.inertial import FlightWindow, Increments, Navigation, World
+from companion.lab.flight.inertial import NO_WINDOWS, Increments, Navigation
 from companion.lab.flight.log import Boot, FlownImu
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
-from companion.lab.logs.log_files import read_ulog, reader_of
+from companion.lab.logs.autopilot_logs import read_ulog, reader_of
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
@@ -36,7 +36,6 @@ from companion.samples import Triad
 from companion.storage.learned import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
-_STANDARD_M_S2: Final = 9.80665
 _SETTLED_S: Final = 3.0
 """After the take-off, and before the landing."""
 _STOOD_S: Final = 30.0
@@ -76,7 +75,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
     reference = boot.truth or boot.solution
     if reference is None:
         return []
-    world = _world(boot)
+    reference = _on_earth(boot, reference)
     # Filters delay the readings; what is compared with the solution must be of the same moment.
     late: dict[int, Increments] = {}
     for imu in boot.imus:
@@ -93,7 +92,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
             reference="ekf" if boot.truth is None else "truth",
             imus=tuple(
                 [
-                    await _imu(boot, imu, _during(late[imu.number], stages), stages, (reference, world), known)
+                    await _imu(boot, imu, _during(late[imu.number], stages), stages, reference, known)
                     for imu in boot.imus
                     if imu.number in late
                 ]
@@ -124,12 +123,13 @@ def _during(found: Increments, stages: Stages) -> Increments:
     return Increments(*(each[inside] for each in found))
 
 
-def _world(boot: Boot) -> World:
-    place, gravity = boot.place, _STANDARD_M_S2
-    if place is not None and not boot.standard_gravity:
-        gravity = gravity_m_s2(*place)
-    turns = boot.earth_turns and place is not None
-    return World(gravity, earth_rate_ned_rad_s(place[0]) if place is not None and turns else np.zeros(3))
+def _on_earth(boot: Boot, reference: Navigation) -> Navigation:
+    """Add gravity and the Earth's rate of the place, where it is known and a simulator has them."""
+    if boot.place is None:
+        return reference
+    gravity = reference.gravity_m_s2 if boot.standard_gravity else gravity_m_s2(*boot.place)
+    rate = earth_rate_ned_rad_s(boot.place[0]) if boot.earth_turns else reference.earth_rate_ned_rad_s
+    return reference._replace(gravity_m_s2=gravity, earth_rate_ned_rad_s=rate)
 
 
 def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
@@ -159,10 +159,9 @@ def _lifted(reference: Navigation, armed_s: float, end_s: float) -> tuple[float 
 
 
 async def _imu(
-    boot: Boot, imu: FlownImu, found: Increments, stages: Stages, seen: tuple[Navigation, World], known: Knowledge
+    boot: Boot, imu: FlownImu, found: Increments, stages: Stages, reference: Navigation, known: Knowledge
 ) -> ImuFlight:
     notes: list[str] = []
-    reference, world = seen
     calibration = None
     try:
         calibration = await _calibration_in(boot.firmware, boot.parameters_at(stages.armed_s), imu)
@@ -190,8 +189,8 @@ async def _imu(
         notes.append(f"logged at {imu.rate_hz:.0f} Hz only: {faster_log} would tell more")
     if len(found.t_s) < 2:
         in_air = None
-    ground = [] if in_air is None else _stood(found, stages, reference, world)
-    stretches = [] if in_air is None else inertial.windows(found, reference, world, in_air, LENGTH_S)
+    ground = NO_WINDOWS if in_air is None else _stood(found, stages, reference)
+    stretches = NO_WINDOWS if in_air is None else inertial.windows(found, reference, in_air, LENGTH_S)
     flown = _kept(stretches)
     if aside := len(stretches) - len(flown):
         of = f"{aside} of {len(stretches)} stretches of {LENGTH_S:.0f} s"
@@ -199,7 +198,7 @@ async def _imu(
     drift: dict[str, list[Drift]] = {}
     if in_air is not None:
         offsets = _offset_sets(calibration, match and match[1], found, in_air)
-        drift = inertial.drift(found, reference, world, in_air, SPANS_S, offsets)
+        drift = inertial.drift(found, reference, in_air, SPANS_S, offsets)
     warmth: Sequence[Term | None] = [None] * 4
     if calibration is not None and in_air is not None:
         warmth = _warmth(imu, calibration, biases, stages, in_air)
@@ -211,37 +210,36 @@ async def _imu(
         accel_id=imu.accel_id if calibration is None else calibration.accel_id,
         set_gyro_rad_s=None if calibration is None else calibration.gyro_offset_rad_s,
         set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
-        axes=tuple(split(ground, flown, _means(imu.vibration, [one.t_s for one in flown]), warmth, _ekf(imu, in_air))),
+        axes=tuple(split(ground, flown, _means(imu.vibration, flown[:, 0]), warmth, _ekf(imu, in_air))),
         drift=drift,
         notes=tuple(notes),
     )
 
 
-def _stood(found: Increments, stages: Stages, reference: Navigation, world: World) -> list[FlightWindow]:
+def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
     """List windows before the motors, if it stood still: that is known better than any solution."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:
-        return []
+        return NO_WINDOWS
     times = np.arange(start_s - 1.0, end_s + 1.0, 0.25)
     attitude = reference.attitude[min(int(np.searchsorted(reference.t_s, end_s)), len(reference.t_s) - 1)]
-    still = Navigation(times, np.tile(attitude, (len(times), 1)), np.zeros((len(times), 3)), np.zeros((len(times), 3)))
-    rows = _kept(inertial.windows(found, still, world, (start_s, end_s), SHORT_S))
-    rates = np.array([one.gyro_rad_s for one in rows]).reshape(-1, 3)
-    return rows if len(rows) and rates.std(axis=0).max() < _STILL_RAD_S else []
+    zeros = np.zeros((len(times), 3))
+    still = reference._replace(t_s=times, attitude=np.tile(attitude, (len(times), 1)), velocity=zeros, position=zeros)
+    rows = _kept(inertial.windows(found, still, (start_s, end_s), SHORT_S))
+    return rows if len(rows) and rows[:, 1:4].std(axis=0).max() < _STILL_RAD_S else NO_WINDOWS
 
 
-def _kept(rows: Sequence[FlightWindow]) -> list[FlightWindow]:
+def _kept(rows: Floats) -> Floats:
     """Leave out windows in which the solution has jumped, as when it found its heading anew."""
     if len(rows) < 4:
-        return list(rows)
-    values = np.array([[*one.gyro_rad_s, one.down_m_s2] for one in rows])
-    off = np.abs(values - [np.median(column, axis=0) for column in values.T])
-    usual = np.maximum([MAD_TO_SIGMA * np.median(column, axis=0) for column in off.T], _USUAL)
-    return [one for one, far in zip(rows, (off > _OUTLIER * usual).any(axis=1), strict=True) if not far]
+        return rows
+    off = np.abs(rows[:, 1:5] - np.median(rows[:, 1:5], axis=0))
+    usual = np.maximum(MAD_TO_SIGMA * np.median(off, axis=0), _USUAL)
+    return np.asarray(rows[(off <= _OUTLIER * usual).all(axis=1)])
 
 
-def _means(table: Floats, times_s: Sequence[float]) -> Floats | None:
+def _means(table: Floats, times_s: Floats) -> Floats | None:
     """Average a value, from rows of time and value, about each of these times."""
     if len(table) < 2:
         return None
@@ -254,9 +252,8 @@ def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]
     found, nothing = imu.estimated, [None] * 4
     if found is None or in_air is None:
         return [*nothing]
-    late = (found.t_s >= 0.5 * (in_air[0] + in_air[1])) & (found.t_s <= in_air[1])
-    values = np.column_stack([found.gyro_rad_s[late], found.accel_m_s2[late, 2]])
-    sigmas = np.column_stack([found.gyro_sigma_rad_s[late], found.accel_sigma_m_s2[late, 2]])
+    late = (found[:, 0] >= 0.5 * (in_air[0] + in_air[1])) & (found[:, 0] <= in_air[1])
+    values, sigmas = found[late, 1:5], found[late, 5:]
     if not late.any() or not np.isfinite(sigmas).all():
         return [*nothing]
     sigma = np.hypot(values.std(axis=0), sigmas.mean(axis=0))

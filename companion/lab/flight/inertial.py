@@ -26,7 +26,7 @@ _OUTLIER: Final = 50.0
 
 
 class Navigation(NamedTuple):
-    """An estimator's solution, or the truth of a simulator."""
+    """An estimator's solution, or the truth of a simulator, and the Earth that it is on."""
 
     t_s: Floats
     attitude: Floats
@@ -35,6 +35,9 @@ class Navigation(NamedTuple):
     """(n, 3) m/s, NED."""
     position: Floats
     """(n, 3) m, NED."""
+    gravity_m_s2: float = 9.80665
+    earth_rate_ned_rad_s: Floats = np.zeros(3)
+    """(3,); zero: a simulator without, or a place that is not known."""
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
         """Interpolate rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3)."""
@@ -56,13 +59,6 @@ def joined(attitude: Floats, moving: Floats) -> Navigation | None:
     q = q[np.linalg.norm(q[:, 1:5], axis=1) > 0.5]
     states = _between(q[:, 0], moving[:, 0], moving[:, 1:7])
     return Navigation(q[:, 0], q[:, 1:5], states[:, :3], states[:, 3:]) if len(q) > 1 else None
-
-
-class World(NamedTuple):
-    """Gravity and rotation of the Earth; a simulator may have none."""
-
-    gravity_m_s2: float
-    earth_rate_ned_rad_s: Floats
 
 
 class Increments(NamedTuple):
@@ -112,9 +108,9 @@ def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
     )
 
 
-def without_earth(found: Increments, solution: Navigation, world: World) -> Increments:
+def without_earth(found: Increments, solution: Navigation) -> Increments:
     """Without what the Earth's turning adds: seen from the ground."""
-    rate = world.earth_rate_ned_rad_s
+    rate = solution.earth_rate_ned_rad_s
     if not rate.any():
         return found
     turn, velocity, _ = solution.at(found.t_s - 0.5 * found.dt_s)
@@ -150,27 +146,21 @@ def lag_s(found: Increments, solution: Navigation) -> float:
     return found_s if abs(found_s) < _MOST_LAG_S else 0.0
 
 
-class _Carried(NamedTuple):
-    """Readings integrated from the log's beginning, in the axes of the body then."""
+def _carry(found: Increments) -> tuple[Floats, Floats, Floats]:
+    """Integrate turn, velocity and position in the axes of the body at the log's beginning.
 
-    turn: Floats
-    velocity: Floats
-    position: Floats
-
-
-def _carry(found: Increments) -> _Carried:
-    """Integrate from the beginning: (n + 1, ...), before the first increment and after each."""
+    Each is (n + 1, ...), before the first increment and after each.
+    """
     turn = np.concatenate([np.eye(3)[None], running_products(rotations(found.angle))])
     added = np.einsum("nij,nj->ni", turn[:-1], found.velocity)
     velocity = np.concatenate([np.zeros((1, 3)), np.cumsum(added, axis=0)])
     moved = (velocity[:-1] + 0.5 * added) * found.dt_s[:, None]
-    return _Carried(turn, velocity, np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)]))
+    return turn, velocity, np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
 
 
 def drift(
     found: Increments,
     solution: Navigation,
-    world: World,
     within_s: tuple[float, float],
     spans_s: Sequence[float],
     offsets: Mapping[str, tuple[Floats, Floats]],
@@ -180,7 +170,6 @@ def drift(
     Args:
         found: readings, corrected by the firmware, on the solution's clock.
         solution: where each start begins, and what its end is compared with.
-        world: gravity, and the Earth's rate.
         within_s: first start and last end.
         spans_s: how long each is without aid.
         offsets: by name, what the output has more with those offsets, rad/s and m/s^2.
@@ -188,7 +177,7 @@ def drift(
     Returns:
         By name, one of each span that fits in without a gap in the readings.
     """
-    clean = without_earth(found, solution, world)
+    clean = without_earth(found, solution)
     # A node is the beginning of an increment; the last one ends the last of them.
     nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
     turn, velocity, position = solution.at(nodes)
@@ -198,7 +187,7 @@ def drift(
     first, last = max(within_s[0], float(nodes[0])), min(within_s[1], float(nodes[-1]))
     results: dict[str, list[Drift]] = {}
     for name, (gyro, accel) in offsets.items():
-        carried = _carry(clean.shifted(gyro, accel))
+        turned, gained, moved = _carry(clean.shifted(gyro, accel))
         rows = []
         for span_s in spans_s:
             k = np.searchsorted(nodes, np.arange(first, last - span_s + 1e-9))
@@ -208,40 +197,35 @@ def drift(
             if not len(k):
                 continue
             t = (nodes[j] - nodes[k])[:, None]
-            back = turn[k] @ _transposed(carried.turn[k])
-            inertial = carried.position[j] - carried.position[k] - carried.velocity[k] * t
+            back = turn[k] @ _transposed(turned[k])
+            inertial = moved[j] - moved[k] - gained[k] * t
             there = position[k] + velocity[k] * t + np.einsum("nij,nj->ni", back, inertial)
-            there += [0.0, 0.0, 0.5 * world.gravity_m_s2] * t**2
+            there += [0.0, 0.0, 0.5 * solution.gravity_m_s2] * t**2
             off = np.sort(np.linalg.norm(there - position[j], axis=1))
             rows.append(Drift(span_s, len(off), float(_at(off, 0.5)), float(_at(off, 0.95))))
         results[name] = rows
     return results
 
 
-class FlightWindow(NamedTuple):
-    """Excess of the readings over the solution in some seconds; axes of the body."""
-
-    t_s: float
-    """Middle of the window."""
-    gyro_rad_s: Floats
-    down_m_s2: float
-    """Along the vertical, counted along body z."""
-    tilt: Floats
-    """(2,) how much of x and of y lies along the vertical, for one of z."""
+NO_WINDOWS: Final = np.zeros((0, 7))
 
 
-def windows(
-    found: Increments, solution: Navigation, world: World, within_s: tuple[float, float], length_s: float
-) -> list[FlightWindow]:
-    """List windows side by side, without those in which readings or solution have holes."""
-    clean = without_earth(found, solution, world)
+def windows(found: Increments, solution: Navigation, within_s: tuple[float, float], length_s: float) -> Floats:
+    """Compare the readings with the solution in windows side by side; leave out those with holes in either.
+
+    Returns:
+        (n, 7): middle of the window in s; excess of the readings over the solution, by gyro (3, rad/s, axes of the
+        body) and by accelerometer along the vertical, counted along body z (m/s^2); share of x and of y that lies along
+        the vertical, for one of z.
+    """
+    clean = without_earth(found, solution)
     nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
     turn, velocity, _ = solution.at(nodes)
-    carried = _carry(clean)
+    carried, _, _ = _carry(clean)
     # The solution's attitude turns specific force, so that what the gyros have wrong does not tilt it.
     added = np.einsum("nj,nj->n", (0.5 * (turn[:-1] + turn[1:]))[:, 2], clean.velocity)
     down = np.concatenate([[0.0], np.cumsum(added)])
-    along = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(carried.turn[:-1] * found.dt_s[:, None, None], axis=0)])
+    along = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(carried[:-1] * found.dt_s[:, None, None], axis=0)])
     vertical = np.concatenate([np.zeros((1, 3)), np.cumsum(turn[:-1, 2] * found.dt_s[:, None], axis=0)])
     holes = np.concatenate([[0], np.cumsum(found.dt_s > GAP_S)])
     edges = np.arange(max(within_s[0], float(nodes[0])), min(within_s[1], float(nodes[-1])) + 1e-9, length_s)
@@ -254,14 +238,12 @@ def windows(
         x, y, level = (vertical[j] - vertical[k]) / max(t, 1e-9)
         if holes[j] != holes[k] or inside[1] - inside[0] < length_s or t <= 0.0 or abs(level) < 0.5:
             continue
-        turned = carried.turn[k].T @ carried.turn[j]
+        turned = carried[k].T @ carried[j]
         off = vectors((turn[j].T @ turn[k] @ turned)[None])[0]
-        gyro = np.linalg.solve(carried.turn[j].T @ (along[j] - along[k]), off)
-        more = (down[j] - down[k] + world.gravity_m_s2 * t - (velocity[j] - velocity[k])[2]) / t
-        rows.append(
-            FlightWindow(float(0.5 * (nodes[k] + nodes[j])), gyro, float(more / level), np.array([x, y]) / level)
-        )
-    return rows
+        gyro = np.linalg.solve(carried[j].T @ (along[j] - along[k]), off)
+        more = (down[j] - down[k] + solution.gravity_m_s2 * t - (velocity[j] - velocity[k])[2]) / t
+        rows.append([0.5 * (nodes[k] + nodes[j]), *gyro, more / level, x / level, y / level])
+    return np.array(rows).reshape(-1, 7)
 
 
 def matrices(q: Floats) -> Floats:

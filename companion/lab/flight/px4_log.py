@@ -10,8 +10,8 @@ import numpy as np
 
 from companion.autopilot.firmware.px4 import PX4
 from companion.lab.flight.inertial import Navigation, joined
-from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, ascending, changes, starts
-from companion.lab.logs.autopilot_logs import US, ulog
+from companion.lab.flight.log import Boot, FlownImu, changes
+from companion.lab.logs.autopilot_logs import US, BootMessages, ascending, ulog
 from companion.physics.frames import Floats
 
 
@@ -25,8 +25,8 @@ _TOPICS: Final[dict[str, tuple[str, ...]]] = {
     "sensor_selection": ("gyro_device_id",),
     "vehicle_imu_status": ("gyro_device_id", "accel_device_id", "temperature_gyro", "accel_vibration_metric"),
     "estimator_sensor_bias": (
-        "gyro_device_id", *_elements("gyro_bias"), *_elements("accel_bias"), *_elements("gyro_bias_variance"),
-        *_elements("accel_bias_variance"),
+        "gyro_device_id", *_elements("gyro_bias"), "accel_bias[2]", *_elements("gyro_bias_variance"),
+        "accel_bias_variance[2]",
     ),
     "vehicle_attitude": ("timestamp_sample", *_elements("q", 4)),
     "vehicle_attitude_groundtruth": ("timestamp_sample", *_elements("q", 4)),
@@ -41,14 +41,10 @@ _TURNING: Final = 0.02
 
 
 def read(path: Path) -> Iterator[Boot]:
-    """Each start of the autopilot in it: of PX4 there is one in a file, unless somebody has put several together."""
-    fields = {name: len(columns) for name, columns in _TOPICS.items()}
-    return map(_boot, starts(ulog(path, _TOPICS), fields))
-
-
-def _boot(start: BootMessages) -> Boot:
+    """Give the one start of the autopilot in a log."""
+    start = ulog(path, _TOPICS)
     armed, landed = start.rows("actuator_armed"), start.rows("vehicle_land_detected")
-    return Boot(
+    yield Boot(
         firmware=PX4.name,
         imus=_imus(start),
         solution=_navigation(start, ""),
@@ -111,14 +107,13 @@ def _imu(start: BootMessages, k: int, rows: Floats) -> FlownImu:
     )  # fmt: skip
 
 
-def _estimated(start: BootMessages, gyro_id: int | None) -> Estimated | None:
+def _estimated(start: BootMessages, gyro_id: int | None) -> Floats | None:
     for instance in start.instances("estimator_sensor_bias"):
         rows = start.rows("estimator_sensor_bias", instance)
         if not len(rows) or gyro_id not in (None, rows[-1, 1]):
             continue
         rows = _whole(rows)
-        sigmas = np.sqrt(np.maximum(rows[:, 8:], 0.0))
-        return Estimated(rows[:, 0], rows[:, 2:5], sigmas[:, :3], rows[:, 5:8], sigmas[:, 3:])
+        return np.column_stack([rows[:, 0], rows[:, 2:6], np.sqrt(np.maximum(rows[:, 6:], 0.0))])
     return None
 
 

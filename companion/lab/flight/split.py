@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.records.flight_record import AXES, Split, Term
-from companion.lab.flight.inertial import FlightWindow
 from companion.physics.frames import Floats
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG
@@ -38,8 +37,8 @@ _LEAST_TREND_S: Final = 60.0
 
 
 def split(
-    before: Sequence[FlightWindow],
-    flight: Sequence[FlightWindow],
+    before: Floats,
+    flight: Floats,
     levels: Floats | None,
     warmth: Sequence[Term | None],
     ekf: Sequence[Term | None],
@@ -47,7 +46,7 @@ def split(
     """Split the gyro's three axes and the accelerometer's vertical one.
 
     Args:
-        before: windows before the motors.
+        before: windows before the motors, as `inertial.windows` gives them.
         flight: windows in the air.
         levels: (n,) vibration in each of those, m/s^2; None: not known.
         warmth: by axis, what temperature explains of the step at the motors' start; None: not known.
@@ -55,7 +54,7 @@ def split(
     """
     found = []
     for k, axis in enumerate(AXES):
-        ground, air = (np.array([[*one.gyro_rad_s, one.down_m_s2][k] for one in each]) for each in (before, flight))
+        ground, air = before[:, 1 + k], flight[:, 1 + k]
         end = _ATTITUDE_RAD[k] if k < 3 else _VELOCITY_M_S
         constant = 0.0 if k < 3 else _GRAVITY_M_S2
         aside = 0.0 if k < 3 else _LEVEL_M_S2
@@ -78,9 +77,9 @@ def split(
     return found
 
 
-def _tilt(windows: Sequence[FlightWindow]) -> float:
+def _tilt(windows: Floats) -> float:
     """Root mean square of how x and y lie along the vertical."""
-    return math.sqrt(float(np.mean([one.tilt @ one.tilt for one in windows]))) if windows else 0.0
+    return math.sqrt(float(np.square(windows[:, 5:]).sum(axis=1).mean())) if len(windows) else 0.0
 
 
 def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
@@ -94,10 +93,10 @@ def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | 
 
 
 def _slopes(
-    values: Floats, windows: Sequence[FlightWindow], levels: Floats | None, end: float, aside: float
+    values: Floats, windows: Floats, levels: Floats | None, end: float, aside: float
 ) -> tuple[Term | None, Term | None]:
     """Fit slopes against vibration and time; each only where the flight has enough of it."""
-    times = np.array([one.t_s for one in windows])
+    times = windows[:, 0]
     columns = {}
     if len(times) > _LEAST and np.ptp(times) >= _LEAST_TREND_S:
         columns["trend"] = (times - times.mean()) / 60.0

@@ -29,8 +29,7 @@ from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.results import imu_records, record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
-from companion.lab.logs.playback import UNUSABLE, Playback, config_of
-from companion.lab.logs.recording import Head, Recording
+from companion.lab.logs.recording import UNUSABLE, Head, Playback, Recording, config_of
 from companion.physics.frames import Array
 from companion.recording import messages
 from companion.recording.messages import ImuState, Measured, Solved, Start, decode
@@ -61,16 +60,6 @@ class Replayed(msgspec.Struct, frozen=True):
     """Reason why its estimates were taken from the recording, if so."""
 
 
-class Result(msgspec.Struct, frozen=True):
-    """Result of a replay."""
-
-    calibrations: list[Replayed]
-    seconds: float
-    cut_short: str | None
-    notes: list[str]
-    """Other versions, gaps."""
-
-
 class Replay:
     """One pass over a recording: one file, or several of a ring, the oldest first."""
 
@@ -79,10 +68,13 @@ class Replay:
         self._path, self._config, self._head = path, config, head
         self._playback = Playback(config)
         self._collector: RollingCollector | None = None
-        self._calibrations: list[Replayed] = []
-        self._notes: list[str] = []
-        self.is_cut = False
-        """True: the end of a file is missing, so that the next one begins anew."""
+        self.calibrations: list[Replayed] = []
+        theirs = head.versions.get("companion")
+        self.notes = [] if theirs == __version__ else [f"recorded with companion {theirs}, here {__version__}"]
+        """Other versions, gaps."""
+        self.cut_short: str | None = None
+        """Why the first file that ends early does so."""
+        self._is_cut = False
         self._first_s = self._now_s = self._begun_s = math.nan
         self._where = Whereabouts()
         self._measured: Measurement | CalibrationRefusedError | None = None
@@ -126,17 +118,17 @@ class Replay:
         elif topic == messages.SOLVED:
             self._solve(decode(topic, data))
         elif topic == messages.RECORD:
-            self._calibrations.append(self._compare(from_json(data)))
+            self.calibrations.append(self._compare(from_json(data)))
 
     def _start(self, start: Start, t_s: float) -> None:
-        follows = start.continues and self._collector is not None and not self.is_cut
+        follows = start.continues and self._collector is not None and not self._is_cut
         if follows and t_s - self._now_s < FOLLOWS_S:
             return
         if start.lost:
-            self._notes.append(f"{start.lost} messages were lost in recording; replayed from behind the gap")
+            self.notes.append(f"{start.lost} messages were lost in recording; replayed from behind the gap")
         if math.isnan(self._first_s):
             self._first_s = t_s
-        self.is_cut, self._begun_s = False, t_s
+        self._is_cut, self._begun_s = False, t_s
         self._collector = models.collector(self._config)
         self._playback.begin()
         self._measured = self._solution = None
@@ -204,16 +196,19 @@ class Replay:
         again = msgspec.structs.replace(again, system_id=recorded.system_id, alignment=recorded.alignment)
         return compared(recorded, again)
 
+    @property
+    def seconds(self) -> float:
+        """Length of the recording."""
+        return 0.0 if math.isnan(self._first_s) else self._now_s - self._first_s
+
+    def cut(self, why: str) -> None:
+        """Note that the end of a file is missing, so that the next one begins anew."""
+        self.cut_short = self.cut_short or why
+        self._is_cut = True
+
     def goes_on(self, head: Head) -> bool:
         """Return whether a file with this head is of the same run of the daemon."""
         return (head.offset_ns, head.config) == (self._head.offset_ns, self._head.config)
-
-    def result(self, cut_short: str | None) -> Result:
-        """Return the calibrations, and how far the recording went."""
-        seconds = 0.0 if math.isnan(self._first_s) else self._now_s - self._first_s
-        if (theirs := self._head.versions.get("companion")) != __version__:
-            self._notes.insert(0, f"recorded with companion {theirs}, here {__version__}")
-        return Result(self._calibrations, seconds, cut_short, self._notes)
 
 
 def compared(recorded: Record, again: Record) -> Replayed:
@@ -249,10 +244,9 @@ def _change(collector: RollingCollector, before: ImuState | None, state: ImuStat
         collector.reset("offsets written", name)
 
 
-def replay(paths: Iterable[Path]) -> Result:
+def replay(paths: Iterable[Path]) -> Replay:
     """Replay recordings in this order, each to its end or to where it is cut."""
     found: Replay | None = None
-    cut_short: str | None = None
     for path in paths:
         recording = Recording(path)
         for item in recording.items():
@@ -264,7 +258,6 @@ def replay(paths: Iterable[Path]) -> Result:
             elif not found.goes_on(item):
                 raise StorageError(f"{path}: not of the same run of the daemon as the file before; replay it alone")
         if recording.cut_short is not None and found is not None:
-            cut_short = cut_short or recording.cut_short
-            found.is_cut = True
+            found.cut(recording.cut_short)
     assert found is not None
-    return found.result(cut_short)
+    return found

@@ -1,9 +1,12 @@
-"""Biases in a log, estimated from its longest still stretch; and which stretch that was."""
+"""Biases in a log: estimated from its longest still stretch, or from windows side by side to check sigma."""
 
 from __future__ import annotations
 
 import datetime
+import itertools
 import math
+import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -11,20 +14,22 @@ import msgspec
 import numpy as np
 
 from companion.config.sections import Mounting, NoiseProfile
-from companion.errors import CalibrationRefusedError
+from companion.errors import CalibrationRefusedError, StorageError
 from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.records.record import Record
+from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.request import What
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Remedies, Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
-from companion.lab.logs.log import StillLog
-from companion.physics.frames import rotation_matrix
+from companion.formats import Object
+from companion.lab.logs.still_log import StillLog
+from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
+from companion.physics.units import DEG
 from companion.samples import ImuSample, Vector
 
 MIN_STILL_S: Final = 5.0
@@ -42,6 +47,18 @@ _REMEDIES: Final = Remedies(
 _LONGER: Final = 1.02
 """A window is chosen again when the stretch has grown by so much."""
 _AT_ONCE: Final = 4096
+
+MOST_WINDOWS: Final = 100_000
+"""Eleven days of the shortest; a clock that jumps makes more."""
+PAUSE_S: Final = 3.0
+"""A sensor that was silent for longer may have been switched off."""
+HORIZON_S: Final = 180.0
+_AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
+_SAME_RAD: Final = 1.0 * DEG
+"""More than any bias drifts by: gravity from elsewhere is another pose."""
+_EXACT_DEG: Final = 1e-4
+_LATITUDE_DEG: Final = 45.0
+"""Any: the Earth's rate cancels, too."""
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,24 +82,11 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     """True: accept biases beyond those of any part."""
 
 
-class Used(msgspec.Struct, frozen=True, kw_only=True):
-    """Part of a log that went into the means; times from its first sample on."""
+def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Object]:
+    """Estimate the biases from the longest still stretch of a log.
 
-    files: tuple[str, ...]
-    seconds: float
-    from_s: float | None
-    """None: nothing was of use."""
-    to_s: float | None
-    still_s: int
-    """Seconds between them that count."""
-    left_out: dict[str, int]
-    """Lines, by reason."""
-    notes: tuple[str, ...]
-    """Assumptions, in words."""
-
-
-def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Used]:
-    """Estimate the biases from the longest still stretch of a log; return also which part of it was used."""
+    Return also which part of the log went into the means, in seconds from its first sample on, as JSON has it.
+    """
     return _Pass(log, given, max_still_s).run()
 
 
@@ -112,7 +116,7 @@ class _Pass:
         self._still_s = 0.0
         self._obstacle = ""
 
-    def run(self) -> tuple[Record, Used]:
+    def run(self) -> tuple[Record, Object]:
         """Run from the first sample to the last."""
         log, collector = self._log, self._collector
         began_at = datetime.datetime.now(tz=datetime.UTC)
@@ -179,17 +183,17 @@ class _Pass:
             return record_of(None, began_at, seconds, state="failed", reason=str(error), warnings=warnings)
         return record_of(solution, began_at, seconds, warnings=warnings)
 
-    def _used(self, slots: Sequence[int], seconds: float) -> Used:
+    def _used(self, slots: Sequence[int], seconds: float) -> Object:
         first = math.ceil(_FIRST_S)
-        return Used(
-            files=self._log.files,
-            seconds=seconds,
-            from_s=float(slots[0] - first) if slots else None,
-            to_s=float(slots[-1] + 1 - first) if slots else None,
-            still_s=len(slots),
-            left_out=self._log.left_out,
-            notes=self._log.notes,
-        )
+        return {
+            "files": self._log.files,
+            "seconds": seconds,
+            "from_s": float(slots[0] - first) if slots else None,
+            "to_s": float(slots[-1] + 1 - first) if slots else None,
+            "still_s": len(slots),
+            "left_out": self._log.left_out,
+            "notes": self._log.notes,
+        }
 
 
 def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vector, float | None]]:
@@ -222,3 +226,114 @@ def _posed(window: Window, given: Given) -> Window:
     if given.heading_deg is not None:
         heading = HeadingWindow(heading_deg=given.heading_deg, sigma_deg=0.0)
     return msgspec.structs.replace(window, tilt=tilt, heading=heading)
+
+
+# --- windows
+
+
+def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
+    """Check sigma on a sensor: calibrate every window of a length in seconds by itself, as after a start.
+
+    What a window finds is compared with what the windows after it find: the difference has to be within 2 sigma in 95
+    of 100 cases. How the sensor lay is the same in both and cancels: the pose counts as known, and sigma is the
+    sensor's alone. Windows between which it was moved are not compared.
+
+    Returns:
+        Number of windows; number of those without a result by reason, the commonest first, where reasons that differ in
+        figures are one; comparisons by axis, none where fewer than two windows in a row gave a result.
+    """
+    posed, force = given, np.zeros(3)
+    found: list[Floats | None] = []
+    """Bias, sigma_stat and sigma_use of each window, (3, 6); None: it gave none."""
+    whys: list[str] = []
+    begin_s = float(log.t_s[0])
+    starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
+    count = math.floor((float(log.t_s[-1]) - begin_s) / length_s + 1e-6)
+    if count > MOST_WINDOWS:
+        raise StorageError(f"{log.files[0]}: {count} windows from its first to its last time; allowed: {MOST_WINDOWS}")
+    edges = np.searchsorted(log.t_s, begin_s + length_s * np.arange(count + 1))
+    for start, end in itertools.pairwise(edges.tolist()):
+        if end - start < 2:
+            found.append(None)
+            whys.append("no samples")
+            continue
+        part = msgspec.structs.replace(
+            log, t_s=log.t_s[start:end], readings=log.readings[start:end],
+            temperature_degc=log.temperature_degc[start:end],
+        )  # fmt: skip
+        here = part.readings[:, 3:].mean(axis=0)
+        if not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0:
+            posed, force = _posed_by(here, given), here
+            found.append(None)
+        # What was switched on before the window says how far a warm-up may still go.
+        at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
+        powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered if at == 0 else 0.0)
+        record, _ = estimate(part, msgspec.structs.replace(posed, powered=powered_s), max_still_s=length_s)
+        imu = record.imus[0] if record.imus else None
+        one = None if imu is None else _figures(imu)
+        found.append(one)
+        if one is None:
+            whys.append(record.reason if imu is None else "; ".join(imu.warnings))
+    spans = sorted({1, math.ceil(HORIZON_S / length_s)})
+    return count, _counted(whys), [each for span in spans for each in _kept(found, span, span * length_s)]
+
+
+def _posed_by(force: Floats, given: Given) -> Given:
+    """Fill in what was not given: a pose by that specific force (3,), and a place, both exact."""
+    mean = rotation_matrix(given.mounting) @ force
+    roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
+    return msgspec.structs.replace(
+        given,
+        pitch_deg=pitch_rad / DEG if given.pitch_deg is None else given.pitch_deg,
+        roll_deg=roll_rad / DEG if given.roll_deg is None else given.roll_deg,
+        heading_deg=given.heading_deg or 0.0,
+        sigma_deg=_EXACT_DEG,
+        heading_sigma_deg=_EXACT_DEG,
+        latitude_deg=_LATITUDE_DEG if given.latitude_deg is None else given.latitude_deg,
+        height_m=given.height_m or 0.0,
+    )
+
+
+def _figures(imu: ImuRecord) -> Floats | None:
+    gyro = (imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s)
+    accel = (imu.accel_bias_m_s2, imu.accel_sigma_stat_m_s2, imu.accel_sigma_use_m_s2)
+    return None if None in gyro or None in accel else np.hstack([np.array(gyro), np.array(accel)])
+
+
+def _counted(whys: Sequence[str]) -> dict[str, int]:
+    """Count reasons without their figures, the commonest first; the key is the first of a kind."""
+    kinds = Counter(re.sub(r"\d+(\.\d+)?", "", why) for why in whys)
+    first = {re.sub(r"\d+(\.\d+)?", "", why): why for why in reversed(whys)}
+    return {first[kind]: count for kind, count in kinds.most_common()}
+
+
+def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[Object]:
+    """Compare every window with the mean of the `span` windows after it; by axis, in rad/s or m/s^2.
+
+    `rms` is of the misses, `sigma_use` the median of the promised sigmas, `ratio` the root mean square of a miss over
+    its sigma (1 where sigma is right), `share` that within 2 sigma, the white noise of the windows after allowed for.
+    """
+    misses, uses, seen = [], [], []
+    for at, one in enumerate(found):
+        after = [each for each in found[at + 1 : at + 1 + span] if each is not None]
+        if one is None or len(after) < span:
+            continue
+        bias, stat, _ = np.moveaxis(np.array(after), 1, 0)
+        misses.append(one[0] - bias.mean(axis=0))
+        uses.append(np.square(one[2]))
+        seen.append(np.square(stat).mean(axis=0) / span)
+    if not misses:
+        return []
+    columns = zip(_AXES, *(np.array(each).T for each in (misses, uses, seen)), strict=True)
+    return [
+        {
+            "axis": axis,
+            "next_s": next_s,
+            "pairs": len(misses),
+            "sigma_use": float(np.sqrt(np.median(use))),
+            "rms": float(np.sqrt(np.square(miss).mean())),
+            "ratio": float(np.sqrt((np.square(miss) / (use + own)).mean())),
+            "share": float((np.square(miss) <= 4.0 * (use + own)).mean()),
+        }
+        for axis, miss, use, own in columns
+    ]

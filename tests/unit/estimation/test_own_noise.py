@@ -17,7 +17,7 @@ from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.estimation.stillness.gates import ImuGate
 from companion.estimation.stillness.own_noise import OwnNoise
-from companion.lab.profile import fit_profile, rests, seconds_of
+from companion.lab.profile import fit_profile, rests, seconds_at_rest, seconds_of
 from tests.support.extent import extent
 from tests.support.made_noise import DEG, DEG_H, MG, filtered
 from tests.support.recordings import shared
@@ -68,7 +68,7 @@ def test_a_still_sensor_behind_a_filter_is_still(
         later = verdicts(t_s, readings)[80:]
         assert np.mean(later) >= 0.95
         # A profile's recordings are looked at as a whole: nothing is lost at their beginning.
-        assert rests(t_s, readings, "own", UNKNOWN).still_s >= 165
+        assert seconds_at_rest(rests(t_s, readings, "own", UNKNOWN)[0]) >= 165
 
 
 def test_what_is_learned_is_the_density_of_the_noise() -> None:
@@ -197,9 +197,9 @@ def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_
     assert words[-1].endswith(" (steady as noise: name its part, or companion profile)")
     assert "" not in words
     # Its recording tells a profile, and with it, it is still.
-    found = rests(t_s, readings, "own", UNKNOWN)
-    assert found.still_s >= 110
-    profile = fit_profile("own", found.stretches, UNKNOWN).profile
+    stretches, _, _ = rests(t_s, readings, "own", UNKNOWN)
+    assert seconds_at_rest(stretches) >= 110
+    profile, _, _ = fit_profile("own", stretches, UNKNOWN)
     assert profile.gyro.white == pytest.approx(noisy[0], rel=0.15)
     gate = ImuGate("own", profile)
     later = [gate.judge(batch).still for batch in seconds_of(*filtered(120, 100, noisy, 10.0, 1, 10))][40:]

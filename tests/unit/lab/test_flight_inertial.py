@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from companion.lab.flight.inertial import Increments, Navigation, World, drift, increments, lag_s, windows
+from companion.lab.flight.inertial import NO_WINDOWS, Increments, Navigation, drift, increments, lag_s, windows
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
 from companion.physics.frames import rotations, running_products
 from companion.physics.units import DEG, DEG_H, MG
 from tests.support.flown import Flown, earth_rate, fly, gravity
 from tests.support.made_noise import Floats
 
-WORLD = World(gravity(), earth_rate())
 AIR = (70.0, 235.0)
 NOTHING_KNOWN = [None] * 4
 NOTHING = (np.zeros(3), np.zeros(3))
@@ -39,7 +38,7 @@ def navigation(flown: Flown, seed: int | None = None) -> Navigation:
              y0 - x * z0 + y * w0 + z * x0, z0 + x * y0 - y * x0 + z * w0]
         )  # fmt: skip
         v = v + 0.05 * wandering[:, 3:]
-    return Navigation(flown.at_s, q, v, flown.position)
+    return Navigation(flown.at_s, q, v, flown.position, gravity(), earth_rate())
 
 
 def of(flown: Flown) -> Increments:
@@ -52,12 +51,13 @@ def perfect() -> Flown:
 
 
 def test_perfect_sensors_on_a_turning_earth_come_back_to_where_they_are(perfect: Flown) -> None:
-    rows = drift(of(perfect), navigation(perfect), WORLD, AIR, (10.0, 30.0, 60.0), {"flown": NOTHING})["flown"]
+    rows = drift(of(perfect), navigation(perfect), AIR, (10.0, 30.0, 60.0), {"flown": NOTHING})["flown"]
     assert [row.seconds for row in rows] == [10.0, 30.0, 60.0]
     assert [row.starts for row in rows] == [156, 136, 106]
     assert all(row.worst_m < limit for row, limit in zip(rows, (0.006, 0.024, 0.05), strict=True)), rows
     # An Earth that is taken to stand still: W g t^3 / 6 or so.
-    still = drift(of(perfect), navigation(perfect), World(gravity(), np.zeros(3)), AIR, (60.0,), {"flown": NOTHING})
+    resting = navigation(perfect)._replace(earth_rate_ned_rad_s=np.zeros(3))
+    still = drift(of(perfect), resting, AIR, (60.0,), {"flown": NOTHING})
     assert 10.0 < still["flown"][0].median_m < 40.0
 
 
@@ -78,7 +78,7 @@ def test_a_bias_drifts_as_by_hand_and_another_offset_takes_it_away(perfect: Flow
     biased = fly(gyro_rad_s=GYRO, accel_m_s2=ACCEL)
     ground = (5.0, 62.0)
     offsets = {"flown": NOTHING, "right": (-GYRO, -ACCEL)}
-    found = drift(of(biased), navigation(biased), WORLD, ground, (30.0,), offsets)
+    found = drift(of(biased), navigation(biased), ground, (30.0,), offsets)
     # Standing: half b t^2, and g w t^3 / 6 of what tilts, in the axes of the body, which lies within a degree.
     t = 30.0
     x = 0.5 * ACCEL[0] * t**2 - gravity() * GYRO[1] * t**3 / 6.0
@@ -86,8 +86,8 @@ def test_a_bias_drifts_as_by_hand_and_another_offset_takes_it_away(perfect: Flow
     z = 0.5 * ACCEL[2] * t**2
     assert found["flown"][0].median_m == pytest.approx(float(np.linalg.norm([x, y, z])), rel=0.02)
     assert found["right"][0].median_m < 0.02
-    in_air = drift(of(biased), navigation(biased), WORLD, AIR, (30.0,), offsets)
-    own = drift(of(perfect), navigation(perfect), WORLD, AIR, (30.0,), {"flown": NOTHING})
+    in_air = drift(of(biased), navigation(biased), AIR, (30.0,), offsets)
+    own = drift(of(perfect), navigation(perfect), AIR, (30.0,), {"flown": NOTHING})
     assert in_air["right"][0].median_m == pytest.approx(own["flown"][0].median_m, abs=0.02)
     assert in_air["flown"][0].median_m > 40.0
 
@@ -113,12 +113,13 @@ def test_what_motors_add_is_found_with_an_honest_sigma() -> None:
     sigmas: list[float] = []
     flown = fly(gyro_rad_s=GYRO, accel_m_s2=ACCEL, step_m_s2=step, rate_hz=50.0, white=(20.0 * DEG_H, 0.1 * MG))
     found = of(flown)
-    still = Navigation(
-        flown.at_s, np.tile(flown.quaternions[0], (len(flown.at_s), 1)), *[np.zeros((len(flown.at_s), 3))] * 2
+    zeros = np.zeros((len(flown.at_s), 3))
+    still = navigation(flown)._replace(
+        attitude=np.tile(flown.quaternions[0], (len(flown.at_s), 1)), velocity=zeros, position=zeros
     )
-    before = windows(found, still, WORLD, (35.0, 64.0), SHORT_S)
+    before = windows(found, still, (35.0, 64.0), SHORT_S)
     for seed in range(12):
-        air = windows(found, navigation(flown, seed), WORLD, AIR, LENGTH_S)
+        air = windows(found, navigation(flown, seed), AIR, LENGTH_S)
         for k, axis in enumerate(split(before, air, levels(len(air)), NOTHING_KNOWN, NOTHING_KNOWN)):
             assert axis.in_flight is not None
             assert axis.turn_on is not None
@@ -139,10 +140,11 @@ def test_what_motors_add_is_found_with_an_honest_sigma() -> None:
 
 def test_what_the_data_do_not_carry_is_not_known(perfect: Flown) -> None:
     assert all(
-        axis.in_flight is None and axis.motors is None for axis in split([], [], None, NOTHING_KNOWN, NOTHING_KNOWN)
+        axis.in_flight is None and axis.motors is None
+        for axis in split(NO_WINDOWS, NO_WINDOWS, None, NOTHING_KNOWN, NOTHING_KNOWN)
     )
-    air = windows(of(perfect), navigation(perfect), WORLD, (70.0, 115.0), LENGTH_S)
-    for axis in split([], air, None, NOTHING_KNOWN, NOTHING_KNOWN):
+    air = windows(of(perfect), navigation(perfect), (70.0, 115.0), LENGTH_S)
+    for axis in split(NO_WINDOWS, air, None, NOTHING_KNOWN, NOTHING_KNOWN):
         assert axis.in_flight is not None
         assert axis.turn_on is None
         assert axis.motors is None

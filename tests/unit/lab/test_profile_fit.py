@@ -13,7 +13,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.means.windows import ImuInput, estimate
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.lab.profile import LearnedNoise, Rest, fit_profile, rests, seconds_of
+from companion.lab.profile import Rest, fit_profile, rests, seconds_at_rest, seconds_of
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
 from tests.support.recordings import Recording, px4, shared, xio, xsens_counts
 
@@ -56,20 +56,20 @@ def test_movement_ends_a_stretch_and_a_new_pose_is_another_one() -> None:
     t_s, readings = at_rest(200)
     readings[100 * 50 : 110 * 50, :3] += np.random.default_rng(3).normal(0.0, 0.2, (500, 3))
     readings[110 * 50 :, 3] += 0.5  # it lies tilted now
-    found = rests(t_s, readings, "own", UNKNOWN)
-    assert [(rest.slots[0], rest.slots[-1]) for rest in found.stretches] == [(1, 99), (110, 198)]
-    assert found.seconds == 198
-    assert found.obstacle.startswith("gyro own")
+    stretches, seconds, obstacle = rests(t_s, readings, "own", UNKNOWN)
+    assert [(slots[0], slots[-1]) for slots, _ in stretches] == [(1, 99), (110, 198)]
+    assert seconds == 198
+    assert obstacle.startswith("gyro own")
 
 
 def test_a_knock_and_a_lost_second_are_holes() -> None:
     t_s, readings = at_rest(100)
     readings[50 * 50 : 50 * 50 + 20, 0] += 0.2
     there = (t_s < 70.0) | (t_s >= 71.0)
-    found = rests(t_s[there], readings[there], "own", UNKNOWN)
-    (rest,) = found.stretches
-    assert sorted(set(range(1, 99)) - set(rest.slots.tolist())) == [50, 70]
-    assert found.still_s == 96
+    stretches, _, _ = rests(t_s[there], readings[there], "own", UNKNOWN)
+    ((slots, _),) = stretches
+    assert sorted(set(range(1, 99)) - set(slots.tolist())) == [50, 70]
+    assert seconds_at_rest(stretches) == 96
 
 
 # --- the profile
@@ -79,40 +79,41 @@ def rest_of(seconds: int, models: tuple[AllanModel, AllanModel], seed: int) -> R
     """Made second by second, without samples."""
     rng = np.random.default_rng(seed)
     columns = [slow(rng, seconds, m.flicker, m.walk, m.white) for m in (models[0],) * 3 + (models[1],) * 3]
-    return Rest(np.arange(seconds), np.stack(columns, axis=1))
+    return np.arange(seconds), np.stack(columns, axis=1)
 
 
 GYRO = AllanModel(7.1 * DEG_H, 3.0 * FLICKER_OF_FLOOR * DEG_H, 0.16 * DEG_H)
 ACCEL = AllanModel(0.05 * MG, 0.01 * FLICKER_OF_FLOOR * MG, 0.0005 * MG)
 
 
-def fitted(rest: Rest, fallback: NoiseProfile = UNKNOWN) -> LearnedNoise:
-    return fit_profile("made", [rest], fallback)
+def fitted(rest: Rest, fallback: NoiseProfile = UNKNOWN) -> tuple[NoiseProfile, list[str]]:
+    profile, _, kept = fit_profile("made", [rest], fallback)
+    return profile, kept
 
 
 def test_what_is_not_told_is_borrowed_and_named() -> None:
-    finding = fitted(rest_of(70, (GYRO, ACCEL), 6))
-    assert {"gyro B", "gyro K", "accel B", "accel K"} <= set(finding.kept)
+    profile, kept = fitted(rest_of(70, (GYRO, ACCEL), 6))
+    assert {"gyro B", "gyro K", "accel B", "accel K"} <= set(kept)
     # As large as the cautious profile's, save what a minute rules out.
-    assert finding.profile.gyro.floor > 2.0 * GYRO.floor
-    assert finding.profile.gyro.walk >= 0.5 * UNKNOWN.gyro.walk
-    better = fitted(rest_of(70, (GYRO, ACCEL), 6), noise_profile("icm42688p"))
-    assert better.profile.gyro.floor < finding.profile.gyro.floor
+    assert profile.gyro.floor > 2.0 * GYRO.floor
+    assert profile.gyro.walk >= 0.5 * UNKNOWN.gyro.walk
+    better, _ = fitted(rest_of(70, (GYRO, ACCEL), 6), noise_profile("icm42688p"))
+    assert better.gyro.floor < profile.gyro.floor
     # An hour rules the cautious floor out, and tells its own.
-    hour = fitted(rest_of(3600, (GYRO, ACCEL), 7))
-    assert "gyro B" not in hour.kept
-    assert hour.profile.gyro.floor == pytest.approx(GYRO.floor, rel=0.25)
+    hour, kept = fitted(rest_of(3600, (GYRO, ACCEL), 7))
+    assert "gyro B" not in kept
+    assert hour.gyro.floor == pytest.approx(GYRO.floor, rel=0.25)
 
 
 def test_a_drift_costs_what_it_does_over_a_calibration_and_the_minutes_after_it() -> None:
     """200 deg/h in an hour: over the longest averages of the hour K would be several deg/h over sqrt(s)."""
-    still = rest_of(3600, (GYRO, ACCEL), 8)
+    slots, means = rest_of(3600, (GYRO, ACCEL), 8)
     ramp = 200.0 * DEG_H / 3600.0
-    finding = fitted(Rest(still.slots, still.means + ramp * still.slots[:, None]))
-    assert finding.profile.gyro.floor == pytest.approx(GYRO.floor, rel=0.3)
-    assert finding.profile.gyro.walk < 1.2 * DEG_H
+    profile, _ = fitted((slots, means + ramp * slots[:, None]))
+    assert profile.gyro.floor == pytest.approx(GYRO.floor, rel=0.3)
+    assert profile.gyro.walk < 1.2 * DEG_H
     # A minute and the three after it: d (T + H) / 2.
-    more = (finding.profile.gyro.walk**2) * 240.0 / 3.0
+    more = (profile.gyro.walk**2) * 240.0 / 3.0
     assert more >= (ramp * 120.0) ** 2
 
 
@@ -120,7 +121,7 @@ def test_what_tells_nothing_is_refused() -> None:
     with pytest.raises(CalibrationRefusedError, match="only 30 s at rest; a profile needs 60 s"):
         fitted(rest_of(30, (GYRO, ACCEL), 10))
     stuck = rest_of(100, (GYRO, ACCEL), 11)
-    stuck.means[:, 4] = 1.0
+    stuck[1][:, 4] = 1.0
     with pytest.raises(CalibrationRefusedError, match="accel y never changes"):
         fitted(stuck)
 
@@ -164,14 +165,14 @@ class Misses:
 def test_a_night_s_profile_keeps_its_word_in_the_other_half() -> None:
     """2.8 h, as the recordings of the ADIS16405 were, at a tenth of their rate: noise does not care."""
     t_s, readings = adis16405(10080, 10, seed=12)
-    found = rests(t_s, readings, "adis", UNKNOWN)
-    assert found.still_s > 10070
-    profile = fit_profile("adis", found.stretches, UNKNOWN).profile
+    stretches, _, _ = rests(t_s, readings, "adis", UNKNOWN)
+    assert seconds_at_rest(stretches) > 10070
+    profile, _, _ = fit_profile("adis", stretches, UNKNOWN)
     assert profile.gyro.white / DEG_H == pytest.approx(152.0, rel=0.04)
     assert 23.0 < profile.gyro.floor / DEG_H < 34.0
     assert 0.17 < profile.accel.floor / MG < 0.23
-    half = rests(t_s[: len(t_s) // 2], readings[: len(t_s) // 2], "adis", UNKNOWN)
-    learned = fit_profile("adis", half.stretches, UNKNOWN).profile
+    half, _, _ = rests(t_s[: len(t_s) // 2], readings[: len(t_s) // 2], "adis", UNKNOWN)
+    learned, _, _ = fit_profile("adis", half, UNKNOWN)
     later = seconds_of(t_s[len(t_s) // 2 :], readings[len(t_s) // 2 :])
     for mean_s in (10, 30, 60):
         misses = Misses()
@@ -205,7 +206,7 @@ def made_session(
         )
         for slot, mean in enumerate(means)
     ]  # fmt: skip
-    return Rest(np.arange(seconds), means), batches
+    return (np.arange(seconds), means), batches
 
 
 @pytest.mark.parametrize(
@@ -229,9 +230,7 @@ def test_a_wander_costs_what_it_does_in_the_next_minutes(
     """
     nights = [made_session(figures, bounded, 7200, seed) for seed in range(40, 44)]
     rests_of = [rest for rest, _ in nights]
-    profiles = [
-        fit_profile("made", [each for each in rests_of if each is not rest], UNKNOWN).profile for rest in rests_of
-    ]
+    profiles = [fit_profile("made", [each for each in rests_of if each is not rest], UNKNOWN)[0] for rest in rests_of]
     for mean_s, next_s in itertools.product((10, 30, 60), (60, 180)):
         misses = Misses()
         for (_, batches), profile in zip(nights, profiles, strict=True):
@@ -266,7 +265,7 @@ def test_of_real_recordings_the_next_seconds_are_where_they_were_promised_to_be(
     misses = Misses()
     for played, next_s in ((imu_tk(), 10), (px4(), 10), (xio("fusion_sensor_data.csv.gz"), 5), (broad(), 10)):
         readings = np.hstack([played.gyro, played.accel])
-        slots = {slot for rest in rests(played.t_s, readings, "own", UNKNOWN).stretches for slot in rest.slots}
+        slots = {slot for within, _ in rests(played.t_s, readings, "own", UNKNOWN)[0] for slot in within}
         still = [batch for batch in seconds_of(played.t_s, readings) if batch.slot in slots]
         misses.add(still, UNKNOWN, 10, next_s)
     assert len(misses.miss) >= 12

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.cli import main as companion
-from companion.lab.logs.csv_log import read
+from companion.lab.logs.still_log import read_csv
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at
@@ -129,6 +129,6 @@ def test_every_line_is_read_however_it_is_written(tmp_path: Path, separator: str
     for end in ("\n", "\r\n"):
         path, text = tmp_path / "imu.csv", end.join(lines) + end
         path.write_bytes(text.encode())
-        log = read(path)
+        log = read_csv(path)
         found = np.column_stack([log.t_s, log.readings, log.temperature_degc])
         np.testing.assert_array_equal(found, np.array(by_hand(text, 8), dtype=np.float64))

@@ -12,7 +12,7 @@ import pytest
 
 from companion.cli import main as companion
 from companion.errors import StorageError
-from companion.lab.logs.csv_log import HEADER, read
+from companion.lab.logs.still_log import HEADER, read_csv
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at
@@ -157,7 +157,7 @@ def test_a_log_without_times_has_a_rate(
 def test_repeated_lines_are_left_out_and_equal_times_refused(tmp_path: Path, still: tuple[Floats, ImuModel]) -> None:
     data = still[0]
     doubled = [row for number, row in enumerate(data.tolist()) for _ in range(2 if number % 10 == 4 else 1)]
-    log = read(written(tmp_path, HEADER + "\n" + joined(doubled)))
+    log = read_csv(written(tmp_path, HEADER + "\n" + joined(doubled)))
     np.testing.assert_array_equal(np.column_stack([log.t_s, log.readings]), data)
     assert log.left_out == {"repeated: time and readings of the line before": len(data) // 10}
     coarse = np.column_stack([np.floor(data[:, 0] * 10.0) / 10.0, data[:, 1:]])
@@ -165,15 +165,15 @@ def test_repeated_lines_are_left_out_and_equal_times_refused(tmp_path: Path, sti
     with pytest.raises(
         StorageError, match=r"line 3: time 3\.000000 s after 3\.000000 s; allowed: growing times, or --rate"
     ):
-        read(path)
-    assert np.diff(read(path, rate_hz=100.0).t_s) == pytest.approx(0.01)
+        read_csv(path)
+    assert np.diff(read_csv(path, rate_hz=100.0).t_s) == pytest.approx(0.01)
 
 
 def test_a_counter_of_32_bits_goes_on_behind_its_end(tmp_path: Path, still: tuple[Floats, ImuModel]) -> None:
     data, _ = still
     stamps = (np.round(data[:, 0] * 1e6).astype(np.int64) + 2**32 - 15_000_000) % 2**32
     rows = [[int(stamp), *row[1:].tolist()] for stamp, row in zip(stamps, data, strict=True)]
-    log = read(written(tmp_path, "t_us,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n" + joined(rows)))
+    log = read_csv(written(tmp_path, "t_us,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n" + joined(rows)))
     np.testing.assert_allclose(np.diff(log.t_s), 0.01, atol=2e-6)
 
 

@@ -16,7 +16,7 @@ from companion.estimation.records.history import Point
 from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
 from companion.physics.units import DEG_H
-from companion.report.by_temperature import biases_by_temperature
+from companion.report.page import biases_by_temperature
 from tests.support.histories import OFFSET_DEG_H, gyro_deg_h_at, windows_of_days
 
 MODEL, ACCEL_MODEL = PROFILES["icm42688p"].gyro, PROFILES["icm42688p"].accel

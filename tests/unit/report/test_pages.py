@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
-from companion.report import calibration
 from companion.report.calibration import calibration_page, read_material
 from companion.report.page import unix_s
 from companion.samples import Vector
@@ -70,7 +69,7 @@ class Page(HTMLParser):
 
 
 def _calibration(folder: Path, wanted: int | None = None) -> str:
-    return calibration_page(read_material(folder, wanted), NOW)
+    return calibration_page(*read_material(folder, wanted), NOW)
 
 
 def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
@@ -112,7 +111,7 @@ def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
     for k in range(230):
         one = record(k, imus=tuple(imu_record(name, k) for name in names), warnings=tuple(["x" * 5000] * 100))
         store.save(one)
-    content = calibration_page(read_material(tmp_path, None), NOW)
+    content = calibration_page(*read_material(tmp_path, None), NOW)
     assert len(content.encode()) < LARGEST
     found = Page(content)
     assert "5 more IMUs are not shown" in found.text
@@ -143,8 +142,8 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
     guilty = msgspec.structs.replace(arming(one), reason=evil)
     (tmp_path / "armings.json").write_bytes(msgspec.json.encode([guilty]))
     for content in (
-        calibration_page(read_material(tmp_path, 1), NOW),
-        calibration_page(read_material(tmp_path, 2), NOW),
+        calibration_page(*read_material(tmp_path, 1), NOW),
+        calibration_page(*read_material(tmp_path, 2), NOW),
     ):
         found = Page(content)
         assert {tag for tag, _ in found.tags} <= {
@@ -255,12 +254,11 @@ def test_whatever_a_record_holds_gives_pages(
         columns = dict(zip(_COLUMNS, axes[k:] + axes[:k], strict=True))
         imu = msgspec.structs.replace(imu_record(), name=words, temperature_degc=temperature, **columns)
         records.append((k, record(k, imus=(imu,), started_at=at, reason=words)))
-    last = records[-1][1]
-    one = calibration.Material(
-        number=2, record=last, earlier=records, armings=[],
-        damaged=[words],
-    )  # fmt: skip
-    drawn = [held for tag, held in Page(calibration_page(one, NOW)).tags if tag in {"path", "rect", "circle", "text"}]
+    drawn = [
+        held
+        for tag, held in Page(calibration_page(records, [], [words], NOW)).tags
+        if tag in {"path", "rect", "circle", "text"}
+    ]
     assert not any(re.search("nan|inf", str(value)) for held in drawn for key, value in held.items() if key != "class")
 
 

@@ -15,7 +15,6 @@ from companion.errors import CompanionError, ConfigError
 from companion.protocols.guess import Line
 from companion.setup.document import render
 from companion.setup.draft import Draft, sample
-from companion.setup.survey import FoundDevice
 
 SAMPLE = sample()
 OWN = """# Of the heron.
@@ -36,7 +35,7 @@ sigma_deg = 0.02
 [mqtt]
 host = "box"
 """
-TILT = FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "even"), "gradienter")
+TILT = ("/dev/tilt", "inclinometer_xy", Line(9600, "even"))
 
 
 def comments(text: str) -> list[str]:
@@ -86,7 +85,7 @@ def test_a_file_that_is_not_written_line_by_line_is_refused() -> None:
 
 def test_a_device_that_is_there_again_keeps_what_its_owner_has_said_of_it() -> None:
     draft = Draft(OWN, is_new=False)
-    draft.take(TILT)
+    draft.take("gradienter", *TILT)
     found = parse(draft.result(), "f").gradienter
     assert found is not None
     assert (found.parity, found.law, found.offset_deg, found.sigma_deg) == ("even", "slope", (0.1, -0.2), 0.02)

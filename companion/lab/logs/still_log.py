@@ -1,4 +1,4 @@
-"""A CSV log of an IMU: names of columns that say quantity and unit, then a line for each sample.
+"""Readings of one IMU at rest, and a reader of CSV logs: names of columns with quantity and unit, then lines.
 
 There is one vocabulary of names (`COLUMNS`), for the header of the file and for --columns alike. Nothing is guessed: a
 column of another name is passed over, and said.
@@ -7,21 +7,26 @@ column of another name is passed over, and said.
 from __future__ import annotations
 
 import csv
+import datetime
 import itertools
 import math
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple, TextIO
+from typing import Final, TextIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.config.sections import NoiseProfile
 from companion.errors import StorageError
-from companion.lab.logs.log import LAST_S, NAME, StillLog
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
+NAME: Final = "imu"
+
+LAST_S: Final = 1e11
 IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _UNITS: Final[tuple[tuple[tuple[str, ...], dict[str, float]], ...]] = (
     (("t",), {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
@@ -50,16 +55,51 @@ _WRAPS: Final = 2.0**32
 _MOST_NAMED: Final = 12
 
 
-class Column(NamedTuple):
-    """One column that is read."""
+class StillLog(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one session: a file, or several of which each goes on where the one before ends."""
 
-    place: int
-    """Number of the column, from 0."""
-    factor: float
-    name: str
+    imu: str
+    files: tuple[str, ...]
+    began_unix_s: float | None
+    t_s: Floats
+    """(n,) ascending."""
+    readings: Floats
+    """(n, 6): gyro in rad/s, accelerometer in m/s^2; axes as recorded."""
+    temperature_degc: Floats
+    """(n,); NaN where unknown."""
+    profile: str | NoiseProfile | None = None
+    """Noise profile in the configuration in force then."""
+    truncated: bool = False
+    """It came as integers only, which are left out."""
+    clock_offset_s: float | None = None
+    """UTC minus the recording's clock."""
+    breaks_s: tuple[float, ...] = ()
+    """When the readings became others by no noise: offsets were written, the device restarted."""
+
+    notes: tuple[str, ...] = ()
+    """Assumptions and oddities, in words."""
+    left_out: dict[str, int] = {}
+    """Lines that do not count, by reason."""
+    clock_from_start: bool = False
+    """True: times count from the switch-on of the autopilot."""
+
+    @property
+    def began_at(self) -> str | None:
+        """UTC."""
+        if self.began_unix_s is None:
+            return None
+        return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
+
+    def pieces(self, skip_s: float = 0.0) -> list[slice]:
+        """The samples between the breaks, in order; without the first `skip_s` of the session."""
+        if not len(self.t_s):
+            return []
+        first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s)) if skip_s else 0
+        cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
+        return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
 
 
-def read(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
+def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
     """Read a CSV file: semicolons, tabs, commas or blanks; "#" begins a remark.
 
     `columns`, separated by commas, take the place of the file's header, and a rate that of its times.
@@ -82,44 +122,40 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
             left_out[why] = int((~good).sum())
             table, numbers = table[good], numbers[good]
 
-    places = {what: place for place, what in enumerate(used)}
-    readings = [places[what] for what in IMU]
-    whole = np.all(np.isfinite(table[:, readings]), axis=1)
-    keep(whole, "without a number in each of " + ", ".join(IMU))
+    keep(np.all(np.isfinite(table[:, 1:7]), axis=1), "without a number in each of " + ", ".join(IMU))
     if rate_hz is None:
-        keep(np.isfinite(table[:, places["t"]]), "without a time")
+        keep(np.isfinite(table[:, 0]), "without a time")
     if not len(table):
         raise StorageError(f"{path}: no line in it has a number for all of {', '.join(IMU)}")
     if rate_hz is None:
-        changed = np.any(np.diff(table[:, [places["t"], *readings]], axis=0) != 0.0, axis=1)
+        changed = np.any(np.diff(table[:, :7], axis=0) != 0.0, axis=1)
         keep(np.append([True], changed), "repeated: time and readings of the line before")
-        t_s = _times(path, table[:, places["t"]], used["t"].factor, numbers)
+        t_s = _times(path, table[:, 0], COLUMNS[used["t"]][1], numbers)
     else:
         t_s = numbers / rate_hz
-    values = {what: table[:, places[what]] * used[what].factor for what in used}
-    forces = np.column_stack([values[what] for what in IMU[3:]])
-    _check_gravity(path, forces, [used[what].name for what in IMU[3:]])
+    readings = table[:, 1:7] * [COLUMNS[used[what]][1] for what in IMU]
+    _check_gravity(path, readings[:, 3:], [used[what] for what in IMU[3:]])
     return StillLog(
         imu=name,
         files=(path.name,),
         began_unix_s=None,
         t_s=t_s,
-        readings=np.column_stack([*(values[what] for what in IMU[:3]), forces]),
-        temperature_degc=values.get("temperature", np.full(len(t_s), math.nan)),
+        readings=readings,
+        temperature_degc=table[:, 7],
         notes=(f"columns passed over: {_some(passed)}",) if passed else (),
         left_out=left_out,
     )
 
 
-def columns_of(names: Sequence[str], where: str, *, timed: bool) -> dict[str, Column]:
-    """Map quantities to columns; one is time, if `timed`."""
-    used: dict[str, Column] = {}
-    for place, name in enumerate(names):
+def columns_of(names: Sequence[str], where: str, *, timed: bool) -> dict[str, str]:
+    """Map quantities to names of columns; one is time, if `timed`."""
+    used: dict[str, str] = {}
+    for name in names:
         if (known := COLUMNS.get(name)) is not None:
-            what, factor = known
+            what, _ = known
             if what in used:
-                raise StorageError(f"{where}: two columns for {what}: {used[what].name} and {name}")
-            used[what] = Column(place, factor, name)
+                raise StorageError(f"{where}: two columns for {what}: {used[what]} and {name}")
+            used[what] = name
     if not timed:
         used.pop("t", None)
     wanted = (*(("t",) if timed else ()), *IMU)
@@ -196,10 +232,10 @@ def _is_number(text: str) -> bool:
 
 
 def _numbers(
-    path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, Column]
+    path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, str]
 ) -> tuple[Floats, Floats]:
-    """Read the columns in use, NaN where a field is empty; and the number of each line."""
-    places, width = [column.place for column in used.values()], len(names)
+    """Read time, readings and temperature (n, 8), NaN where one is missing; and the number of each line."""
+    places, width = [names.index(name) for name in used.values()], len(names)
     flat, numbers = array("d"), array("d")
     for number, fields in lines:
         if len(fields) < width or any(field.strip() for field in fields[width:]):
@@ -216,7 +252,8 @@ def _numbers(
         numbers.append(number)
     if not numbers:
         raise StorageError(f"{path}: no line of numbers in it with {width} fields")
-    table = np.array(flat).reshape(-1, len(places))
+    table = np.full((len(numbers), 8), math.nan)
+    table[:, [("t", *IMU, "temperature").index(what) for what in used]] = np.array(flat).reshape(-1, len(places))
     table[~(np.abs(table) < _NUMBERS)] = math.nan
     return table, np.array(numbers)
 
