@@ -16,8 +16,7 @@ import msgspec
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.request import LONGEST_S, What
-from companion.formats import Object
-from companion.printable import printable
+from companion.formats import Object, printable
 
 MAX_SHOWN: Final = 60
 """The most characters of a value in a refusal."""

@@ -1,4 +1,7 @@
-"""JSON as it is let in: a file of ours by its format version (an older one is read, a newer one refused), a request."""
+"""Data as it is let in and shown: JSON files of ours, requests, words from outside.
+
+A file of an older format version is read, one of a newer version refused.
+"""
 
 from __future__ import annotations
 
@@ -45,3 +48,13 @@ def parse_request(data: bytes) -> dict[str, Any]:
         if isinstance(value, str) and "\0" in value:
             raise ValueError(f"{key!r}: found a text with a zero byte; allowed: texts without")
     return found
+
+
+def printable(text: str) -> str:
+    """Return a text from outside in one line, with an escape for each letter that moves the cursor or is invisible.
+
+    `ascii` and not a codec: Python loads a codec from a file at its first use, which fails without a free descriptor.
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)

@@ -19,8 +19,7 @@ from companion import commands, config
 from companion.config.sections import Config, NoiseProfile, Storage
 from companion.config.words import COMMAND_LINE, refusal_of_words
 from companion.errors import ConfigError
-from companion.formats import Object
-from companion.printable import printable
+from companion.formats import Object, printable
 
 DONE: Final = 0
 FAILED: Final = 1

@@ -16,11 +16,11 @@ from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
 from companion.estimation.request import What
+from companion.formats import printable
 from companion.ground import heard
 from companion.ground.exchange import Exchange
 from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListener, Text
 from companion.ground.link import GroundLink
-from companion.printable import printable
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
 EVERYBODY_WITHIN_S: Final = 1.3

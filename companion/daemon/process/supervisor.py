@@ -25,11 +25,10 @@ from companion.config.sections import Config
 from companion.daemon.process import footprint
 from companion.daemon.process.service import Service
 from companion.errors import CompanionError, ConfigError
-from companion.formats import Object
+from companion.formats import Object, printable
 from companion.links.serial import bytestream
 from companion.links.system import logs
 from companion.links.system.service_manager import ServiceManager
-from companion.printable import printable
 from companion.storage.profiles import saved_profile
 
 logger = logging.getLogger(__name__)

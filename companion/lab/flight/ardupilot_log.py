@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.autopilot.firmware.ardupilot import ArduPilot
-from companion.lab.flight.inertial import joined
-from companion.lab.flight.log import Boot, FlownImu, changes
+from companion.lab.flight.inertial import Boot, FlownImu, changes, joined
 from companion.lab.logs.autopilot_logs import BootMessages, dataflash
 from companion.physics.frames import Floats
 from companion.physics.units import DEG

@@ -24,8 +24,7 @@ from companion.estimation.records.flight_record import Drift, Flight, ImuFlight,
 from companion.estimation.records.record import Record
 from companion.estimation.solution.prior import curve_of
 from companion.lab.flight import ardupilot_log, inertial, px4_log
-from companion.lab.flight.inertial import NO_WINDOWS, Increments, Navigation
-from companion.lab.flight.log import Boot, FlownImu
+from companion.lab.flight.inertial import NO_WINDOWS, Boot, FlownImu, Increments, Navigation
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
 from companion.lab.logs.autopilot_logs import read_ulog, reader_of
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.px4 import PX4
-from companion.lab.flight.inertial import Navigation, joined
-from companion.lab.flight.log import Boot, FlownImu, changes
+from companion.lab.flight.inertial import Boot, FlownImu, Navigation, changes, joined
 from companion.lab.logs.autopilot_logs import US, BootMessages, ascending, ulog
 from companion.physics.frames import Floats
 

@@ -110,8 +110,6 @@ def _add(playback: Playback, topic: str, t_s: float, data: bytes, found: dict[st
     """Take the samples of a message; readings behind another state cannot be compared with those before."""
     if topic == messages.START:
         playback.begin()
-    if not playback.wants(topic):
-        return
     for role, part in playback.take(topic, data, t_s):
         if isinstance(part, ImuSample):
             state = playback.state(role.name)

@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 import msgspec
 
 from companion.autopilot.firmware.firmwares import FIRMWARES, firmware_named
-from companion.autopilot.firmware.imu_messages import PX4_FLOATS, EkfBiasReading, ImuMessage, ImuSamples, Reading
+from companion.autopilot.firmware.imu_messages import PX4_FLOATS, EkfBiasReading, ImuSamples, Reading
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
 from companion.errors import StorageError
@@ -93,7 +93,11 @@ class Recording:
                 for record in _records(file):
                     if isinstance(record, records.Metadata) and record.name == messages.METADATA:
                         table = record.metadata
-                        self._check_format(table)
+                        if (found := table.get("format")) != messages.FORMAT_VERSION:
+                            raise StorageError(
+                                f"{self.path}: found recording format {found}; allowed: {messages.FORMAT_VERSION};"
+                                f" companion {table.get('companion')}, which wrote it, replays it"
+                            )
                     elif isinstance(record, records.Attachment) and record.name == messages.CONFIG and table:
                         head = Head(table, int(table["offset_ns"]), record.data)
                         yield head
@@ -115,14 +119,6 @@ class Recording:
             cut = self.cut_short
             whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
             raise StorageError(f"{self.path}: {whose}")
-
-    def _check_format(self, table: dict[str, str]) -> None:
-        if (found := table.get("format")) != messages.FORMAT_VERSION:
-            version = table.get("companion")
-            raise StorageError(
-                f"{self.path}: found recording format {found}; allowed: {messages.FORMAT_VERSION};"
-                f" companion {version}, which wrote it, replays it"
-            )
 
 
 class _Bounded:
@@ -177,44 +173,6 @@ def config_of(found: Head, where: object) -> Config:
         raise StorageError(f"{where}: its configuration is of another version: {error}") from None
 
 
-class _AutopilotImu:
-    """One IMU of the autopilot: its state, and what makes samples of its messages."""
-
-    def __init__(self, role: Role) -> None:
-        self.role = role
-        self.state: ImuState | None = None
-        self.samples = ImuSamples()
-
-    def set_state(self, state: ImuState) -> None:
-        """Take a state; without messages the autopilot may have restarted."""
-        self.state = state
-        if state.message is None:
-            self.samples = ImuSamples()
-
-    def sample(self, message: Any, t_s: float, bias: EkfBiasReading | None) -> ImuSample | None:
-        """Return the sample in a message; None: it carries none that counts."""
-        state = self.state
-        source = None if state is None else _source(state, type(message))
-        if state is None or source is None or message.get_header().srcSystem != state.sender[0]:
-            return None
-        if message.get_header().srcComponent != state.sender[1]:
-            return None
-        reading = source.decode(message)
-        if not isinstance(reading, Reading) or reading.all_zero:
-            return None
-        name, floats = source.name, source is PX4_FLOATS
-        if not self.samples.accept(name, reading, t_s) or name != state.message or state.calibration is None:
-            return None
-        if floats and bias is None:
-            return None
-        return self.samples.sample(reading, t_s, bias if floats else None)
-
-
-def _source(state: ImuState, kind: type[Message]) -> ImuMessage | None:
-    sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
-    return next((each for each in sources if each.message is kind), None)
-
-
 class Playback:
     """The devices of a configuration, fed with what was recorded of them."""
 
@@ -228,54 +186,59 @@ class Playback:
         self._decoders = {
             name: device.info.decoder(device.settings.seconds_per_byte) for name, device in self._devices.items()
         }
-        self._imus = {name: _AutopilotImu(Role(name, "imu")) for name in self._autopilots}
+        self._states: dict[str, ImuState] = {}
+        self._samples = {name: ImuSamples() for name in self._autopilots}
         self._bias: EkfBiasReading | None = None
         self._found: list[Part] = []
         self._link = MavlinkLink()
         for kind in _KINDS:
             self._link.subscribe(kind, self._on_message)
 
-    def wants(self, topic: str) -> bool:
-        """Return whether messages on a topic bring samples or states."""
-        return topic.startswith((SERIAL, IMU)) or topic in (MAVLINK, EKF_BIAS)
-
     def state(self, name: str) -> ImuState | None:
         """Return the state of an IMU; None: it is none of the autopilot's, or nothing is known yet."""
-        return self._imus[name].state if name in self._imus else None
+        return self._states.get(name)
 
     def take(self, topic: str, data: bytes, t_s: float) -> list[Part]:
         """Take a message; return the samples that came of it, each with its role."""
-        if topic.startswith(SERIAL):
-            return list(self._serial(topic.removeprefix(SERIAL), data, t_s))
-        if topic == MAVLINK:
-            return self._mavlink(data, t_s)
-        if topic == EKF_BIAS:
-            self._bias = decode(topic, data)
-        else:
-            self._imus[topic.removeprefix(IMU)].set_state(decode(topic, data))
-        return []
-
-    def _serial(self, name: str, data: bytes, t_s: float) -> Iterator[Part]:
-        decoder = self._decoders[name]
-        if not data:
-            decoder.interrupted()
-            return
-        roles = self._devices[name].roles
-        for sample in decoder.receive(data, t_s):
-            yield from parts_of(sample, roles)
-
-    def _mavlink(self, data: bytes, t_s: float) -> list[Part]:
-        if not self._imus:
-            return []
-        if not data:
-            self._link.attach(None)
-            return []
         self._found = []
-        self._link.receive(data, t_s)
+        if topic.startswith(SERIAL):
+            name = topic.removeprefix(SERIAL)
+            decoder, roles = self._decoders[name], self._devices[name].roles
+            if data:
+                return [part for sample in decoder.receive(data, t_s) for part in parts_of(sample, roles)]
+            decoder.interrupted()
+        elif topic == MAVLINK and self._samples:
+            if data:
+                self._link.receive(data, t_s)
+            else:
+                self._link.attach(None)
+        elif topic == EKF_BIAS:
+            self._bias = decode(topic, data)
+        elif topic.startswith(IMU):
+            name, state = topic.removeprefix(IMU), decode(topic, data)
+            samples = self._samples[name]
+            # Without messages the autopilot may have restarted.
+            self._samples[name] = ImuSamples() if state.message is None else samples
+            self._states[name] = state
         return self._found
 
     def _on_message(self, message: Message, t_s: float) -> None:
-        for imu in self._imus.values():
-            sample = imu.sample(message, t_s, self._bias)
+        for name, state in self._states.items():
+            sample = self._sample(message, t_s, state, self._samples[name])
             if sample is not None:
-                self._found.append((imu.role, sample))
+                self._found.append((Role(name, "imu"), sample))
+
+    def _sample(self, message: Any, t_s: float, state: ImuState, samples: ImuSamples) -> ImuSample | None:
+        """Return the sample of an IMU in a message; None: it carries none that counts."""
+        sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
+        source = next((each for each in sources if each.message is type(message)), None)
+        header = message.get_header()
+        if source is None or (header.srcSystem, header.srcComponent) != (state.sender[0], state.sender[1]):
+            return None
+        reading = source.decode(message)
+        if not isinstance(reading, Reading) or reading.all_zero or not samples.accept(source.name, reading, t_s):
+            return None
+        bias = self._bias if source is PX4_FLOATS else None
+        if source.name != state.message or state.calibration is None or (source is PX4_FLOATS and bias is None):
+            return None
+        return samples.sample(reading, t_s, bias)

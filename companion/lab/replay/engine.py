@@ -97,13 +97,12 @@ class Replay:
         if collector is None:
             return
         self._now_s = t_s
-        if self._playback.wants(topic):
-            imu = topic.removeprefix(messages.IMU) if topic.startswith(messages.IMU) else ""
-            before = self._playback.state(imu)
-            for role, part in self._playback.take(topic, data, t_s):
-                collect(collector, role, part)
-            if (state := self._playback.state(imu)) is not None:
-                _change(collector, before, state)
+        imu = topic.removeprefix(messages.IMU)
+        before = self._playback.state(imu)
+        for role, part in self._playback.take(topic, data, t_s):
+            collect(collector, role, part)
+        if topic.startswith(messages.IMU) and (state := self._playback.state(imu)) is not None:
+            _change(collector, before, state)
         elif topic == messages.TICK:
             collector.tick(t_s)
         elif topic == messages.RAW_MEAN:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from companion.printable import printable
+from companion.formats import printable
 
 ROOT = Path("/")
 _BY_ID, _BY_PATH = "/dev/serial/by-id/", "/dev/serial/by-path/"

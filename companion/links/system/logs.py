@@ -14,8 +14,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final, TextIO
 
+from companion.formats import printable
 from companion.links.system.connection import Budget
-from companion.printable import printable
 
 # The journal reads the level from "<N>" at the beginning of a line, so that `journalctl -p warning` finds it.
 _PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}

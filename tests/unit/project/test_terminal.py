@@ -23,10 +23,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.cli import main, monitor
 from companion.daemon.process.check import CheckLine
 from companion.errors import LinkError
+from companion.formats import printable
 from companion.ground.heard import Address, GroundListener
 from companion.links.serial.ports import Holder, SerialPort
 from companion.links.system.logs import JournalFormatter, OneLineFormatter
-from companion.printable import printable
 from tests.support.ground_wire import StationOnTheWire
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
