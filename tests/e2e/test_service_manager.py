@@ -19,13 +19,13 @@ WATCHDOG_S = 2.0
 # One task waits for ever; the limits are short so that the test is.
 HANGING = """
 import asyncio, sys
-from companion.daemon.process import supervisor
-from companion.daemon.process.supervisor import main
+from companion.daemon.process import service
+from companion.daemon.process.service import main
 from companion.component.component import MavlinkComponent
 from companion.links.serial import bytestream
 
-supervisor.ESTIMATOR_S = supervisor.COMPONENT_S = 3.0
-bytestream.BEAT_WITHIN_S, supervisor.MARGIN_S = 3.0, 0.0
+service.ESTIMATOR_S = service.COMPONENT_S = 3.0
+bytestream.BEAT_WITHIN_S, service.MARGIN_S = 3.0, 0.0
 
 async def for_ever(*_):
     await asyncio.Event().wait()

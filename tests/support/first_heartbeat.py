@@ -13,8 +13,8 @@ from pathlib import Path
 
 CODE = """
 import os, sys
-from companion.daemon.process import footprint
-footprint.prepare()
+from companion.daemon.__main__ import prepare
+prepare()
 from companion.links.mavlink.link import MavlinkLink
 
 def first(self, message):
@@ -25,7 +25,7 @@ def first(self, message):
 
 MavlinkLink.send = lambda self, *what: (before.update(sys.modules), first(self, *what))
 before = set()
-from companion.daemon.process.supervisor import main
+from companion.daemon.process.service import main
 sys.exit(main(*sys.argv[1:]))
 """
 

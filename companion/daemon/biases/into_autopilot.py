@@ -38,7 +38,7 @@ class IntoAutopilot:
         offsets: Offsets,
     ) -> None:
         self._core, self._imus, self._measuring, self._memory = core, imus, measuring, memory
-        self._path, self._ledger = offsets.write_path, offsets.ledger
+        self._path, self._ledger = offsets, offsets.ledger
 
     def why_no_undo(self) -> str | None:
         """Return why the write of curves cannot be undone; None where it is the latest write."""

@@ -36,8 +36,7 @@ from companion.daemon.offsets.plan import (
     warnings_of,
     without,
 )
-from companion.daemon.offsets.subsystem import Offsets
-from companion.daemon.offsets.write import WATCHING
+from companion.daemon.offsets.subsystem import WATCHING, Offsets
 from companion.daemon.stands.measuring import Estimator, Measuring
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
@@ -100,7 +99,7 @@ class CalibrationRun(Job):
         kind = AUTOMATIC if automatic else "calibration"
         super().__init__(kind, what, requester, timeout_s, reboot=reboot, automatic=automatic)
         self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
-        self._imus, self._measuring, self._path = parts.imus, parts.measuring, parts.offsets.write_path
+        self._imus, self._measuring, self._offsets = parts.imus, parts.measuring, parts.offsets
         self.before, self.system_id = before, parts.core.vehicle.system_id
         self.begun_s = asyncio.get_running_loop().time()
         self.log = WriteLog()
@@ -188,7 +187,7 @@ class CalibrationRun(Job):
         """Wait until it is still and average."""
         while True:
             self.measured = await self._measuring.measure(self)
-            if await self._path.offsets_still_hold():
+            if await self._offsets.offsets_still_hold():
                 return
             # The window holds telemetry under other offsets than those now in force.
             self._machine.on(Event.MOVED)
@@ -230,7 +229,7 @@ class CalibrationRun(Job):
     async def _make_plan(self) -> None:
         """Compute new offsets of every IMU that the autopilot uses, and the rivals to switch off."""
         assert self.solution is not None
-        core, rivalry, slots = self._core, self._parts.offsets.rivalry, self._parts.offsets.slots
+        core, rivalry, slots = self._core, self._offsets.rivalry, self._offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}
         push = core.wanted.push  # may be switched while parameters are read: for all IMUs or for none
         targets: list[ImuPlan] = []
@@ -278,8 +277,8 @@ class CalibrationRun(Job):
             self.check_cancelled()
             self._machine.on(Event.NOTHING_TO_WRITE)
             return
-        self.plan = await self._path.write(self, self.plan, self.measured, self.log, self._watching)
-        await self._path.settle(self, self.plan, self.measured, self.log)
+        self.plan = await self._offsets.write(self, self.plan, self.measured, self.log, self._watching)
+        await self._offsets.settle(self, self.plan, self.measured, self.log)
 
     def _watching(self, words: str) -> None:
         """Show progress while the telemetry is watched, and report movement."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -20,10 +20,11 @@ from companion.autopilot.parameters.verify import EffectVerdict, Observation, ju
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleTimer
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
-from companion.daemon.offsets.plan import ImuPlan, Plan
+from companion.daemon.offsets.plan import ImuPlan, Plan, Residual
 from companion.daemon.offsets.px4_writes import OnTheWay, Px4Writes
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import MIN_BATCHES
+from companion.estimation.means.warming import Warming
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
 from companion.physics.frames import Array, vector
@@ -113,15 +114,17 @@ def _in_the_way(core: Core, looked_s: float) -> str:
 
 
 def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: Window) -> list[EffectVerdict]:
-    sides = BeforeAfter(
-        before=next(imu for imu in before.imus if imu.name == target.name),
-        after=next(imu for imu in after.imus if imu.name == target.name),
-        gyro_residual=target.residual[0],
-        accel_residual=target.residual[1],
+    first, second = (next(imu for imu in window.imus if imu.name == target.name) for window in (before, after))
+    return judge_vectors(
+        first,
+        second,
+        target.residual,
+        target.calibration,
+        target.changes,
+        core.profiles.of(target.name),
+        px4.on_the_way(target.calibration.instance),
         apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
     )
-    profile, on_the_way = core.profiles.of(target.name), px4.on_the_way(target.calibration.instance)
-    return judge_vectors(sides, target.calibration, list(target.changes), profile, on_the_way)
 
 
 def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
@@ -139,45 +142,37 @@ def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
     return f"the change {'does not show' if hasty else 'is small'}: looking longer"
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class BeforeAfter:
-    """One IMU's telemetry before and after a write, and the residuals that the write takes out (vehicle FRD)."""
-
-    before: ImuWindow
-    after: ImuWindow
-    gyro_residual: Array | None
-    accel_residual: Array | None
-    apart_s: float = 0.0
-    """Time between the middles of both windows."""
-
-
 def judge_vectors(
-    sides: BeforeAfter,
+    first: ImuWindow,
+    second: ImuWindow,
+    residual: Residual,
     calibration: ImuCalibration,
-    changes: list[Change],
+    changes: Sequence[Change],
     profile: str | NoiseProfile | None,
     on_the_way: OnTheWay,
+    *,
+    apart_s: float = 0.0,
 ) -> list[EffectVerdict]:
-    """Judge the written vectors: accelerometers, gyros, or both.
+    """Judge the written vectors by the telemetry before and after: accelerometers, gyros, or both.
 
     Where the output followed a far value and then left it as it had to, the new value is in use, however small the
-    change as a whole.
+    change as a whole. `apart_s`: time between the middles of both windows.
     """
-    gyro_step, accel_step = output_step(calibration, changes, sides.before.accel_m_s2)
+    gyro_step, accel_step = output_step(calibration, changes, first.accel_m_s2)
     names, noise = calibration.parameters, noise_profile(profile)
-    spans_s = (sides.before.duration_s, sides.after.duration_s)
+    spans_s = (first.duration_s, second.duration_s)
     flicker: Mapping[Triad, float] = {} if profile is not None else ORDINARY_FLICKER
     verdicts: list[EffectVerdict] = []
     halves: tuple[tuple[Triad, Array | None, Vector, tuple[str, str, str], str], ...] = (
-        ("accel", sides.accel_residual, accel_step, names.accel_offset, "m/s^2"),
-        ("gyro", sides.gyro_residual, gyro_step, names.gyro_offset, "rad/s"),
+        ("accel", residual[1], accel_step, names.accel_offset, "m/s^2"),
+        ("gyro", residual[0], gyro_step, names.gyro_offset, "rad/s"),
     )
-    for triad, residual, step, parameters, unit in halves:
-        if residual is None:
+    for triad, excess, step, parameters, unit in halves:
+        if excess is None:
             continue
-        mean, sigma, use = _read(sides.before, triad)
-        mean_after, sigma_after, _ = _read(sides.after, triad)
-        before, after, warmed = _as_at_end(triad, sides, mean, mean_after)
+        mean, sigma, use = _read(first, triad)
+        mean_after, sigma_after, _ = _read(second, triad)
+        before, after, warmed = _as_at_end(triad, (first.warming, second.warming), apart_s, mean, mean_after)
         model = noise.of(triad)
         # The bias wanders between the windows (method 2.2, V less its white part).
         drift = np.sqrt(floor_variance(min(model.flicker, flicker.get(triad, math.inf)), model.walk, *spans_s))
@@ -189,7 +184,7 @@ def judge_vectors(
             after=after,
             after_sigma=vector(np.hypot(np.hypot(_no_calmer(sigma_after, sigma, spans_s), drift), warmed)),
             expected_step=step,
-            truth=vector(np.subtract(before, residual)),
+            truth=vector(np.subtract(before, excess)),
             tolerance=TOLERANCE_SIGMAS * max(use),
             orientation=calibration.orientation,
         )
@@ -216,18 +211,20 @@ def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
     return window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2
 
 
-def _as_at_end(triad: Triad, sides: BeforeAfter, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
+def _as_at_end(
+    triad: Triad, warming: tuple[Warming | None, Warming | None], apart_s: float, before: Vector, after: Vector
+) -> tuple[Vector, Vector, Array]:
     """Convert both means to the temperature at the end of the first window; returns one sigma of that too, (3,)."""
-    first, second = sides.before.warming, sides.after.warming
+    first, second = warming
     if first is None:
         return before, after, np.zeros(3)
     slope, sigma = first.goes_on(triad)
     later = np.zeros(3) if second is None else second.ahead(triad)
-    since_end_s = sides.apart_s - first.half_s
+    since_end_s = apart_s - first.half_s
     return (
         vector(before - first.ahead(triad) + slope * first.half_s),
         vector(after - later - slope * since_end_s),
-        sigma * sides.apart_s,
+        sigma * apart_s,
     )
 
 

@@ -1,38 +1,74 @@
-"""The offsets in the autopilot: who writes them, who puts them back, and what else changes them."""
+"""Writing to the autopilot: journal, write with read-back, effect in the telemetry; after any failure the old values.
+
+Calibrations, alignments and temperature curves write through `Offsets`. An undo and PX4's far values restore what they
+found, and use the journal's transaction alone.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
+from typing import Final
 
+from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
+from companion.autopilot.parameters.verify import EffectVerdict
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
+from companion.autopilot.vehicle.vehicle import ArmState
+from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Subsystem, Task
+from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
+from companion.daemon.job import GoOn, Job, JobCancelledError
+from companion.daemon.offsets.effect import in_short, watch_effect
+from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
 from companion.daemon.offsets.ledger import Ledger, Recovery
 from companion.daemon.offsets.other_writers import OtherCompanions, Rivalry
+from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.px4_writes import Px4Writes
-from companion.daemon.offsets.reboot import RebootOwed
-from companion.daemon.offsets.write import WritePath
+from companion.daemon.offsets.reboot import BACK_WITHIN_S, NotRebootedError, RebootOwed, harm_of_reboot, reboot
+from companion.errors import (
+    AutopilotError,
+    AutopilotRebootedError,
+    CompanionError,
+    NotDisarmedError,
+    ParameterTimeoutError,
+    StorageError,
+)
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object
-from companion.storage.changes import ChangeLog
+from companion.storage.changes import ChangeLog, ChangeSet, Origin
 
 logger = logging.getLogger(__name__)
 
+DISARMED_WITHIN_S: Final = 10.0
+"""Longest wait for a heartbeat lost just before the write."""
+WATCHING: Final = "watching the telemetry take the new offsets"
+POLL_S: Final = 0.2
+CONCLUDING_PERCENT: Final = 95.0
+READ_ATTEMPTS: Final = 3
+
+Note = Callable[[Mapping[str, WrittenParameter], Collection[str]], None]
+"""Takes parameters by their outcome, and the names of those that could not be restored."""
+
 
 class Offsets(Subsystem):
-    """Writing, and what belongs to it."""
+    """Writes plans, each as a whole or not at all; wires what restores them and what else changes offsets."""
 
     def __init__(self, core: Core, devices: Devices) -> None:
-        config, vehicle, parameters, imus = core.config, core.vehicle, core.parameters, devices.imus
-        self._vehicle, self.slots = vehicle, devices.slots
-        self.companions = OtherCompanions(core.link, core.texts.say, lambda: core.wanted.push)
-        self.ledger = Ledger(ChangeLog(config.storage.path), core.offload, self.companions.why_not)
-        self.writer = ParameterWriter(parameters, vehicle)
-        self.rivalry, self.owed = Rivalry(core, imus), RebootOwed(core)
-        px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
-        firmware = FirmwareCalibration(core, self.writer, self.ledger)
-        self.write_path = WritePath(core, imus, self.writer, self.ledger, px4, firmware, self.owed)
+        vehicle, imus = core.vehicle, devices.imus
+        self._core, self._vehicle, self._machine, self._imus = core, vehicle, core.machine, imus
+        self.slots, self.rivalry, self.owed = devices.slots, Rivalry(core, imus), RebootOwed(core)
+        self.companions = OtherCompanions(core.link, core.say, lambda: core.wanted.push)
+        self.ledger = Ledger(ChangeLog(core.config.storage.path), core.offload, self.companions.why_not)
+        self.writer = ParameterWriter(core.parameters, vehicle)
+        self._px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
+        self._firmware = FirmwareCalibration(core, self.writer, self.ledger)
         self.recovery = Recovery(core, self.writer, self.ledger, imus, self.owed)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
@@ -62,3 +98,259 @@ class Offsets(Subsystem):
             ("reboot-owed", self.owed.run),
             ("other-companions", self.companions.run),
         ]
+
+    async def offsets_still_hold(self) -> bool:
+        """Read the offsets again; False when they differ, or may differ, from those under which was measured.
+
+        Raises:
+            AutopilotError: they cannot be read; or doubtful ones could not be brought into use.
+            StorageError: the old values could not be kept.
+        """
+        held = True
+        for imu in self._imus.values():
+            held &= await imu.refresh()
+        return held and not (self._core.wanted.push and await self._px4.make_sure(list(self._imus.values())))
+
+    # --- any write
+
+    async def begin(self, job: Job, parameters: int) -> None:
+        """Announce a write of so many parameters, and wait until the aircraft is surely disarmed.
+
+        Raises:
+            NotDisarmedError: it is armed, or no heartbeat comes.
+        """
+        job.check_cancelled()
+        self._machine.on(Event.WRITE)
+        job.progress(MEASURED_PERCENT, f"writing {parameters} parameters")
+        await self._wait_disarmed()
+
+    async def commit(
+        self,
+        changes: Sequence[Change],
+        origin: Origin,
+        imus: Collection[AutopilotImu],
+        apply: Callable[[], Awaitable[Sequence[Change]]],
+        verify: Callable[[], Awaitable[None]],
+        note: Note = lambda _written, _failed: None,
+    ) -> None:
+        """Write in a journal transaction; keep the values only when `verify` passes and they can be undone later.
+
+        Args:
+            changes: planned changes; their old values are on disk before `apply` starts.
+            origin: cause of the write, for the undo.
+            imus: IMUs whose output changes.
+            apply: writes, and returns all changes made in their order, the firmware's own included.
+            verify: looks for the effect; raises where the new values must not stay.
+            note: told of parameters that were restored.
+
+        Raises:
+            CompanionError: cause, and the parameters that could not be restored, if any.
+            JobCancelledError: raised by `verify`; the message says what became of the old values.
+        """
+        system_id = self._vehicle.system_id
+        async with self.ledger.transaction(ChangeSet.of(system_id, changes, origin=origin)):
+            with changing(imus):
+                made = await apply()
+            self._machine.on(Event.WRITTEN)
+            try:
+                await verify()
+                await self.ledger.done(ChangeSet.of(system_id, made, origin=origin))
+            except JobCancelledError as cancelled:
+                raise JobCancelledError(await self._roll_back(made, imus, str(cancelled), note)) from None
+            except CompanionError as error:
+                raise AutopilotError(await self._roll_back(made, imus, str(error), note)) from error
+
+    async def _roll_back(self, made: Sequence[Change], imus: Collection[AutopilotImu], reason: str, note: Note) -> str:
+        """Restore the old values; returns the reason and what became of them."""
+        left: Sequence[str] = ()
+        end = "will be once disarmed"
+        with contextlib.suppress(NotDisarmedError):
+            await self._wait_disarmed()  # after a restart the first heartbeat is still to come
+        with changing(imus):
+            try:
+                note(await self.writer.restore(made), ())
+            except WriteFailedError as error:
+                note(error.written, ())
+                left = error.left_changed
+                if error.kind == "changed by someone else":
+                    end = "somebody else changed them"
+            except NothingWrittenError:
+                left = [change.parameter for change in made]
+                note({}, left)
+        if left:
+            return f"{reason}; old values NOT back in {', '.join(left)}: {end}"
+        with contextlib.suppress(StorageError):
+            await self.ledger.undone()
+        return f"{reason}; old values back"
+
+    async def _wait_disarmed(self) -> None:
+        await self._heartbeat(DISARMED_WITHIN_S)
+        if self._vehicle.arm_state is ArmState.ARMED:
+            raise NotDisarmedError("armed; nothing written")
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            raise NotDisarmedError("no heartbeat; nothing written")
+
+    async def _heartbeat(self, within_s: float) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while self._vehicle.arm_state is ArmState.UNKNOWN:
+                    await asyncio.sleep(POLL_S)
+
+    # --- a write of offsets
+
+    async def write(self, job: Job, plan: Plan, before: Window, log: WriteLog, go_on: GoOn | None = None) -> Plan:
+        """Write offsets, read them back, and watch the telemetry make the step that it must; errors as `commit`.
+
+        `before` is the window measured under the old offsets. `log` is filled; `go_on` replaces the job's progress
+        while the telemetry is watched. Returns the plan with the firmware's own changes.
+        """
+        await self.begin(job, len(plan.changes))
+        gyros = await self._firmware.prepare(plan.gyros, log.warnings.append)
+        ours = {target.name for target in plan.targets}
+        imus = [imu for name, imu in self._imus.items() if gyros is not None or name in ours]
+
+        def note(written: Mapping[str, WrittenParameter], failed: Collection[str]) -> None:
+            plan.note(log, written)
+            plan.mark(log, failed, "failed")
+
+        async def apply() -> Sequence[Change]:
+            nonlocal plan
+            try:
+                if gyros is not None:
+                    plan = await self._firmware.write(
+                        plan, gyros, log, lambda words: job.progress(MEASURED_PERCENT, words)
+                    )
+                else:
+                    reads = [(target.calibration, target.all, target.read_m_s2) for target in plan.targets]
+                    async with self._px4.standing_by(reads) as probe:
+                        plan.note(log, await self.writer.apply(plan.changes, probe))
+            except WriteFailedError as error:
+                plan.note(log, error.written)
+                raise
+            return plan.everything
+
+        async def verify() -> None:
+            job.progress(WRITTEN_PERCENT, WATCHING)
+            problems = await self._problems(plan, before, log, go_on or job.going_on(WRITTEN_PERCENT, WATCHING))
+            if problems:
+                raise AutopilotError("; ".join(problems))
+            await self.owed.after(plan.changes)
+
+        await self.commit(plan.changes, Origin(job.short, log.started), imus, apply, verify, note)
+        return plan
+
+    async def _problems(self, plan: Plan, before: Window, log: WriteLog, go_on: GoOn) -> list[str]:
+        """List reasons why written values must not stay."""
+        verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, plan.boots)
+        # Somebody else's change explains what the telemetry shows, so it comes first.
+        problems: list[str] = []
+        try:
+            async for name, now in self._not_as_written(plan, attempts=1):
+                problems.append(f"{name} is {now:.6g}, somebody changed it right after the write")
+        except AutopilotError as error:
+            problems.append(str(error))
+        if verdicts is None and self._vehicle.boots != plan.boots:
+            problems.append(unseen)
+        explained = bool(problems)
+        for target in plan.targets:
+            if not target.watched:
+                log.warn(target.name, "effect of the written offsets not seen: this IMU is not in the telemetry")
+            elif verdicts is None:
+                log.warn(target.name, f"effect of the written offsets not seen: {unseen}")
+            elif not explained:
+                problems += _note_verdicts(plan, target, verdicts[target.name], log)
+        return problems
+
+    async def _not_as_written(self, plan: Plan, *, attempts: int) -> AsyncIterator[tuple[str, float]]:
+        """Yield name and present value of changed parameters, each as soon as it is read."""
+        for change in plan.changes:
+            for _ in range(attempts - 1):
+                with contextlib.suppress(AutopilotRebootedError, ParameterTimeoutError):
+                    now = await self._core.parameters.read(change.parameter)
+                    break
+            else:
+                now = await self._core.parameters.read(change.parameter)
+            if not same_float32(now, change.after):
+                yield change.parameter, now
+
+    # --- after a write that stays
+
+    async def settle(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> None:
+        """Restart the autopilot where that was asked for, else wait until its EKF agrees with the new offsets.
+
+        Raises:
+            AutopilotError: the autopilot has not come back, or not with what was written.
+        """
+        boots = self._vehicle.boots
+        if not_rebooted := await self._restart(job, plan, before, log) if job.reboot else "":
+            self._warn(log, not_rebooted)
+        if (words := self.owed.words) is not None:
+            log.warnings.append(f"{words} for minutes after such a step (companion calibrate --reboot does it)")
+            self.owed.say()
+        self._machine.on(Event.VERIFIED)
+        if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
+            job.lasts(settles_within_s(plan.firmware))
+            try:
+                unsettled = await self._firmware.settle(plan, job.going_on(CONCLUDING_PERCENT))
+            except JobCancelledError as cancelled:
+                unsettled = f"wait 2 min before take-off: {cancelled} while the EKF took in the new offsets, which stay"
+            if unsettled is not None:
+                self._warn(log, unsettled)
+            if self._vehicle.boots != boots:
+                await self._survived(plan, log)
+        self._machine.on(Event.CONCLUDED)
+
+    def _warn(self, log: WriteLog, words: str) -> None:
+        log.warnings.append(words)
+        self._core.say(Severity.WARNING, words, Weight.NEWS)
+
+    async def _survived(self, plan: Plan, log: WriteLog) -> None:
+        """After a restart that the companion did not ask for, check that the written values are still there."""
+        await self._heartbeat(BACK_WITHIN_S)
+        changed = [name async for name, _ in self._not_as_written(plan, attempts=READ_ATTEMPTS)]
+        if changed:
+            plan.mark(log, changed, "failed")
+            raise AutopilotError(f"the autopilot restarted and replaced {', '.join(changed)}: calibrate again")
+
+    async def _restart(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> str:
+        """Restart the autopilot and check that the new offsets are in force; returns why that was not seen, or ""."""
+        go_on = job.going_on(CONCLUDING_PERCENT, "watching the telemetry after the reboot")
+        self._machine.on(Event.REBOOT)
+        try:
+            if (harm := harm_of_reboot([target.calibration for target in plan.targets], plan.changes)) is not None:
+                return harm
+            await reboot(self._vehicle, go_on)
+            stored = {change.parameter: change.after for change in plan.changes}
+            changed = [
+                f"{name} is {now:.6g} after the reboot, {stored[name]:.6g} had been stored"
+                async for name, now in self._not_as_written(plan, attempts=READ_ATTEMPTS)
+            ]
+            if changed:
+                raise AutopilotError("; ".join(changed))
+            verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, self._vehicle.boots)
+        except NotRebootedError as error:
+            return str(error)
+        except JobCancelledError as cancelled:
+            return f"{cancelled} before the reboot was confirmed; the new offsets stay"
+        found = (verdicts or {}).items()
+        problems = [f"imu {name}: {in_short(verdict)}" for name, each in found for verdict in each if not verdict.ok]
+        if problems:
+            raise AutopilotError(f"after the reboot: {'; '.join(problems)}")
+        if unseen:
+            log.warnings.append(f"rebooted, and the parameters are as written; their effect was not seen: {unseen}")
+        log.notes.append("rebooted" if unseen else "rebooted, offsets in force")
+        return ""
+
+
+def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict], log: WriteLog) -> list[str]:
+    """Enter the outcomes of one IMU's parameters; returns what is wrong, in words."""
+    hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
+    if hidden:
+        log.warn(target.name, f"so small a change does not show in the telemetry: {', '.join(hidden)}")
+    for verdict in verdicts:
+        log.warn(target.name, *verdict.problems)
+        # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
+        seen = verdict.ok and not verdict.hidden
+        for axis in verdict.axes:
+            plan.mark(log, [axis.parameter], "verified" if seen else verdict.outcome(axis.parameter))
+    return [f"imu {target.name}: {in_short(verdict)}" for verdict in verdicts if not verdict.ok]

@@ -1,12 +1,29 @@
-"""The daemon: all subsystems on one event loop, running until a signal."""
+"""The daemon as a process: its subsystems on one event loop, its signals, and the watchdog of its long-lived tasks.
+
+SIGTERM and SIGINT end it in order, with old values restored and exit code 0. SIGHUP is ignored: a companion run by hand
+goes on when its terminal closes. The service manager's watchdog is fed while all tasks go on; one that does not is
+logged with the place where it waits, before the manager ends the process.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import ctypes
+import dataclasses
+import faulthandler
+import gc
 import logging
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+import signal
+import sys
+import types
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
+from companion import config as configuration
+from companion import summary
+from companion.autopilot.telemetry import imu_stream
 from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
@@ -18,9 +35,14 @@ from companion.daemon.interfaces.control import ControlServer
 from companion.daemon.interfaces.subsystem import Interfaces
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder import Recorder
-from companion.formats import Object
+from companion.errors import CompanionError, ConfigError
+from companion.formats import Object, printable
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
+from companion.links.serial import bytestream
+from companion.links.system import logs
+from companion.links.system.service_manager import ServiceManager
+from companion.storage.profiles import saved_profile
 from companion.storage.state import only_daemon
 
 if TYPE_CHECKING:
@@ -31,6 +53,16 @@ logger = logging.getLogger(__name__)
 SETTLED_WITHIN_S: Final = 20.0
 """A small board takes seconds to start the MQTT process, and a silent broker 10 s to be given up."""
 LISTEN_TURN_S: Final = 0.1
+SETTLED_AFTER_S: Final = 3.0
+"""Time after which lazily imported modules (recording, the child processes) are loaded."""
+PERIOD_S: Final = 1.0
+FEEDS_PER_LIMIT: Final = 4.0
+"""Feeds of the watchdog within its limit, where that is short: one of them may be late."""
+MARGIN_S: Final = 2.0
+COMPONENT_S: Final = 5.0
+ESTIMATOR_S: Final = 10.0
+AUTOMATIC_S: Final = 180.0
+"""Deadline of a task that may read a dozen parameters over a bad radio link, each with all its retries."""
 
 
 class Service:
@@ -126,3 +158,199 @@ class Service:
     def status(self) -> Object:
         """Return the daemon's status for JSON."""
         return self.faces.all_status()
+
+
+@dataclasses.dataclass(slots=True)
+class WatchedTask:
+    """A task that must go on, by its counted turns: an idle event loop proves nothing of a task that waits for ever."""
+
+    name: str
+    task: str
+    within_s: float
+    who: Any
+    """Object that counts its `turns`."""
+    seen: int = 0
+    age_s: float = 0.0
+    """Age of the latest turn in calls of `overdue`: while the whole event loop stands still, no task ages."""
+
+    def overdue(self, passed_s: float) -> bool:
+        """Let time pass; returns whether the task has not gone on for too long."""
+        before, self.seen = self.seen, self.who.turns
+        self.age_s = self.age_s + passed_s if self.seen == before else 0.0
+        return self.age_s > self.within_s
+
+
+def watched_tasks(service: Service) -> list[WatchedTask]:
+    """List the tasks of a service that must go on."""
+    link_s = bytestream.BEAT_WITHIN_S + MARGIN_S
+    attitude = service.heading.attitude
+    return [
+        WatchedTask("MAVLink component", "component", COMPONENT_S, service.faces.component),
+        WatchedTask("MAVLink connection", "mavlink", link_s, service.core.link),
+        WatchedTask("estimator", "readiness", ESTIMATOR_S, service.arming.readiness),
+        WatchedTask("automatic calibration", "automatic", AUTOMATIC_S, service.arming.automatic),
+        *([] if attitude is None else [WatchedTask("attitude", "attitude", ESTIMATOR_S, attitude)]),
+        *(
+            WatchedTask(f"imu {name}", f"{name} telemetry", imu_stream.BEAT_WITHIN_S, imu.stream)
+            for name, imu in service.devices.imus.items()
+        ),
+        *(WatchedTask(f"sensor {sensor.name}", sensor.name, link_s, sensor.link) for sensor in service.devices.sensors),
+    ]
+
+
+def main(path: str, *verbose: str) -> int:
+    """Run the daemon with a configuration file until SIGTERM or SIGINT; return the command line's exit code."""
+    # The watchdog's SIGABRT may be the only witness of a process that hangs: let it print where.
+    faulthandler.enable()
+    logs.set_up("debug" if verbose else "info")
+    try:
+        wanted = configuration.load(Path(path), partial(saved_profile, forgiving=True))
+        if not verbose:
+            logging.getLogger().setLevel(wanted.log.level.upper())
+        asyncio.run(run(wanted))
+    except ConfigError as error:
+        sys.stderr.write(printable(f"{error}") + "\n")
+        return 2
+    except CompanionError as error:
+        sys.stderr.write(printable(f"companion: {error}") + "\n")
+        return 1
+    return 0
+
+
+async def run(wanted: Config) -> None:
+    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
+    manager = ServiceManager.from_environment()
+    try:
+        await Supervisor(Service(wanted), manager).run()
+    except BaseExceptionGroup as group:
+        if (known := group.subgroup(CompanionError)) is None:
+            raise
+        raise CompanionError("; ".join(map(str, _leaves(known)))) from group
+    finally:
+        manager.close()
+
+
+def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
+    for error in group.exceptions:
+        if isinstance(error, BaseExceptionGroup):
+            yield from _leaves(error)
+        else:
+            yield error
+
+
+class Supervisor:
+    """Runs a service until a signal or a fault, and feeds the watchdog meanwhile."""
+
+    def __init__(self, service: Service, manager: ServiceManager) -> None:
+        self._service, self._manager = service, manager
+        self.watched = watched_tasks(service)
+        self._work: asyncio.Task[None] | None = None
+        self._stopping = False
+        self._missed: set[str] = set()
+        self._status_failed = False
+
+    async def run(self) -> None:
+        """Run until a signal or a fault."""
+        loop = asyncio.get_running_loop()
+        self._work = work = loop.create_task(self._service.run(lambda: self._manager.notify("READY=1")), name="service")
+        watching = loop.create_task(self._watch(), name="supervisor")
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._stop, signal.Signals(number).name)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        settling = loop.call_later(SETTLED_AFTER_S, settle)
+        try:
+            await asyncio.wait([work, watching], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            settling.cancel()
+            if not work.done() and not self._stopping:
+                work.cancel()
+            await asyncio.wait([work])
+            watching.cancel()
+            await asyncio.wait([watching])
+        for task in (work, watching):
+            if not task.cancelled():
+                task.result()
+        logger.info("stopped")
+
+    def _stop(self, why: str) -> None:
+        if self._work is None or self._stopping:
+            # A second signal must not cut off what the first one is putting in order.
+            logger.warning("%s: stopping already; what was begun is put in order first", why)
+            return
+        logger.info("%s: stopping", why)
+        self._stopping = True
+        self._manager.notify("STOPPING=1")
+        self._work.cancel()
+
+    async def _watch(self) -> None:
+        """Feed the watchdog and report the status until cancelled."""
+        loop = asyncio.get_running_loop()
+        limit_s = self._manager.watchdog_s
+        period_s = PERIOD_S if limit_s is None else min(PERIOD_S, limit_s / FEEDS_PER_LIMIT)
+        before_s = loop.time()
+        while True:
+            # While the loop stood still no task could go on.
+            passed_s = min(loop.time() - before_s, 2.0 * period_s)
+            before_s = loop.time()
+            overdue = [each for each in self.watched if each.overdue(passed_s) and not self._stopping]
+            self._report(overdue)
+            if not overdue:
+                self._manager.notify("WATCHDOG=1")
+            self._manager.status(self._words(overdue))
+            await asyncio.sleep(period_s)
+
+    def _report(self, overdue: Sequence[WatchedTask]) -> None:
+        fed = "; the watchdog is not fed until it does" if self._manager.watchdog_s is not None else ""
+        for each in overdue:
+            if each.name not in self._missed:
+                where = _where(each.task)
+                logger.error("watchdog: %s has not gone on for %.0f s (%s)%s", each.name, each.age_s, where, fed)
+        missed = {each.name for each in overdue}
+        for name in () if self._stopping else self._missed - missed:
+            logger.warning("watchdog: %s goes on again", name)
+        self._missed = missed
+
+    def _words(self, overdue: Sequence[WatchedTask]) -> str:
+        if not self._manager.listens:
+            return ""
+        notes = ["stopping"] if self._stopping else []
+        notes += [f"HUNG: {each.name}" for each in overdue]
+        try:
+            return "; ".join([*notes, status_line(self._service.status())])
+        except Exception:
+            # A fault in the description must not end the work.
+            if not self._status_failed:
+                logger.exception("the status cannot be worked out")
+            self._status_failed = True
+            return "; ".join([*notes, "the status cannot be worked out: see the log"])
+
+
+def _where(task_name: str) -> str:
+    for task in asyncio.all_tasks():
+        if task.get_name() == task_name:
+            inner = task.get_coro()
+            while isinstance(inner, types.CoroutineType) and isinstance(inner.cr_await, types.CoroutineType):
+                inner = inner.cr_await
+            if isinstance(inner, types.CoroutineType) and inner.cr_frame is not None:
+                frame = inner.cr_frame
+                return f"waits in {inner.__qualname__}, {frame.f_code.co_filename}:{frame.f_lineno}"
+    return "its task has ended"
+
+
+def status_line(status: Object) -> str:
+    """Return the status in one line, most important first."""
+    rows = [row for row in summary.rows(status) if row[1] != "autopilot"]
+    parts = [summary.headline(status), str(status["vehicle"]["summary"])]
+    parts += [f"{name}: {words}" for verdict, name, words in rows if verdict == "wrong"]
+    good = [name for verdict, name, _ in rows if verdict == "ok"]
+    return "; ".join([*parts, f"{', '.join(good)} good"] if good else parts)
+
+
+def settle() -> None:
+    """Keep what exists by now, once everything is imported, out of all later garbage collections."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

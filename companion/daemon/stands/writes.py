@@ -55,7 +55,7 @@ class AlignmentWrites:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
         self._core, self._vehicle, self._imus, self._own = core, core.vehicle, imus, own
-        self.path, self._writer, self._owed = offsets.write_path, offsets.writer, offsets.owed
+        self.path, self._writer, self._owed = offsets, offsets.writer, offsets.owed
 
     async def write_accelerometers(
         self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], log: WriteLog

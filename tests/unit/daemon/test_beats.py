@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from companion.daemon.process.supervisor import WatchedTask
+from companion.daemon.process.service import WatchedTask
 
 
 def test_a_silent_task_is_overdue_until_it_goes_on() -> None:

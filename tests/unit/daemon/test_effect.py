@@ -11,7 +11,7 @@ from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import EffectVerdict
-from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, BeforeAfter, judge_vectors, why_look_longer
+from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, judge_vectors, why_look_longer
 from companion.estimation.means.windows import ImuWindow
 
 NOISE_RAD_S = 1e-4
@@ -59,9 +59,7 @@ def verdict_of(
     before = window(rng.normal(0.0, noise, (spans[0], 3)), 0.0)
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if made is None else made)
     changes = [Change(name, 0.0, float(each)) for name, each in zip(parameters_of(1).gyro_offset, step, strict=True)]
-    (verdict,) = judge_vectors(
-        BeforeAfter(before, after, np.asarray(step), None), calibration(), changes, "icm42688p", {}
-    )
+    (verdict,) = judge_vectors(before, after, (np.asarray(step), None), calibration(), changes, "icm42688p", {})
     return verdict
 
 

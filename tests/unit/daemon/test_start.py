@@ -51,12 +51,13 @@ def test_nothing_heavy_before_the_first_heartbeat(tmp_path: Path, text: str, mos
 
 SETTLED = """
 import gc, os
-from companion.daemon.process import footprint
+from companion.daemon.__main__ import prepare
 
-footprint.prepare()
+prepare()
 assert not gc.isenabled() and os.environ["OPENBLAS_NUM_THREADS"] == "1"
 from pymavlink.dialects.v20 import ardupilotmega
-footprint.settle()
+from companion.daemon.process.service import settle
+settle()
 assert gc.isenabled() and gc.get_freeze_count() > 10_000
 print("good")
 """

@@ -1,4 +1,4 @@
-"""`WritePath.commit`: new values stay only when their effect was seen and they can be undone."""
+"""`Offsets.commit`: new values stay only when their effect was seen and they can be undone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.daemon.job import JobCancelledError
 from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.offsets.write import WritePath
+from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.machine import Machine, State
 from companion.storage.changes import ChangeLog, Origin
@@ -48,10 +48,9 @@ class Aircraft:
         self.writer, self.machine = Writer(), Machine()
         self.machine.state = State.WRITING
         vehicle = SimpleNamespace(system_id=1, arm_state=ArmState.DISARMED)
-        core: Any = SimpleNamespace(vehicle=vehicle, machine=self.machine)
-        unused: Any = None
-        writer: Any = self.writer
-        self.path = WritePath(core, {}, writer, self.ledger, unused, unused, unused)
+        path: Any = Offsets.__new__(Offsets)
+        path._vehicle, path._machine, path.writer, path.ledger = vehicle, self.machine, self.writer, self.ledger
+        self.path: Offsets = path
 
     async def _offload(self, function: Any, *arguments: Any) -> Any:
         if self.disk_is_full:
