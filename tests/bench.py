@@ -31,7 +31,7 @@ from companion.lab.replay.engine import replay
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind
 from companion.samples import ImuSample
-from companion.storage.learned import BiasStore, KnownImu
+from companion.storage.records import BiasStore, KnownImu
 from tests import bench_daemon, bench_replay, bench_start
 from tests.support.component import ScriptedGate
 from tests.support.decoders import make_decoder

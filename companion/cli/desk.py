@@ -281,8 +281,7 @@ async def flight(options: argparse.Namespace) -> int:
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
     """Read what the companion has on disk, and give its store of flights; None: this user may not."""
-    from companion.storage.learned import BiasStore
-    from companion.storage.records import FlightStore, RecordStore
+    from companion.storage.records import BiasStore, FlightStore, RecordStore
 
     directory = storage_path(options)
     try:

@@ -25,7 +25,6 @@ from companion.links.system.listeners import Listeners
 CATCH_UPS: Final = 3
 """Most estimates in a row: while one is computed the next may become due."""
 TICK_S: Final = 0.2
-"""Interval at which the collector is told the time."""
 Handler = Callable[[Any, str], AsyncIterator[Object]]
 """Answers a `Command` that came through an interface (second), with any number of replies."""
 Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]

@@ -6,15 +6,14 @@ import asyncio
 from collections.abc import Callable
 from typing import Final
 
-import msgspec
-
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
-from companion.estimation.records.record import Record, WrittenParameter
+from companion.estimation.records.record import Record
 from companion.estimation.request import What
+from companion.formats import Object
 from companion.links.system.waiting import comes
-from companion.storage.changes import BY_TEMPERATURE, ChangeSet
+from companion.storage.changes import BY_TEMPERATURE
 
 ALIGNMENT: Final = "gradienter alignment"
 FACES: Final = "measurement on all sides"
@@ -24,23 +23,6 @@ NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 
 GoOn = Callable[[str], None]
 """Called now and then with words for progress; raises `JobCancelledError`."""
-
-
-class Undone(msgspec.Struct, frozen=True):
-    """One undone step."""
-
-    step: ChangeSet
-    written: dict[str, WrittenParameter]
-    """Restored parameters; fewer than in the step where others have changed some."""
-    by_hand: bool
-    """An alignment or a temperature curve was undone; the last calibration stays."""
-
-
-class CurvesWritten(msgspec.Struct, frozen=True):
-    """Curves over temperature that were written to the autopilot."""
-
-    imus: dict[str, dict[str, WrittenParameter]]
-    warnings: tuple[str, ...]
 
 
 class JobCancelledError(Exception):
@@ -70,7 +52,9 @@ class Job:
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
         """Loop time by which measuring must end; None: no limit."""
         self.finished: asyncio.Future[JobResult] = loop.create_future()
-        self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Undone | CurvesWritten | None = None
+        self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Object | None = None
+        self.undid_calibration = kind == "undo"
+        """False also where an alignment or a temperature curve was undone: the last calibration stays."""
         self.words = ""
         """Present activity, for people."""
         self.hold_still_s: int | None = None
@@ -95,11 +79,6 @@ class Job:
     def record(self) -> Record | None:
         """Record of a calibration."""
         return self.product if isinstance(self.product, Record) else None
-
-    @property
-    def undid_calibration(self) -> bool:
-        """Return whether a calibration was undone."""
-        return self.kind == "undo" and not (isinstance(self.product, Undone) and self.product.by_hand)
 
     @property
     def short(self) -> str:

@@ -7,7 +7,6 @@ to an autopilot: only parameters that the companion writes are accepted, within 
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -20,8 +19,6 @@ from companion.autopilot.parameters.change import Change
 from companion.errors import StorageError
 from companion.formats import Object
 from companion.storage.state import BoundedList, StateFile, numbers_in, remove_durably, write_atomically
-
-logger = logging.getLogger(__name__)
 
 _UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
@@ -160,9 +157,6 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         return Undoable(self.system_id, (left, *steps[1:]) if left.changes else steps[1:])
 
 
-ChangeFile = StateFile[ChangeSet]
-
-
 class ChangeLog:
     """The change files of one storage folder."""
 
@@ -170,7 +164,7 @@ class ChangeLog:
         self._directory = directory
         self._allowed = {name: one for each in CALIBRATION.values() for name, one in each.items()}
         self._probe = directory / "probe"
-        self.journal: ChangeFile = StateFile(directory / "journal.json", ChangeSet, self._check)
+        self.journal: StateFile[ChangeSet] = StateFile(directory / "journal.json", ChangeSet, self._check)
 
     def undo_of(self, system_id: int) -> StateFile[Undoable]:
         """The values from before the last finished writes on one vehicle."""
@@ -189,11 +183,7 @@ class ChangeLog:
             return []  # `check_writable` has said so
 
     def check_writable(self) -> None:
-        """Find out now, not at the first write, whether anything can be kept here.
-
-        Raises:
-            StorageError: it cannot.
-        """
+        """Raise StorageError now, not at the first write, where nothing can be kept here."""
         write_atomically(self._probe, b"")
         remove_durably(self._probe)
 
@@ -230,33 +220,19 @@ class Interruption(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
     """Result of the restore, for people."""
 
-
-class Interruptions:
-    """List of interruptions on disk, with the pending one in front."""
-
-    def __init__(self, directory: Path) -> None:
-        self._file = BoundedList(directory / "interrupted.json", Interruption, KEEP_INTERRUPTIONS)
-
-    def keep(self, step: ChangeSet, reason: str, ended_at: str) -> None:
-        """Add an interruption that is over; blocking."""
-        try:
-            self._file.append(_interruption(step, reason, ended_at))
-        except StorageError as error:
-            logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
-
-    def history(self, pending: ChangeSet | None) -> list[Object]:
-        """All interruptions, the latest first; blocking. `pending`: the write whose restore is to come."""
-        now = [] if pending is None else [_interruption(pending, PENDING, None)]
-        return [msgspec.to_builtins(each) for each in (*now, *reversed(self._file.read()))]
+    @classmethod
+    def of(cls, step: ChangeSet, reason: str = PENDING, ended_at: str | None = None) -> Interruption:
+        """Describe the interrupted write of this step."""
+        return cls(
+            what=step.origin.what,
+            began_at=step.origin.at,
+            ended_at=ended_at,
+            system_id=step.system_id,
+            parameters=tuple(step.names),
+            reason=reason,
+        )
 
 
-def _interruption(step: ChangeSet, reason: str, ended_at: str | None) -> Interruption:
-    origin = step.origin
-    return Interruption(
-        what=origin.what,
-        began_at=origin.at,
-        ended_at=ended_at,
-        system_id=step.system_id,
-        parameters=tuple(step.names),
-        reason=reason,
-    )
+def interruptions_in(directory: Path) -> BoundedList[Interruption]:
+    """Return the list of interruptions that are over, `interrupted.json` in a storage directory."""
+    return BoundedList(directory / "interrupted.json", Interruption, KEEP_INTERRUPTIONS)

@@ -64,11 +64,7 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check_name(name: str) -> None:
-    """Check that a profile may be saved under this name.
-
-    Raises:
-        StorageError: it is the catalogue's, or no name for a file; says what is allowed.
-    """
+    """Raise StorageError where a profile may not be saved under this name: the catalogue's, or no name for a file."""
     if _plain(name) in CATALOGUE:
         raise StorageError(f"profile {name!r}: that name is the catalogue's; allowed: another one")
     if not _NAME.fullmatch(name):
@@ -93,19 +89,11 @@ class ProfileStore:
         return self._folder / f"{name}.json"
 
     def names(self) -> list[str]:
-        """List all profiles, whether they can be read or not.
-
-        Raises:
-            StorageError: the folder cannot be listed.
-        """
+        """List all profiles, unreadable ones too; raises StorageError."""
         return named_in(self._folder, _FILE)
 
     def read(self, name: str) -> SavedProfile:
-        """Read one profile.
-
-        Raises:
-            StorageError: one line: it cannot be read, is damaged, or of a newer version.
-        """
+        """Read one profile; raises StorageError in one line."""
         path = self.path(name)
         found = read_profile(path)
         if found.name != name:
@@ -113,11 +101,7 @@ class ProfileStore:
         return found
 
     def write(self, profile: SavedProfile) -> Path:
-        """Save a profile, in the place of one of that name; return its file.
-
-        Raises:
-            StorageError: the name is not allowed, or the file could not be written.
-        """
+        """Save a profile, in the place of one of that name; return its file. Raises StorageError."""
         check_name(profile.name)
         path = self.path(profile.name)
         # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.
@@ -127,11 +111,7 @@ class ProfileStore:
 
 
 def read_profile(path: Path) -> SavedProfile:
-    """Read a profile from a file, wherever that lies and whatever it is called.
-
-    Raises:
-        StorageError: one line: it cannot be read, is damaged, or of a newer version.
-    """
+    """Read a profile from any file; raises StorageError in one line: unreadable, damaged, or of a newer version."""
     try:
         found: SavedProfile = formats.decode(unsealed(read_regular(path)), SavedProfile, FORMAT_VERSION)
         for model in (found.gyro, found.accel):

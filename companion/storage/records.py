@@ -1,8 +1,12 @@
-"""Numbered files of a storage directory: the calibrations in `records`, and the flights read from logs in `flights`."""
+"""Files of results: records of calibrations and flights, and what later calibrations learn from.
+
+Numbered files in `records` and `flights`; alignments, armings, biases of each IMU, the time in our signatures.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator
 from itertools import islice
@@ -12,11 +16,11 @@ from typing import Any, ClassVar, Final, Generic, TypeVar
 import msgspec
 
 from companion.errors import StorageError
-from companion.estimation.records import flight_record, record
+from companion.estimation.records import align_record, flight_record, history, record
 from companion.estimation.records.flight_record import KeptFlight
-from companion.estimation.records.record import Record
+from companion.estimation.records.record import ArmingRecord, Record
 from companion.storage.changes import ChangeSet
-from companion.storage.state import StateFile, numbers_in
+from companion.storage.state import BoundedList, StateFile, numbers_in
 
 logger = logging.getLogger(__name__)
 
@@ -39,11 +43,7 @@ class NumberedFiles(Generic[T]):
         self.folder = directory / self.name
 
     def numbers(self) -> list[int]:
-        """List all numbers, ascending, of unreadable files too.
-
-        Raises:
-            StorageError: the folder cannot be listed.
-        """
+        """List all numbers, ascending, of unreadable files too; raises StorageError."""
         return numbers_in(self.folder, _NAME)
 
     def file(self, number: int) -> StateFile[T]:
@@ -51,11 +51,7 @@ class NumberedFiles(Generic[T]):
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
-        """Add a file; return its number.
-
-        Raises:
-            StorageError: it could not be written; nothing is half written.
-        """
+        """Add a file; return its number. Raises StorageError; nothing is half written."""
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 1
         self.file(number).write(value)
@@ -67,11 +63,7 @@ class NumberedFiles(Generic[T]):
         return number
 
     def latest(self) -> Iterator[tuple[int, T]]:
-        """Yield numbers and contents, the newest first; an unreadable file is logged and skipped.
-
-        Raises:
-            StorageError: the folder cannot be listed.
-        """
+        """Yield numbers and contents, the newest first, without unreadable files; raises StorageError."""
         for number in reversed(self.numbers()):
             try:
                 found = self.file(number).read()
@@ -96,11 +88,7 @@ class RecordStore(NumberedFiles[Record]):
         return list(self.newest(limit).values())
 
     def mark_undone(self, step: ChangeSet, undone_at: str) -> list[str]:
-        """Note in the records of what was written in this step that it was put back; returns when they had begun.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Note in the records of a step that it was undone; return their `started_at`. Raises StorageError."""
         found: dict[int, Record] = {}
         for number, each in self.latest():
             if each.undone_at or each.state != "done" or each.system_id != step.system_id:
@@ -136,3 +124,122 @@ class FlightStore(NumberedFiles[KeptFlight]):
                 self.file(number).write(value)
                 return number
         return super().save(value)
+
+
+def alignment_in(directory: Path) -> StateFile[align_record.AlignmentRecord]:
+    """Return the alignment, `alignment.json` in a storage directory."""
+    kind, newest = align_record.AlignmentRecord, align_record.FORMAT_VERSION
+    return StateFile(directory / "alignment.json", kind, align_record.check, newest)
+
+
+def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
+    """Return the measurement of all sides, `faces.json` in a storage directory."""
+    kind, newest = align_record.FacesRecord, align_record.FORMAT_VERSION
+    return StateFile(directory / "faces.json", kind, align_record.check, newest)
+
+
+class Done(msgspec.Struct, frozen=True, kw_only=True):
+    """Outcome of one alignment."""
+
+    what: str
+    """"zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1."""
+    state: str
+    """"done", "failed", or "predicted" of version 0.1."""
+    measured_at: str
+    reason: str
+    system_id: int | None
+    written: dict[str, float]
+    """Values in the autopilot, by parameter."""
+    undone_at: str | None = None
+
+
+KEEP_DONE: Final = 50
+KEEP_ARMINGS: Final = 200
+"""A season of flying, below 100 kB at some 400 bytes each."""
+
+
+def alignments_in(directory: Path) -> BoundedList[Done]:
+    """Return the list of the latest alignments, `by-hand.json` in a storage directory."""
+    return BoundedList(directory / "by-hand.json", Done, KEEP_DONE)
+
+
+def armings_in(directory: Path) -> BoundedList[ArmingRecord]:
+    """Return the list of the latest armings, `armings.json` in a storage directory."""
+    return BoundedList(directory / "armings.json", ArmingRecord, KEEP_ARMINGS)
+
+
+BIASES_VERSION: Final = 2
+KEEP_IMUS: Final = 8
+
+
+class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
+    """Identity and points of one IMU, oldest first."""
+
+    identity: dict[str, str]
+    points: tuple[history.Point, ...] = ()
+
+
+class _File(msgspec.Struct, frozen=True, kw_only=True):
+    imus: dict[str, KnownImu]
+    format_version: int = BIASES_VERSION
+
+
+class BiasStore:
+    """`biases.json` in the storage directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=BIASES_VERSION)
+
+    def read(self) -> dict[str, KnownImu]:
+        """Read the IMUs; a file that cannot be used is set aside, since nothing depends on it."""
+        found = self._file.load()
+        return {} if found is None else found.imus
+
+    def all(self) -> dict[str, KnownImu]:
+        """Read the IMUs, and set nothing aside; raises StorageError."""
+        found = self._file.read()
+        return {} if found is None else found.imus
+
+    def write(self, imus: dict[str, KnownImu]) -> None:
+        """Write the latest IMUs; after a StorageError what was there before still is."""
+        latest = sorted(imus, key=lambda name: max((point.unix_s for point in imus[name].points), default=0.0))
+        self._file.write(_File(imus={name: imus[name] for name in latest[-KEEP_IMUS:]}))
+
+
+SIGNING_FILE: Final = "mavlink-signing-time.json"
+MOST_UPTIME_S: Final = 3.2e9
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+
+
+class SigningTime(msgspec.Struct, frozen=True):
+    """Latest time in our signatures. Ticks are 10 us since 2015."""
+
+    ticks: int
+    reserved: int
+    """Largest tick that may have been used before the next write."""
+    uptime_s: float
+    """Uptime of the board at the write."""
+    boot_id: str
+    """Boot of the board; empty: unknown."""
+
+
+def this_boot() -> str:
+    """Return the boot id of the running kernel; empty where it is unknown."""
+    # The service's unit hides the file, and hands the id over instead.
+    handed = os.environ.get("COMPANION_BOOT_ID", "")
+    if handed:
+        return handed.replace("-", "")
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip().replace("-", "")
+    except OSError:
+        return ""
+
+
+def signing_time_in(directory: Path) -> StateFile[SigningTime]:
+    """Return the signing time of a storage directory."""
+    return StateFile(directory / SIGNING_FILE, SigningTime, _check_time)
+
+
+def _check_time(found: SigningTime) -> None:
+    if not 0 <= found.ticks <= found.reserved < 2**48 or not 0.0 <= found.uptime_s < MOST_UPTIME_S:
+        raise msgspec.ValidationError(f"ticks {found.ticks} to {found.reserved} at {found.uptime_s:g} s cannot be")

@@ -30,10 +30,7 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o600, parents: boo
     """Replace a file's content so that a power cut at any byte leaves the old or the new content.
 
     Temporary file in the same folder, fsync, rename, fsync of the folder. The folder is created if its parent exists:
-    a typing error in a path must not create a tree. `parents` creates the whole path.
-
-    Raises:
-        StorageError: one line that names the file and the operating system's reason.
+    a typing error in a path must not create a tree. `parents` creates the whole path. Raises StorageError in one line.
     """
     try:
         path.parent.mkdir(parents=parents, exist_ok=True)
@@ -55,11 +52,7 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o600, parents: boo
 
 
 def remove_durably(path: Path) -> None:
-    """Remove a file so that it stays removed after a power cut; a file already gone is no error.
-
-    Raises:
-        StorageError: one line that names the file and the operating system's reason.
-    """
+    """Remove a file, if there is one, so that it stays removed after a power cut; raises StorageError in one line."""
     try:
         path.unlink(missing_ok=True)
         if path.parent.is_dir():
@@ -96,12 +89,7 @@ T = TypeVar("T")
 
 
 def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """The content of a regular file, or of a link to one; never waits for anybody.
-
-    Raises:
-        FileNotFoundError: there is none.
-        OSError: it cannot be read, is no regular file, or a longer one.
-    """
+    """Read a regular file, or a link to one, without ever waiting; raises OSError, also for a longer file."""
     # Looked at before it is opened: a device may do something when it is.
     _require_regular(path.stat())
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY), "rb") as file:
@@ -113,11 +101,7 @@ def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
-    """The first group of such names of files, in order; none where there is no folder.
-
-    Raises:
-        StorageError: it cannot be listed.
-    """
+    """Return the first group of such file names, sorted; empty where there is no folder; raises StorageError."""
     try:
         names = [entry.name for entry in folder.iterdir()]
     except FileNotFoundError:
@@ -145,11 +129,7 @@ def sealed(data: bytes) -> bytes:
 
 
 def unsealed(data: bytes) -> bytes:
-    """The JSON without its checksum, which fits; as it is where there is none.
-
-    Raises:
-        msgspec.ValidationError: it does not fit.
-    """
+    """Return the JSON without its checksum, if it has one; raises msgspec.ValidationError where that does not fit."""
     seal = _SEAL.search(data, max(0, len(data) - _SEAL_BYTES))
     if seal is None:
         return data
@@ -176,11 +156,7 @@ class StateFile(Generic[T]):
         """Error of the last `load`, in one line; None: there was none."""
 
     def read(self) -> T | None:
-        """Read the file; None: there is none.
-
-        Raises:
-            StorageError: it cannot be used: where and why, in one line.
-        """
+        """Read the file; None: there is none. Raises StorageError, where and why in one line."""
         try:
             return self._of(read_regular(self.path))
         except (FileNotFoundError, NotADirectoryError):
@@ -208,11 +184,7 @@ class StateFile(Generic[T]):
             return None
 
     def write(self, value: T) -> None:
-        """Replace the content.
-
-        Raises:
-            StorageError: it could not be written, or is nothing that may be; what was there before still is.
-        """
+        """Replace the content; after a StorageError what was there before still is."""
         try:
             data = sealed(msgspec.json.encode(value))
             # What could not be read again would cost what was there before, too.
@@ -222,11 +194,7 @@ class StateFile(Generic[T]):
         write_atomically(self.path, data, mode=self._mode)
 
     def clear(self) -> None:
-        """Remove the file.
-
-        Raises:
-            StorageError: the file could not be removed.
-        """
+        """Remove the file; raises StorageError."""
         remove_durably(self.path)
 
 
@@ -257,27 +225,15 @@ class BoundedList(Generic[T]):
         return _listed(self._file.load())[-self._keep :]
 
     def all(self) -> list[T]:
-        """All entries, for whoever changes nothing.
-
-        Raises:
-            StorageError: the file cannot be used.
-        """
+        """Return all entries, and set nothing aside; raises StorageError."""
         return _listed(self._file.read())
 
     def append(self, entry: T) -> None:
-        """Add an entry.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Add an entry; raises StorageError."""
         self.write([*self.read(), entry][-self._keep :])
 
     def write(self, entries: list[T]) -> None:
-        """Replace the entries.
-
-        Raises:
-            StorageError: they could not be written.
-        """
+        """Replace the entries; raises StorageError."""
         self._file.write(_Entries(entries))
 
 

@@ -15,8 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.estimation.records.history import PowerUp
 from companion.estimation.records.record import Record
-from companion.storage.learned import BiasStore
-from companion.storage.records import RecordStore
+from companion.storage.records import BiasStore, RecordStore
 from sim.devices import HMR3300
 from sim.motions import SlowTurn
 from tests.e2e.test_attitude_push import Firmware, Flight, Vision, flight

@@ -12,7 +12,7 @@ import pytest
 
 from companion.errors import RequestRefusedError
 from companion.estimation.records.history import PowerUp
-from companion.storage.learned import BiasStore
+from companion.storage.records import BiasStore
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import GYRO_BIAS_DEG_H, Rig
 

@@ -14,8 +14,15 @@ from hypothesis import strategies as st
 from companion.daemon.offsets.reboot import owed_in
 from companion.estimation.records.record import ArmingRecord
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import SIGNING_FILE, BiasStore, Done, alignment_in, faces_in, signing_time_in
-from companion.storage.records import RecordStore
+from companion.storage.records import (
+    SIGNING_FILE,
+    BiasStore,
+    Done,
+    RecordStore,
+    alignment_in,
+    faces_in,
+    signing_time_in,
+)
 from companion.storage.state import BoundedList, sealed
 
 NAMES = st.sampled_from(

@@ -20,7 +20,7 @@ import pytest
 
 from companion.estimation.records.history import Point, PowerUp
 from companion.physics.frames import vector
-from companion.storage.learned import BiasStore
+from companion.storage.records import BiasStore
 from sim.companion_process import CompanionProcess
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG

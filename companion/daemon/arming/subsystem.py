@@ -25,8 +25,7 @@ from companion.estimation.records.record import ArmingRecord
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
-from companion.storage.learned import armings_in
-from companion.storage.records import FlightStore
+from companion.storage.records import FlightStore, armings_in
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from companion.daemon.devices.subsystem import Devices
 from companion.daemon.stands.alignment import ActiveAlignment
 from companion.estimation.records.align_record import ImuAlignmentRecord
 from companion.estimation.records.history import PowerUp
-from companion.storage.learned import this_boot
+from companion.storage.records import this_boot
 
 _IN_WORDS: Final = {
     "system": "vehicle",

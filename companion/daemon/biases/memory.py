@@ -42,7 +42,7 @@ from companion.estimation.temperature.curve import Along, Curve, settling
 from companion.formats import Object
 from companion.physics.frames import Array, vector
 from companion.samples import TRIADS, Triad, Vector
-from companion.storage.learned import BiasStore, KnownImu
+from companion.storage.records import BiasStore, KnownImu
 
 logger = logging.getLogger(__name__)
 
@@ -113,14 +113,6 @@ class Curves:
         return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
 
-class _Reference(msgspec.Struct):
-    """The last good calibration of one triad in this power-up."""
-
-    session: str
-    point: Point
-    contradicted: int = 0
-
-
 class BiasMemory:
     """Predicts biases before a result is used, and remembers the result."""
 
@@ -131,7 +123,8 @@ class BiasMemory:
         self.curves = Curves(core, devices.imus)
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
-        self._today: dict[tuple[str, Triad], _Reference] = {}
+        self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
+        """Session, point and count of contradictions of the last good calibration in this power-up, by triad."""
         self._now_degc: dict[str, float | None] = {}
         self._written_s = -math.inf
 
@@ -218,10 +211,10 @@ class BiasMemory:
         profile = noise_profile(self._profiles.of(name))
 
         def today(triad: Triad) -> Prediction | None:
-            last = self._today.get((name, triad))
-            if last is None or last.session != session:
+            then, point, _ = self._today.get((name, triad), (None, now, 0))
+            if then != session:
                 return None
-            return expect_today(last.point, triad, now, effect, profile.of(triad), self.curves.of(name, triad))
+            return expect_today(point, triad, now, effect, profile.of(triad), self.curves.of(name, triad))
 
         return ExpectedImu(
             name=name,
@@ -310,7 +303,7 @@ class BiasMemory:
         for name, known in self._known.items():
             left = tuple(point for point in known.points if point.started_at not in started)
             self._known[name] = msgspec.structs.replace(known, points=left)
-        self._today = {key: ref for key, ref in self._today.items() if ref.point.started_at not in started}
+        self._today = {key: ref for key, ref in self._today.items() if ref[1].started_at not in started}
         await self._write()
 
     async def _write(self) -> None:
@@ -326,12 +319,12 @@ class BiasMemory:
         found = point.of(triad)
         if found is None:
             return
-        session, before = self.identities.session(name), self._today.get((name, triad))
-        same = before is not None and before.session == session and before.point.zero == point.zero
-        if before is not None and same and found.is_outlier and before.contradicted < 2:
-            before.contradicted += 1
-            return
-        self._today[name, triad] = _Reference(session, point)
+        session = self.identities.session(name)
+        then, before, contradicted = self._today.get((name, triad), (None, point, 0))
+        if found.is_outlier and then == session and before.zero == point.zero and contradicted < 2:
+            self._today[name, triad] = session, before, contradicted + 1
+        else:
+            self._today[name, triad] = session, point, 0
 
     # --- what is known
 

@@ -19,7 +19,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Tune, Weight
 from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
-from companion.daemon.job import Job, JobCancelledError, Undone
+from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.stands.alignment import ByHand
 from companion.errors import CompanionError, StorageError
@@ -97,7 +97,6 @@ class CalibrationManager:
         self.job: Job | None = None
         """The running or the latest job."""
         self.reason = ""
-        """Reason for the present state, in words."""
         self.last: Record | None = None
         """Record of the latest calibration, loaded from disk at start."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
@@ -220,7 +219,6 @@ class CalibrationManager:
         return None
 
     def _automatic_run(self) -> Job | None:
-        """Return the automatic calibration under way, while disarmed."""
         job = self.running
         return job if job is not None and job.automatic and self._vehicle.arm_state is ArmState.DISARMED else None
 
@@ -243,7 +241,6 @@ class CalibrationManager:
     # --- one job to its end
 
     async def _finish(self, job: Job, work: Awaitable[str]) -> None:
-        """Await the work, keep what it has made, and end the job."""
         try:
             result = JobResult("done", await work)
         except JobCancelledError as cancelled:
@@ -275,7 +272,8 @@ class CalibrationManager:
 
     async def _undo(self, job: Job, *, force: bool) -> str:
         step, written = await self._recovery.undo(force=force)
-        job.product = Undone(step, written, await self._note_undone(step))
+        job.undid_calibration = await self._note_undone(step)
+        job.product = {"written": msgspec.to_builtins(written), "undone": step.shown()}
         self._machine.on(Event.CONCLUDED)
         return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 
@@ -302,7 +300,7 @@ class CalibrationManager:
         """Note that the recovery has ended an interrupted write, or an undo."""
         if undone:
             job = Job("undo", What.BOTH, "recovery")
-            job.product = Undone(step, {}, await self._note_undone(step))
+            job.undid_calibration = await self._note_undone(step)
             result = JobResult("done", words)
             self.on_ended.tell(job, result)
             job.finish(result)
@@ -311,7 +309,6 @@ class CalibrationManager:
     # --- records
 
     async def _keep(self, record: Record) -> None:
-        """Save a record; report a failure."""
         self.last = record
         try:
             if record.is_worth_keeping:
@@ -321,10 +318,10 @@ class CalibrationManager:
             self._core.say(Severity.WARNING, f"Record not kept: {error}")
 
     async def _note_undone(self, step: ChangeSet) -> bool:
-        """Note in the history that a step was undone; returns whether it was no calibration's."""
+        """Note in the history that a step was undone; return whether it was a calibration's."""
         if step.origin.what in BY_HAND:
             await self._by_hand.undone(step)
-            return True
+            return False
         now = utc_now()
         try:
             marked: list[str] = await self._core.offload(self._store.mark_undone, step, now)
@@ -334,4 +331,4 @@ class CalibrationManager:
         if self.last is not None and self.last.started_at in marked:
             self.last = msgspec.structs.replace(self.last, undone_at=now)
         await self._parts.memory.forget(marked)
-        return not (marked or step.origin.what)
+        return bool(marked or step.origin.what)

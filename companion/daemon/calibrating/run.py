@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from companion.autopilot.firmware.firmwares import read_calibration
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_of
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.component.service import WRITTEN_PERCENT, JobResult
 from companion.component.statustext import Severity, Tune
@@ -30,7 +30,6 @@ from companion.daemon.offsets.plan import (
     Plan,
     WriteLog,
     as_good,
-    plan_for,
     refuse_shared,
     residual_of_consumer,
     warnings_of,
@@ -51,6 +50,7 @@ from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.estimation.solution.truth import Otherwise
 from companion.links.system.listeners import Listeners
+from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.changes import AUTOMATIC
 
@@ -103,7 +103,6 @@ class CalibrationRun(Job):
         self.before, self.system_id = before, parts.core.vehicle.system_id
         self.begun_s = asyncio.get_running_loop().time()
         self.log = WriteLog()
-        """Written parameters, and warnings."""
         self.alignment: AlignmentUsed | None = None
         """Active alignment of the gradienter; None: zero and sigma of the configuration."""
         self.device_ids: dict[str, tuple[int | None, int | None]] = {}
@@ -113,7 +112,6 @@ class CalibrationRun(Job):
         self._forget()
 
     def _forget(self) -> None:
-        """Clear the results of all phases."""
         self.measured: Window | None = None
         """Window of telemetry under the active offsets."""
         self.solution: Solution | None = None
@@ -184,7 +182,6 @@ class CalibrationRun(Job):
     # --- the phases
 
     async def _measure(self) -> None:
-        """Wait until it is still and average."""
         while True:
             self.measured = await self._measuring.measure(self)
             if await self._offsets.offsets_still_hold():
@@ -248,7 +245,8 @@ class CalibrationRun(Job):
                 continue
             self.log.warn(estimate.name, *rivalry.left_of(calibration))
             if push:
-                target = plan_for(found.name, calibration, residual, watched=imu is not None)
+                changes = changes_for(calibration, *(None if each is None else vector(each) for each in residual))
+                target = ImuPlan(found.name, calibration, tuple(changes), residual, watched=imu is not None)
                 self.log.warn(target.name, *warnings_of(target, found))
                 targets.append(target)
         refuse_shared(targets, slots)
@@ -270,7 +268,6 @@ class CalibrationRun(Job):
         return kept
 
     async def _write_and_settle(self) -> None:
-        """Write the plan, watch its effect in the telemetry, and wait until the autopilot uses it."""
         assert self.plan is not None
         assert self.measured is not None
         if not self.plan.changes:

@@ -8,17 +8,21 @@ from functools import partial
 from typing import Final, Literal
 
 import msgspec
+import numpy as np
 
+from companion.autopilot.firmware.imu_calibration import Thermal
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.commands import Align, Calibrate, Cancel, Temperature, Undo
-from companion.component.service import Refusal
-from companion.daemon.biases.into_autopilot import IntoAutopilot
-from companion.daemon.biases.memory import BiasMemory
+from companion.component.service import MEASURED_PERCENT, Refusal
+from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.core import Core, Handler, Subsystem
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undone
+from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
+from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition, ByHand
 from companion.daemon.stands.measuring import Estimator, Measuring
@@ -27,13 +31,17 @@ from companion.daemon.stands.tasks import SidesTask, TurnTask, ZeroTask
 from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
 from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise
+from companion.estimation.temperature.curve import Curve, Polynomial, of_curve
 from companion.formats import Object
 from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
+from companion.storage.changes import BY_TEMPERATURE
 from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2
@@ -47,7 +55,6 @@ _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
     "turn": TURN,
     "faces": FACES,
 }
-"""Kind of job by action of an alignment."""
 
 
 class Calibrating(Subsystem):
@@ -130,7 +137,6 @@ class Calibrating(Subsystem):
         yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
 
     async def _temperature(self, asked: Temperature, face: str) -> AsyncIterator[Object]:
-        """Show the curves, write them, or undo their write."""
         into = self._into_autopilot
         if asked.action == "undo":
             await self._hear()
@@ -158,13 +164,11 @@ class Calibrating(Subsystem):
         await self._hear()
         job = _accepted(self.manager.start_undo(f"{face} undo", force=asked.force))
         result = await asyncio.shield(job.finished)
-        undone = job.product if isinstance(job.product, Undone) else None
         yield {
             "kind": "result",
             "state": result.outcome,
             "reason": result.reason,
-            "written": {} if undone is None else msgspec.to_builtins(undone.written),
-            "undone": None if undone is None else undone.step.shown(),
+            **(job.product if isinstance(job.product, dict) else {"written": {}, "undone": None}),
             "undoable": self._offsets.undoable(),
         }
 
@@ -174,7 +178,6 @@ class Calibrating(Subsystem):
             await comes(vehicle.found, HEARD_WITHIN_S)
 
     async def _align(self, asked: Align, face: str) -> AsyncIterator[Object]:
-        """Show, forget or measure the alignment."""
         if asked.action == "show":
             yield {"kind": "result", **self._shown()}
         elif asked.action == "forget":
@@ -273,3 +276,102 @@ def _accepted(answer: Job | Refusal) -> Job:
     if isinstance(answer, Refusal):
         raise RequestRefusedError(answer.kind, answer.reason)
     return answer
+
+
+class IntoAutopilot:
+    """Writes bias curves over temperature to the autopilot's own temperature calibration, of all IMUs or of none.
+
+    The output at the present temperature stays, and that is verified.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        imus: Mapping[str, AutopilotImu],
+        measuring: Measuring,
+        memory: BiasMemory,
+        offsets: Offsets,
+    ) -> None:
+        self._core, self._imus, self._measuring, self._memory = core, imus, measuring, memory
+        self._offsets = offsets
+
+    def why_no_undo(self) -> str | None:
+        """Return why the write of curves cannot be undone; None where it is the latest write."""
+        steps = self._offsets.ledger.steps(self._core.vehicle.system_id)
+        after = [step.origin.what or "a write" for step in steps]
+        if BY_TEMPERATURE not in after:
+            return "no curve was written that could be undone"
+        later = after[: after.index(BY_TEMPERATURE)]
+        return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
+
+    async def run(self, job: Job, *, overwrite: bool) -> str:
+        """Measure, write and verify; return in words what was written.
+
+        `overwrite`: replace a temperature calibration that is not ours. After an error or a cancel the old values are
+        restored, or the error names those that are not.
+        """
+        log = WriteLog()
+        await self._core.offload(self._memory.follow)
+        self._measuring.begin()
+        window = await self._measuring.measure(job)
+        if not await self._offsets.offsets_still_hold():
+            raise CalibrationRefusedError("the autopilot's values were changed in between: try again")
+        job.progress(MEASURED_PERCENT, "reading the autopilot's temperature calibration")
+        targets, words, left = await self._find(window, overwrite=overwrite)
+        if not targets:
+            raise CalibrationRefusedError("; ".join(left or ["no IMU of the autopilot was measured"]))
+        log.warnings += left
+        if not any(target.all for target in targets):
+            self._core.machine.on(Event.NOTHING_TO_WRITE)
+            return "already in force"
+        plan = await self._offsets.write(job, Plan(tuple(targets), self._core.vehicle.boots), window, log)
+        await self._offsets.settle(job, plan, window, log)
+        warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
+        job.product = {"imus": log.written, "warnings": warnings}
+        return f"written: {'; '.join(words)}"
+
+    async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[ImuPlan], list[str], list[str]]:
+        """Return the targets of the write, their words, and why other IMUs are left as they are."""
+        exchanged = self._memory.forgotten()  # the curve of an IMU that was replaced must not be written
+        targets: list[ImuPlan] = []
+        words: list[str] = []
+        left: list[str] = []
+        for means in (means for means in window.imus if means.name in self._imus):
+            name, degc = means.name, means.temperature_degc
+            curve, calibration = self._memory.curves.of(name, "gyro"), self._imus[name].in_force
+            enabled_by = calibration.thermal.enabled_by
+            if curve is None:
+                left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
+            elif degc is None:
+                left.append(f"imu {name}: it tells no temperature now")
+            elif enabled_by and not overwrite and not self._is_ours(calibration.thermal):
+                left.append(
+                    f"imu {name}: {enabled_by} is on, and not by the companion: kept"
+                    " (companion temperature --overwrite replaces it)"
+                )
+            else:
+                gyro, accel = of_curve(curve, calibration.orientation), self._of_accelerometers(name, curve)
+                kind, parameters = self._core.vehicle.kind, self._core.parameters
+                changes = await kind.thermal_changes(parameters, calibration, gyro, accel, degc)
+                named = {change.parameter for target in targets for change in target.unseen}
+                unseen = tuple(change for change in changes if change.parameter not in named)
+                targets.append(ImuPlan(name, calibration, (), (np.zeros(3), np.zeros(3)), watched=True, unseen=unseen))
+                low, high = curve.span_degc
+                words.append(f"{name}, {low:.0f} to {high:.0f} degC")
+        return targets, words, left
+
+    def _of_accelerometers(self, name: str, gyro: Curve) -> Polynomial | None:
+        """Return the accelerometers' curve if it spans the gyros' temperatures: an autopilot has one span for both."""
+        curve, calibration = self._memory.curves.of(name, "accel"), self._imus[name].in_force
+        if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
+            return None
+        return of_curve(curve, calibration.orientation, calibration.accel_scale)
+
+    def _is_ours(self, thermal: Thermal) -> bool:
+        """Return whether the values are those of our latest write."""
+        ours: dict[str, float | None] = {}
+        for step in reversed(self._offsets.ledger.steps(self._core.vehicle.system_id)):
+            if step.origin.what == BY_TEMPERATURE:
+                ours |= {one.parameter: one.after for one in step.changes}
+        found = [(ours[name], value) for name, value in thermal.values.items() if name in ours]
+        return bool(found) and all(after is not None and same_float32(after, now) for after, now in found)

@@ -17,7 +17,7 @@ from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EARLIEST_S, TICKS_PER_S, Reason, Signing, read_key, ticks_of, uptime_s
-from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in, this_boot
+from companion.storage.records import SIGNING_FILE, SigningTime, signing_time_in, this_boot
 
 logger = logging.getLogger(__name__)
 

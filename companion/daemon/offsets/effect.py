@@ -205,7 +205,6 @@ def judge_vectors(
 
 
 def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
-    """Return mean, sigma_stat and sigma_use of one triad."""
     if triad == "gyro":
         return window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s
     return window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2

@@ -57,11 +57,7 @@ class FirmwareCalibration:
         self._writer, self._ledger, self._ekf = writer, ledger, EkfWatch(core.vehicle)
 
     async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> dict[str, float] | None:
-        """Read what it would overwrite; None when it is not worth it, or not allowed (then `warn` is called).
-
-        Raises:
-            AutopilotError: the autopilot does not answer.
-        """
+        """Read what it would overwrite; None when it is not worth it, or not allowed (then `warn` is called)."""
         if not self._vehicle.kind.gyro_calibration_resets_ekf or not gyros or self._on_deck:
             # On a deck its mean of half a second is the deck's rate, and would be written to all its gyros.
             return None

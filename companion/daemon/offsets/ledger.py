@@ -26,7 +26,7 @@ from companion.daemon.offsets.reboot import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object, utc_now
-from companion.storage.changes import ChangeLog, ChangeSet, Interruptions, Undoable
+from companion.storage.changes import ChangeLog, ChangeSet, Interruption, Undoable, interruptions_in
 
 logger = logging.getLogger(__name__)
 
@@ -131,32 +131,20 @@ class Ledger:
             self._orphaned.set()
 
     async def update_pending(self, changes: ChangeSet) -> None:
-        """Replace the kept changes of a transaction, before any of the new ones is made.
-
-        Raises:
-            StorageError: as `transaction`; the earlier changes are still kept.
-        """
+        """Replace the kept changes before any new one is made; after a StorageError the earlier ones are still kept."""
         if self._open is not None:
             changes = msgspec.structs.replace(changes, origin=self._open.origin)
         await self._offload(self._log.journal.write, changes)
         self._open = changes
 
     async def done(self, changes: ChangeSet) -> None:
-        """End a transaction whose write stays; from now on it can be undone.
-
-        Raises:
-            StorageError: the disk refuses; the write stays open.
-        """
+        """End a transaction whose write stays; from now on it can be undone. After a StorageError it stays open."""
         kept = self._undoable.get(changes.system_id, Undoable(changes.system_id))
         await self._keep(kept.and_then(changes))
         await self.unchanged()
 
     async def undone(self) -> None:
-        """End a transaction, an interrupted write or an undo: the old values are in force.
-
-        Raises:
-            StorageError: the disk refuses; the write stays open.
-        """
+        """End a transaction, an interrupted write or an undo with old values in force; StorageError: it stays open."""
         if self._open is not None and (kept := self._undoable.get(self._open.system_id)) is not None:
             # It was an undo, or a write that ended before the journal was cleared.
             left = kept.without(self._open)
@@ -170,11 +158,7 @@ class Ledger:
         self._undoable[undoable.system_id] = undoable
 
     async def unchanged(self) -> None:
-        """End a transaction that left the autopilot as it was; all undo steps stay.
-
-        Raises:
-            StorageError: the disk refuses; the write stays open.
-        """
+        """End a transaction that left the autopilot as it was; all undo steps stay. StorageError: it stays open."""
         await self._offload(self._log.journal.clear)
         self._open = None
         self._orphaned.clear()
@@ -193,13 +177,14 @@ class Recovery:
     ) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
-        self._offload, self._interruptions = core.offload, Interruptions(core.config.storage.path)
+        self._offload, self._interruptions = core.offload, interruptions_in(core.config.storage.path)
         self.on_recovered: Callable[..., Awaitable[object]] = _nobody_notes
         """Called with a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
         """List interrupted writes, the latest first; blocking."""
-        return self._interruptions.history(self.ledger.orphaned)
+        pending = [] if self.ledger.orphaned is None else [Interruption.of(self.ledger.orphaned)]
+        return [msgspec.to_builtins(each) for each in (*pending, *reversed(self._interruptions.read()))]
 
     def why_no_undo(self) -> str | None:
         """Say why there is nothing to undo; None when there is."""
@@ -253,7 +238,10 @@ class Recovery:
         self._say(Severity.WARNING, words, Weight.RESULT)
 
     async def _keep(self, open_set: ChangeSet, reason: str) -> None:
-        await self._offload(self._interruptions.keep, open_set, reason, utc_now())
+        try:
+            await self._offload(self._interruptions.append, Interruption.of(open_set, reason, utc_now()))
+        except StorageError as error:
+            logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
         """Restore the values from before the last step, all or none; returns the step and the restored parameters.

@@ -42,8 +42,6 @@ INSTANCE_BITS: Final = 30
 
 
 class _Other(msgspec.Struct):
-    """One other companion."""
-
     system_id: int
     component_id: int
     is_new: bool
@@ -58,7 +56,6 @@ class _Other(msgspec.Struct):
         return self.is_new, self.instance
 
     def words(self, does: str) -> str:
-        """For people."""
         return f"second companion ({self.system_id}/{self.component_id}) on this link {does}: stop one of them"
 
     def counts(self, now_s: float) -> bool:
@@ -70,7 +67,6 @@ class OtherCompanions:
     """Announces this companion and listens for others; `run` until cancelled."""
 
     def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
-        """`writes`: whether this companion writes to the autopilot at all."""
         self._link, self._say, self._writes = link, say, writes
         self._instance, self._is_new = int.from_bytes(os.urandom(4)) >> 32 - INSTANCE_BITS, True
         self._others: dict[int, _Other] = {}

@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
@@ -20,7 +20,7 @@ from companion.errors import AutopilotError
 from companion.estimation.records.record import ImuRecord, Outcome, WrittenParameter
 from companion.estimation.records.validity import RESIDUAL_SIGMAS
 from companion.estimation.solution.solve import ImuSolution, Shared
-from companion.physics.frames import Array, vector
+from companion.physics.frames import Array
 from companion.physics.units import MG
 from companion.samples import Triad, Vector, rows_of
 
@@ -123,13 +123,6 @@ class Plan:
             kept = log.written.get(target.name, {})
             for name in kept.keys() & set(parameters):
                 kept[name] = msgspec.structs.replace(kept[name], outcome=outcome)
-
-
-def plan_for(name: str, calibration: ImuCalibration, residual: Residual, *, watched: bool) -> ImuPlan:
-    """Plan the changes that take a residual out of the output of one IMU."""
-    gyro, accel = residual
-    changes = changes_for(calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel))
-    return ImuPlan(name, calibration, tuple(changes), residual, watched=watched)
 
 
 def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:

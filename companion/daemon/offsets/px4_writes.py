@@ -333,7 +333,6 @@ def _outputs(
 
 
 def _danger(step: ExpectedStep) -> str:
-    """Tell the pilot the effect of a far value in flight."""
     size = float(np.linalg.norm(step.step))
     if step.sensor == "gyro":
         return f"DISARM NOW: yaw rate wrong by {size / DEG:.1f} deg/s"

@@ -25,7 +25,7 @@ from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.job import GoOn
 from companion.errors import AutopilotError, NotDisarmedError, StorageError
-from companion.storage.learned import this_boot
+from companion.storage.records import this_boot
 from companion.storage.state import StateFile
 
 logger = logging.getLogger(__name__)
@@ -138,11 +138,7 @@ class RebootOwed:
             self._core.say(Severity.WARNING, f"Before flight: {words}", Weight.RESULT)
 
     async def after(self, changes: Sequence[Change]) -> None:
-        """Judge changes that come into force.
-
-        Raises:
-            StorageError: that a restart is owed cannot be kept.
-        """
+        """Judge changes that come into force; raises StorageError where an owed restart cannot be kept."""
         stale_deg = self._vehicle.kind.stale_tilt_deg(changes)
         if stale_deg == 0.0:
             return

@@ -114,11 +114,7 @@ class Offsets(Subsystem):
     # --- any write
 
     async def begin(self, job: Job, parameters: int) -> None:
-        """Announce a write of so many parameters, and wait until the aircraft is surely disarmed.
-
-        Raises:
-            NotDisarmedError: it is armed, or no heartbeat comes.
-        """
+        """Announce a write of so many parameters; raises NotDisarmedError unless it is surely disarmed in time."""
         job.check_cancelled()
         self._machine.on(Event.WRITE)
         job.progress(MEASURED_PERCENT, f"writing {parameters} parameters")

@@ -283,7 +283,6 @@ class Supervisor:
         self._work.cancel()
 
     async def _watch(self) -> None:
-        """Feed the watchdog and report the status until cancelled."""
         loop = asyncio.get_running_loop()
         limit_s = self._manager.watchdog_s
         period_s = PERIOD_S if limit_s is None else min(PERIOD_S, limit_s / FEEDS_PER_LIMIT)

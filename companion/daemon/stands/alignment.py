@@ -36,7 +36,7 @@ from companion.formats import Object, utc_now
 from companion.links.system.listeners import Listeners
 from companion.physics.units import MG
 from companion.storage.changes import PREDICTION, ChangeSet
-from companion.storage.learned import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot
+from companion.storage.records import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot
 
 logger = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
-from companion.storage.learned import KnownImu
+from companion.storage.records import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
 _SETTLED_S: Final = 3.0

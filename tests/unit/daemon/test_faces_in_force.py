@@ -19,7 +19,7 @@ from companion.estimation.records.align_record import Determined, FacesImuRecord
 from companion.physics.frames import rotation_matrix, vector
 from companion.physics.units import MG
 from companion.samples import Vector
-from companion.storage.learned import this_boot
+from companion.storage.records import this_boot
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
 

@@ -21,7 +21,7 @@ from companion.errors import StorageError
 from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
-from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in, this_boot
+from companion.storage.records import SIGNING_FILE, SigningTime, signing_time_in, this_boot
 from companion.storage.state import StateFile
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual

@@ -18,9 +18,8 @@ import pytest
 from companion.estimation.records.record import ArmingRecord
 from companion.mqtt.fleet import AircraftFleet
 from companion.storage import fleet_items
-from companion.storage.learned import Done
 from companion.storage.profiles import ProfileStore
-from companion.storage.records import RecordStore
+from companion.storage.records import Done, RecordStore
 from companion.storage.state import BoundedList, sealed, write_atomically
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON, Aircraft

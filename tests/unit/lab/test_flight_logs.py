@@ -13,8 +13,7 @@ import pytest
 from companion.cli import main as companion
 from companion.estimation.records.record import ImuRecord, Record, WrittenParameter
 from companion.physics.units import DEG_H, MG
-from companion.storage.learned import BiasStore, KnownImu
-from companion.storage.records import FlightStore, RecordStore
+from companion.storage.records import BiasStore, FlightStore, KnownImu, RecordStore
 from tests.support.autopilot_files import write_ulog
 from tests.support.flown import HEIGHT_M, LATITUDE_DEG, Flown, dataflash, fly, messages, parameters
 from tests.support.histories import SLOPES_DEG_H_K, windows_of_days

@@ -11,7 +11,7 @@ import pytest
 
 from companion.errors import StorageError
 from companion.estimation.records.history import KEEP_POINTS, KEEP_POWER_UPS, Point
-from companion.storage.learned import KEEP_IMUS, BiasStore, KnownImu
+from companion.storage.records import KEEP_IMUS, BiasStore, KnownImu
 from tests.support.histories import two_years
 
 

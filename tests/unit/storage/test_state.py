@@ -16,9 +16,8 @@ import pytest
 from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
-from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
-from companion.storage.records import RecordStore
+from companion.storage.records import SIGNING_FILE, BiasStore, RecordStore, alignment_in, faces_in, signing_time_in
 from companion.storage.state import MOST_ASIDE, MOST_BYTES, BoundedList, StateFile, sealed
 from companion.web.access import kept_token
 
