@@ -253,7 +253,7 @@ class AircraftFleet:
                 }
                 if self._wait_s > CONFIRMED_WITHIN_S:
                     self._begin_again()  # somebody is there again: in order, from the first
-        elif await self._offload(self._items.want, aircraft, epoch, sequences) and sequences:
+        elif await self._offload(self._items.confirm, aircraft, epoch, sequences, None) and sequences:
             self._begin_again()
         else:
             self._greeted[aircraft] = -1

@@ -144,25 +144,16 @@ class FleetItems:
             )
             return [Waiting(number, of, epoch, sequence, Item(*told)) for number, of, epoch, sequence, *told in found]
 
-    def confirm(self, aircraft: str, epoch: str, ranges: Iterable[Range], now: str) -> bool:
-        """Mark items as confirmed by the fleet; False: it means another epoch."""
-        return self._set(aircraft, epoch, ranges, confirmed=True, now=now)
-
-    def want(self, aircraft: str, epoch: str, ranges: Iterable[Range]) -> bool:
-        """Mark items that the fleet lacks as unconfirmed, as far as they are kept."""
-        return self._set(aircraft, epoch, ranges, confirmed=False)
-
-    def _set(
-        self, aircraft: str, epoch: str, ranges: Iterable[Range], *, confirmed: bool, now: str | None = None
-    ) -> bool:
+    def confirm(self, aircraft: str, epoch: str, ranges: Iterable[Range], now: str | None) -> bool:
+        """Mark items as confirmed, or as lacking in the fleet (`now`: None); False: it means another epoch."""
         with self._transaction() as db:
             if db.execute("SELECT 1 FROM aircraft WHERE (id, epoch) = (?, ?)", (aircraft, epoch)).fetchone() is None:
                 return False
             db.executemany(
                 "UPDATE item SET confirmed = ? WHERE aircraft = ? AND sequence BETWEEN ? AND ?",
-                [(confirmed, aircraft, first, last) for first, last in ranges],
+                [(now is not None, aircraft, first, last) for first, last in ranges],
             )
-            if confirmed:
+            if now is not None:
                 db.execute("UPDATE aircraft SET confirmed_at = ? WHERE id = ?", (now, aircraft))
             return True
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -34,11 +34,6 @@ class ImuIdentities:
         self._sensors = {role.name: sensor for sensor in devices.sensors for role in sensor.roles if role.kind == "imu"}
         self._sources = {imu.name: imu for imu in core.config.imu}
         self._host = this_boot() or os.urandom(8).hex()
-
-    @property
-    def names(self) -> Collection[str]:
-        """All configured IMUs."""
-        return self._sources.keys()
 
     def power_up(self, name: str, unix_s: float) -> PowerUp:
         """Estimate since when an IMU's sensor has been powered, at a wall clock time."""

@@ -155,7 +155,7 @@ class BiasMemory:
     def forgotten(self) -> dict[str, str]:
         """Forget the biases of replaced sensors; return the reason by IMU, in one line."""
         found: dict[str, str] = {}
-        for name in self.identities.names:
+        for name in (imu.name for imu in self._config.imu):
             what = self._changed(name)
             if not what:
                 continue
@@ -335,7 +335,7 @@ class BiasMemory:
 
         self.follow()
         unix_s, found = time.time(), []
-        for name in self.identities.names:
+        for name in (imu.name for imu in self._config.imu):
             what = self._changed(name)
             shown = by_temperature(
                 name,

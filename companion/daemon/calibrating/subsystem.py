@@ -19,7 +19,6 @@ from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.core import Core, Handler, Subsystem
-from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
 from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
@@ -73,7 +72,6 @@ class Calibrating(Subsystem):
         self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
         self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
-        self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
         parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets, self.on_solved)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
@@ -137,17 +135,16 @@ class Calibrating(Subsystem):
         yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
 
     async def _temperature(self, asked: Temperature, face: str) -> AsyncIterator[Object]:
-        into = self._into_autopilot
         if asked.action == "undo":
             await self._hear()
-            if (why := into.why_no_undo()) is not None:
+            if (why := self._why_no_curve_undo()) is not None:
                 raise RequestRefusedError("nothing_to_undo", why)
             async for reply in self._undo(Undo(), face):
                 yield reply
         elif asked.action == "write":
             missing = self._why_not_written(write=True) or self._core.vehicle.kind.why_no_thermal_write
             job = Job(TEMPERATURE, What.GYROS, f"{face} temperature", ALIGN_TIMEOUT_S)
-            started = self.manager.start_job(job, partial(into.run, overwrite=asked.overwrite), missing)
+            started = self.manager.start_job(job, partial(self._write_curves, overwrite=asked.overwrite), missing)
             async for reply in self._to_end(_accepted(started), "written"):
                 yield reply
         else:
@@ -271,31 +268,9 @@ class Calibrating(Subsystem):
             }
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
 
+    # --- bias curves over temperature, into the temperature calibration of the autopilot
 
-def _accepted(answer: Job | Refusal) -> Job:
-    if isinstance(answer, Refusal):
-        raise RequestRefusedError(answer.kind, answer.reason)
-    return answer
-
-
-class IntoAutopilot:
-    """Writes bias curves over temperature to the autopilot's own temperature calibration, of all IMUs or of none.
-
-    The output at the present temperature stays, and that is verified.
-    """
-
-    def __init__(
-        self,
-        core: Core,
-        imus: Mapping[str, AutopilotImu],
-        measuring: Measuring,
-        memory: BiasMemory,
-        offsets: Offsets,
-    ) -> None:
-        self._core, self._imus, self._measuring, self._memory = core, imus, measuring, memory
-        self._offsets = offsets
-
-    def why_no_undo(self) -> str | None:
+    def _why_no_curve_undo(self) -> str | None:
         """Return why the write of curves cannot be undone; None where it is the latest write."""
         steps = self._offsets.ledger.steps(self._core.vehicle.system_id)
         after = [step.origin.what or "a write" for step in steps]
@@ -304,20 +279,20 @@ class IntoAutopilot:
         later = after[: after.index(BY_TEMPERATURE)]
         return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
 
-    async def run(self, job: Job, *, overwrite: bool) -> str:
-        """Measure, write and verify; return in words what was written.
+    async def _write_curves(self, job: Job, *, overwrite: bool) -> str:
+        """Measure, write the curves of all IMUs or of none, verify that the output stays; return what was written.
 
         `overwrite`: replace a temperature calibration that is not ours. After an error or a cancel the old values are
         restored, or the error names those that are not.
         """
         log = WriteLog()
-        await self._core.offload(self._memory.follow)
-        self._measuring.begin()
-        window = await self._measuring.measure(job)
+        await self._core.offload(self.memory.follow)
+        self.measuring.begin()
+        window = await self.measuring.measure(job)
         if not await self._offsets.offsets_still_hold():
             raise CalibrationRefusedError("the autopilot's values were changed in between: try again")
         job.progress(MEASURED_PERCENT, "reading the autopilot's temperature calibration")
-        targets, words, left = await self._find(window, overwrite=overwrite)
+        targets, words, left = await self._curve_targets(window, overwrite=overwrite)
         if not targets:
             raise CalibrationRefusedError("; ".join(left or ["no IMU of the autopilot was measured"]))
         log.warnings += left
@@ -330,27 +305,27 @@ class IntoAutopilot:
         job.product = {"imus": log.written, "warnings": warnings}
         return f"written: {'; '.join(words)}"
 
-    async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[ImuPlan], list[str], list[str]]:
+    async def _curve_targets(self, window: Window, *, overwrite: bool) -> tuple[list[ImuPlan], list[str], list[str]]:
         """Return the targets of the write, their words, and why other IMUs are left as they are."""
-        exchanged = self._memory.forgotten()  # the curve of an IMU that was replaced must not be written
+        exchanged = self.memory.forgotten()  # the curve of an IMU that was replaced must not be written
         targets: list[ImuPlan] = []
         words: list[str] = []
         left: list[str] = []
         for means in (means for means in window.imus if means.name in self._imus):
             name, degc = means.name, means.temperature_degc
-            curve, calibration = self._memory.curves.of(name, "gyro"), self._imus[name].in_force
+            curve, calibration = self.memory.curves.of(name, "gyro"), self._imus[name].in_force
             enabled_by = calibration.thermal.enabled_by
             if curve is None:
                 left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
             elif degc is None:
                 left.append(f"imu {name}: it tells no temperature now")
-            elif enabled_by and not overwrite and not self._is_ours(calibration.thermal):
+            elif enabled_by and not overwrite and not self._wrote_curve(calibration.thermal):
                 left.append(
                     f"imu {name}: {enabled_by} is on, and not by the companion: kept"
                     " (companion temperature --overwrite replaces it)"
                 )
             else:
-                gyro, accel = of_curve(curve, calibration.orientation), self._of_accelerometers(name, curve)
+                gyro, accel = of_curve(curve, calibration.orientation), self._accelerometer_curve(name, curve)
                 kind, parameters = self._core.vehicle.kind, self._core.parameters
                 changes = await kind.thermal_changes(parameters, calibration, gyro, accel, degc)
                 named = {change.parameter for target in targets for change in target.unseen}
@@ -360,14 +335,14 @@ class IntoAutopilot:
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
         return targets, words, left
 
-    def _of_accelerometers(self, name: str, gyro: Curve) -> Polynomial | None:
+    def _accelerometer_curve(self, name: str, gyro: Curve) -> Polynomial | None:
         """Return the accelerometers' curve if it spans the gyros' temperatures: an autopilot has one span for both."""
-        curve, calibration = self._memory.curves.of(name, "accel"), self._imus[name].in_force
+        curve, calibration = self.memory.curves.of(name, "accel"), self._imus[name].in_force
         if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
             return None
         return of_curve(curve, calibration.orientation, calibration.accel_scale)
 
-    def _is_ours(self, thermal: Thermal) -> bool:
+    def _wrote_curve(self, thermal: Thermal) -> bool:
         """Return whether the values are those of our latest write."""
         ours: dict[str, float | None] = {}
         for step in reversed(self._offsets.ledger.steps(self._core.vehicle.system_id)):
@@ -375,3 +350,9 @@ class IntoAutopilot:
                 ours |= {one.parameter: one.after for one in step.changes}
         found = [(ours[name], value) for name, value in thermal.values.items() if name in ours]
         return bool(found) and all(after is not None and same_float32(after, now) for after, now in found)
+
+
+def _accepted(answer: Job | Refusal) -> Job:
+    if isinstance(answer, Refusal):
+        raise RequestRefusedError(answer.kind, answer.reason)
+    return answer

@@ -178,7 +178,7 @@ class Recovery:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self._offload, self._interruptions = core.offload, interruptions_in(core.config.storage.path)
-        self.on_recovered: Callable[..., Awaitable[object]] = _nobody_notes
+        self.on_recovered: Callable[..., Awaitable[object]] | None = None
         """Called with a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
@@ -231,7 +231,8 @@ class Recovery:
         if foreign:
             found += f"; changed by others, left alone: {', '.join(foreign)}"
         words = f"Interrupted write: {found}"
-        await self.on_recovered(open_set, words, undone=self.ledger.is_undoable(open_set))
+        if self.on_recovered is not None:
+            await self.on_recovered(open_set, words, undone=self.ledger.is_undoable(open_set))
         await self._keep(open_set, found)
         await self.ledger.undone()
         logger.warning("%s", words)
@@ -275,7 +276,12 @@ class Recovery:
                 await self._owed.after(ours)
                 await self.ledger.undone()
         except (WriteFailedError, NothingWrittenError) as error:
-            raise AutopilotError(_why_not_undone(error, step)) from error
+            # Not the error's own words: the writer's "old values" are those from before the undo.
+            cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)
+            end = f"{step.origin.what or 'last write'} stays in force: undo again"
+            if error.left_changed:
+                end = f"undone in part ({', '.join(error.left_changed)}): the rest follows once disarmed"
+            raise AutopilotError(f"{cause}; {end}") from error
         self._owed.say()
         return step, written
 
@@ -309,15 +315,3 @@ class Recovery:
             with contextlib.suppress(ParameterRefusedError):
                 found[name] = await self._parameters.read(name)
         return found
-
-
-async def _nobody_notes(_step: ChangeSet, _words: str, *, undone: bool) -> None:
-    """Stand in until the manager keeps a history."""
-
-
-def _why_not_undone(error: WriteFailedError | NothingWrittenError, step: ChangeSet) -> str:
-    """Say what is in force after a failed undo; the writer's "old values" are those from before the undo."""
-    cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)
-    if error.left_changed:
-        return f"{cause}; undone in part ({', '.join(error.left_changed)}): the rest follows once disarmed"
-    return f"{cause}; {step.origin.what or 'last write'} stays in force: undo again"

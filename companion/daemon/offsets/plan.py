@@ -106,11 +106,6 @@ class Plan:
             if change.parameter in target.calibration.parameters.gyro_offset
         )
 
-    @property
-    def everything(self) -> tuple[Change, ...]:
-        """All changes, the firmware's included, in the order in which they happened."""
-        return (*self.collateral, *self.changes)
-
     def note(self, log: WriteLog, written: Mapping[str, WrittenParameter]) -> None:
         """Enter the outcome of parameters."""
         for target in self.targets:

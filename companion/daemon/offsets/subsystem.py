@@ -223,7 +223,7 @@ class Offsets(Subsystem):
             except WriteFailedError as error:
                 plan.note(log, error.written)
                 raise
-            return plan.everything
+            return (*plan.collateral, *plan.changes)
 
         async def verify() -> None:
             job.progress(WRITTEN_PERCENT, WATCHING)
