@@ -62,18 +62,13 @@ class Job:
         self.progress_percent = 0
         """0 to 100, never falling."""
         self._until_s = 0.0
-        self._cancelled_by: str | None = None
+        self.cancelled_by: str | None = None
         self._nudge = asyncio.Event()
 
     @property
     def is_running(self) -> bool:
         """Return whether it has not finished."""
         return not self.finished.done()
-
-    @property
-    def cancelled(self) -> bool:
-        """Return whether it was cancelled."""
-        return self._cancelled_by is not None
 
     @property
     def record(self) -> Record | None:
@@ -110,13 +105,13 @@ class Job:
 
     def cancel(self, by: str) -> None:
         """Ask it to stop at the next safe point."""
-        self._cancelled_by = self._cancelled_by or by
+        self.cancelled_by = self.cancelled_by or by
         self._nudge.set()
 
     def check_cancelled(self) -> None:
         """Raise JobCancelledError, with the canceller, if it was cancelled: a safe point."""
-        if self._cancelled_by is not None:
-            raise JobCancelledError(f"cancelled by {self._cancelled_by}")
+        if self.cancelled_by is not None:
+            raise JobCancelledError(f"cancelled by {self.cancelled_by}")
 
     def check_time(self) -> None:
         """Raise CalibrationRefusedError after the deadline."""

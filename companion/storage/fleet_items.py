@@ -187,31 +187,27 @@ class FleetItems:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock, self._in_one_line():
-            if self._connection is None:
-                self._connection = self._opened()
-            db = self._connection
-            db.execute("BEGIN IMMEDIATE")
+        with self._lock:
             try:
-                yield db
-                db.execute("COMMIT")
-            except BaseException:
-                with contextlib.suppress(sqlite3.Error):
-                    db.execute("ROLLBACK")
-                raise
-
-    @contextlib.contextmanager
-    def _in_one_line(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            self._drop()
-            words = str(error)
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-                words += f"; {self._begin_anew()}"
-            raise StorageError(f"{self.path}: {words}") from error
-        except OSError as error:
-            raise StorageError(f"{self.path}: cannot be used: {error.strerror or error}") from error
+                if self._connection is None:
+                    self._connection = self._opened()
+                db = self._connection
+                db.execute("BEGIN IMMEDIATE")
+                try:
+                    yield db
+                    db.execute("COMMIT")
+                except BaseException:
+                    with contextlib.suppress(sqlite3.Error):
+                        db.execute("ROLLBACK")
+                    raise
+            except sqlite3.Error as error:
+                self._drop()
+                words = str(error)
+                if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+                    words += f"; {self._begin_anew()}"
+                raise StorageError(f"{self.path}: {words}") from error
+            except OSError as error:
+                raise StorageError(f"{self.path}: cannot be used: {error.strerror or error}") from error
 
     def _opened(self) -> sqlite3.Connection:
         if self.path.exists() and not self.path.is_file():

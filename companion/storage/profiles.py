@@ -131,10 +131,7 @@ def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> N
     """Read one profile for the configuration.
 
     `forgiving`: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
-
-    Raises:
-        ConfigError: there is none of that name; says what is allowed.
-        StorageError: it cannot be read.
+    Raises ConfigError where there is none of that name, StorageError where it cannot be read.
     """
     store = ProfileStore(directory)
     try:
@@ -153,11 +150,7 @@ def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> N
 def given_profile(wanted: str, directory: Callable[[], Path]) -> str | NoiseProfile:
     """Find a part of the catalogue, a saved profile, or the file of one (a slash in it, or .json).
 
-    The storage directory is only asked for where it matters.
-
-    Raises:
-        ConfigError: no such profile; says what is allowed.
-        StorageError: the file cannot be read.
+    Calls `directory` only where it matters. Raises ConfigError where there is none, StorageError for a damaged file.
     """
     if (plain := _plain(wanted)) in CATALOGUE:
         return plain

@@ -247,9 +247,7 @@ def only_daemon(directory: Path) -> Iterator[None]:
 
     Two daemons would read each other's journal as an interrupted write. The directory itself is locked, so that no
     file has to be there. Where it can be neither made nor locked (a network file system), the daemon goes on without.
-
-    Raises:
-        StorageError: another daemon holds it.
+    Raises StorageError where another daemon holds it.
     """
     try:
         directory.mkdir(exist_ok=True)

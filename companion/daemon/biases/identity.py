@@ -12,7 +12,6 @@ from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.stands.alignment import ActiveAlignment
-from companion.estimation.records.align_record import ImuAlignmentRecord
 from companion.estimation.records.history import PowerUp
 from companion.storage.records import this_boot
 
@@ -80,11 +79,6 @@ class ImuIdentities:
             "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
             "scale": _plain(calibration.accel_scale),
         }
-
-    def aligned(self, name: str) -> ImuAlignmentRecord | None:
-        """Return an IMU's part of the active alignment."""
-        record = self._alignment.record if self._alignment.unused is None else None
-        return None if record is None else next((imu for imu in record.imus if imu.name == name), None)
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:

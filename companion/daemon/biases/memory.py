@@ -195,7 +195,9 @@ class BiasMemory:
 
     def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float) -> ExpectedImu:
         name = imu.name
-        effect = pose_effect(self.identities.aligned(name))
+        record = self._alignment.record if self._alignment.unused is None else None
+        aligned = () if record is None else record.imus
+        effect = pose_effect(next((each for each in aligned if each.name == name), None))
         if not self._config.calibration.prior:
             return ExpectedImu(name=name, effect=effect)
         now = Point(

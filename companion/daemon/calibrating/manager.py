@@ -44,13 +44,11 @@ class Precondition(enum.Enum):
     """Conditions for starting a calibration, in the order in which they are reported."""
 
     STORAGE = enum.auto()
-    """Old values can be kept; otherwise nothing is written."""
     ONE_AUTOPILOT = enum.auto()
     IDLE = enum.auto()
     DISARMED = enum.auto()
     ARM_STATE_KNOWN = enum.auto()
     ONE_COMPANION = enum.auto()
-    """No other companion writes to this autopilot."""
     RESTORED = enum.auto()
     """No restore of an interrupted write is pending."""
 
@@ -182,8 +180,8 @@ class CalibrationManager:
         """Start restoring the values from before the last write (see `Recovery.undo`), or refuse."""
         running = self._automatic_run()
         missing = None if running is not None else self._recovery.why_no_undo()
-        if (refusal := self._refusal(missing, but=running)) is not None:
-            return msgspec.structs.replace(refusal, kind="nothing_to_undo") if refusal.reason == missing else refusal
+        if (refusal := self._refusal(missing, "nothing_to_undo", but=running)) is not None:
+            return refusal
         job = Job("undo", What.BOTH, requester)
         if running is None:
             return self._start(job, Event.UNDO, self._finish(job, self._undo(job, force=force)))
@@ -204,14 +202,16 @@ class CalibrationManager:
         if self._task is not None:
             await asyncio.wait([self._task])
 
-    def _refusal(self, missing: str | None, *, but: Job | None = None) -> Refusal | None:
+    def _refusal(
+        self, missing: str | None, kind: Literal["nothing_to_undo", "other"] = "other", *, but: Job | None = None
+    ) -> Refusal | None:
         """Refuse what cannot be started; `but` is a running job that does not count."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
         if but is None and (found := self.blocking_reason()) is not None:
             return Refusal(REFUSAL_KINDS.get(found[0], "other"), found[1])
         if missing is not None:
-            return Refusal("other", missing)
+            return Refusal(kind, missing)
         now_s = asyncio.get_running_loop().time()
         if (left := self._starts.left(now_s)) < 1.0:
             return Refusal("busy", f"too many requests, wait {math.ceil((1.0 - left) / STARTS_PER_S)} s")

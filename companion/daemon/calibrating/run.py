@@ -19,7 +19,6 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.component.service import WRITTEN_PERCENT, JobResult
 from companion.component.statustext import Severity, Tune
-from companion.config.sections import Platform
 from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -61,10 +60,6 @@ Key = tuple[str, Triad]
 
 WRONG_IMU_ATTEMPTS: Final = 3
 """Most writes that act on the wrong IMU: two of three may be mistaken for the right one."""
-_STARTED: Final[dict[Platform, str]] = {
-    "ground": "Calibration started: keep the aircraft still",
-    "deck": "Calibration started: the deck may sway",
-}
 _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
 
 
@@ -152,7 +147,7 @@ class CalibrationRun(Job):
     @property
     def is_adoptable(self) -> bool:
         """Return whether a request may still adopt this automatic run."""
-        return self.automatic and not self.cancelled and not self.held_back
+        return self.automatic and self.cancelled_by is None and not self.held_back
 
     def adopt(self, requester: str, timeout_s: float | None, *, reboot: bool) -> None:
         """Turn an automatic calibration into a requested one."""
@@ -163,20 +158,18 @@ class CalibrationRun(Job):
     def _announce(self) -> None:
         if self.automatic:
             return
-        platform = self._core.config.vehicle.platform
-        self._core.say(Severity.NOTICE, _STARTED[platform])
-        if platform == "ground":
-            self._core.tunes.play(Tune.HOLD_STILL)
+        if self._core.config.vehicle.platform == "ground":
+            self._core.prompt(Tune.HOLD_STILL, "Calibration started: keep the aircraft still")
+        else:
+            self._core.say(Severity.NOTICE, "Calibration started: the deck may sway")
 
     def _begin_again(self, error: WriteFailedError) -> None:
         """Measure anew after a write that acted on another IMU, or on none; the old values are restored."""
         self._machine.on(Event.MOVED)
         logger.warning("%s; put back, measuring again", error.reason)
         self._forget()
-        if error.kind == "not as believed":
-            self.log.warnings.append(f"{error.reason}; put back, and written where it belongs")
-        else:
-            self.log.warnings.append(f"{error.reason}; put back, and tried again")
+        anew = "written where it belongs" if error.kind == "not as believed" else "tried again"
+        self.log.warnings.append(f"{error.reason}; put back, and {anew}")
         self.check_cancelled()
 
     # --- the phases

@@ -216,9 +216,8 @@ class Calibrating(Subsystem):
             level=asked.level and on_turn,
         )
         if self._core.config.vehicle.platform == "deck":
-            if _KINDS[action] == ALIGNMENT:
-                return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
-            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+            what = "a zero is" if _KINDS[action] == ALIGNMENT else "accelerometers are"
+            return Refusal("other", f"{what} not measured on a deck that moves: align ashore")
         task: PoseTask
         if action == "faces":
             task = SidesTask(request, self._imus, self.faces)
@@ -226,8 +225,8 @@ class Calibrating(Subsystem):
             task = TurnTask(self._core, request, self._imus, self.faces)
         else:
             task = ZeroTask(self._core, request, self.alignment)
-        what = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
-        job = Job(_KINDS[action], what, by, asked.timeout_s or ALIGN_TIMEOUT_S)
+        biases = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
+        job = Job(_KINDS[action], biases, by, asked.timeout_s or ALIGN_TIMEOUT_S)
         run = partial(self.stands.run, request=request, task=task)
         return self.manager.start_job(job, run, self._why_not_aligned(request))
 

@@ -88,7 +88,7 @@ class Headlines:
     def _working(self, job: Job, now_s: float) -> Headline:
         state = self._manager.state
         words = job.words or state.word
-        if job.cancelled:
+        if job.cancelled_by is not None:
             return "CANCELLING", words, "busy"
         if state is State.UNDOING:
             return state.word.upper(), "the old values are being written", "busy"

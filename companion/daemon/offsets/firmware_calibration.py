@@ -77,10 +77,7 @@ class FirmwareCalibration:
         """Write all offsets, calibrate, write the gyro offsets again: all of it, or all the old values are restored.
 
         Runs in a transaction, which grows with what the firmware changes besides. Returns the plan with those changes
-        and the outcome of the calibration.
-
-        Raises:
-            NothingWrittenError, WriteFailedError: as `ParameterWriter.apply`.
+        and the outcome of the calibration; raises as `ParameterWriter.apply`.
         """
         boots, changes, system_id = self._vehicle.boots, plan.changes, self._vehicle.system_id
         written = await self._writer.apply(changes)
@@ -122,11 +119,7 @@ class FirmwareCalibration:
     async def _restore(
         self, changes: Sequence[Change], before: Mapping[str, float], boots: int, error: CompanionError
     ) -> None:
-        """Restore our old values, and everything that the firmware's calibration may have changed.
-
-        Raises:
-            WriteFailedError: always; what went wrong, and what could not be restored.
-        """
+        """Restore our old values and all that the firmware may have changed; always ends in a WriteFailedError."""
         logger.warning("writing around the firmware's gyro calibration: %s; putting everything back", error)
         reason = error.reason if isinstance(error, WriteFailedError) else str(error)
         back = [change for change in changes if change.parameter not in before]

@@ -247,15 +247,9 @@ class Recovery:
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
         """Restore the values from before the last step, all or none; returns the step and the restored parameters.
 
-        Args:
-            force: leave values that somebody else has changed since, and restore the rest; otherwise nothing is
-                written then.
-
-        Raises:
-            AutopilotError: somebody else has changed some values since (each named, with the present value, ours and
-                the old one), or the write failed: then the step stays in force, or, where some values could not be
-                written again, the recovery ends the undo as soon as the aircraft is disarmed.
-            StorageError: the disk refuses.
+        `force`: leave values that somebody else has changed since, and restore the rest; otherwise AutopilotError names
+        each, with the present value, ours and the old one. After another AutopilotError or a StorageError the step
+        stays in force, or, where some values could not be written again, the recovery ends the undo once disarmed.
         """
         if (why := self.why_no_undo()) is not None:
             raise AutopilotError(why)

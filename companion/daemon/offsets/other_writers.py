@@ -97,14 +97,11 @@ class OtherCompanions:
                 value = self._instance << 1 | self._is_new
                 name = NAME.encode("ascii")
                 self._link.send(mavlink.MAVLink_named_value_int_message(int(now_s * 1e3) % 2**32, name, value))
-            self._tell()
-
-    def _tell(self) -> None:
-        words = self.warning
-        if words is not None and words != self._told:
-            logger.warning("%s", words)
-            self._say(Severity.WARNING, words[:1].upper() + words[1:], Weight.NEWS)
-        self._told = words
+            words = self.warning
+            if words is not None and words != self._told:
+                logger.warning("%s", words)
+                self._say(Severity.WARNING, words[:1].upper() + words[1:], Weight.NEWS)
+            self._told = words
 
     def _other(self) -> _Other | None:
         """Return the first by rank of those that count; None: nobody does, or this companion writes nothing."""

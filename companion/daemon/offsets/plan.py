@@ -133,11 +133,7 @@ def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
 
 
 def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
-    """Check that no two IMUs share one of PX4's parameter slots.
-
-    Raises:
-        AutopilotError: two IMUs do; what was learned of the slots is wrong, and is forgotten.
-    """
+    """Raise AutopilotError, and forget what was learned, where two IMUs seem to share one of PX4's parameter slots."""
     owners: dict[str, str] = {}
     for target in targets:
         for name in (*target.calibration.parameters.gyro_offset, *target.calibration.parameters.accel_offset):

@@ -94,7 +94,6 @@ class Px4Writes:
         self._link, self._vehicle, self._writer, self._ledger = link, vehicle, writer, ledger
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
-        """Steps of the write under way, by parameter."""
         self._seen: dict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
         """`OnTheWay` of the latest write by instance; only of outputs that moved as expected."""
         self._learned = False
@@ -142,9 +141,7 @@ class Px4Writes:
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
         """Bring offsets that may not be in use into use, unchanged; True when there were any.
 
-        Raises:
-            AutopilotError: this failed; the recovery restores what may be left.
-            StorageError: the values could not be kept, so nothing was written.
+        After an AutopilotError the recovery restores what may be left; after a StorageError nothing was written.
         """
         unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
         targets = [(imu.in_force, _same_again(imu.in_force), (0.0, 0.0, 0.0)) for imu in unsure]

@@ -100,12 +100,7 @@ class Offsets(Subsystem):
         ]
 
     async def offsets_still_hold(self) -> bool:
-        """Read the offsets again; False when they differ, or may differ, from those under which was measured.
-
-        Raises:
-            AutopilotError: they cannot be read; or doubtful ones could not be brought into use.
-            StorageError: the old values could not be kept.
-        """
+        """Read the offsets again; False when they may differ from those under which was measured; see `make_sure`."""
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()
@@ -274,8 +269,7 @@ class Offsets(Subsystem):
     async def settle(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> None:
         """Restart the autopilot where that was asked for, else wait until its EKF agrees with the new offsets.
 
-        Raises:
-            AutopilotError: the autopilot has not come back, or not with what was written.
+        Raises AutopilotError where the autopilot has not come back, or not with what was written.
         """
         boots = self._vehicle.boots
         if not_rebooted := await self._restart(job, plan, before, log) if job.reboot else "":

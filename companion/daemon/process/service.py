@@ -310,12 +310,19 @@ class Supervisor:
         self._missed = missed
 
     def _words(self, overdue: Sequence[WatchedTask]) -> str:
+        """Describe the status in one line, most important first."""
         if not self._manager.listens:
             return ""
         notes = ["stopping"] if self._stopping else []
         notes += [f"HUNG: {each.name}" for each in overdue]
         try:
-            return "; ".join([*notes, status_line(self._service.status())])
+            status = self._service.status()
+            rows = [row for row in summary.rows(status) if row[1] != "autopilot"]
+            parts = [summary.headline(status), str(status["vehicle"]["summary"])]
+            parts += [f"{name}: {words}" for verdict, name, words in rows if verdict == "wrong"]
+            if good := [name for verdict, name, _ in rows if verdict == "ok"]:
+                parts.append(f"{', '.join(good)} good")
+            return "; ".join([*notes, *parts])
         except Exception:
             # A fault in the description must not end the work.
             if not self._status_failed:
@@ -334,15 +341,6 @@ def _where(task_name: str) -> str:
                 frame = inner.cr_frame
                 return f"waits in {inner.__qualname__}, {frame.f_code.co_filename}:{frame.f_lineno}"
     return "its task has ended"
-
-
-def status_line(status: Object) -> str:
-    """Return the status in one line, most important first."""
-    rows = [row for row in summary.rows(status) if row[1] != "autopilot"]
-    parts = [summary.headline(status), str(status["vehicle"]["summary"])]
-    parts += [f"{name}: {words}" for verdict, name, words in rows if verdict == "wrong"]
-    good = [name for verdict, name, _ in rows if verdict == "ok"]
-    return "; ".join([*parts, f"{', '.join(good)} good"] if good else parts)
 
 
 def settle() -> None:
