@@ -69,7 +69,6 @@ class Kept(NamedTuple):
     last: int
     """Last sequence that was given; 0: none yet."""
     waiting: int
-    """Number of items that are not confirmed."""
     confirmed_at: str | None
 
 

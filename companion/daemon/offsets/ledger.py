@@ -103,9 +103,7 @@ class Ledger:
         The old values are on disk before the block begins. The block reports its end by `done` or `undone`. A writer's
         error with nothing left changed means that the autopilot is as before the block. After anything else (a value
         left changed, a cancellation, a fault of the program, no report) the state is unknown: the recovery looks.
-
-        Args:
-            changes: changes of the block, as far as they are known beforehand.
+        `changes` are those of the block, as far as they are known beforehand.
 
         Raises:
             AutopilotError: an earlier write is open still, or another companion writes here; do not write.

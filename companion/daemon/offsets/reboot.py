@@ -60,9 +60,7 @@ def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Cha
 async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
     """Restart the autopilot, disarmed, once all is stored, and wait until it is back.
 
-    Raises:
-        NotRebootedError: it was not restarted.
-        AutopilotError: it was restarted and is not back.
+    Raises NotRebootedError where it was not restarted, another AutopilotError where it was and is not back.
     """
     loop = asyncio.get_running_loop()
     stored_s = loop.time() + STORED_AFTER_S

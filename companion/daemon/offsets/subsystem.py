@@ -126,17 +126,10 @@ class Offsets(Subsystem):
     ) -> None:
         """Write in a journal transaction; keep the values only when `verify` passes and they can be undone later.
 
-        Args:
-            changes: planned changes; their old values are on disk before `apply` starts.
-            origin: cause of the write, for the undo.
-            imus: IMUs whose output changes.
-            apply: writes, and returns all changes made in their order, the firmware's own included.
-            verify: looks for the effect; raises where the new values must not stay.
-            note: told of parameters that were restored.
-
-        Raises:
-            CompanionError: cause, and the parameters that could not be restored, if any.
-            JobCancelledError: raised by `verify`; the message says what became of the old values.
+        The old values are on disk before `apply` starts, which returns all changes made in their order, the firmware's
+        own included. `verify` raises where the new values must not stay; `imus` are those whose output changes; `note`
+        is told of restored parameters. Raises CompanionError, or the JobCancelledError of `verify`: the cause, and what
+        became of the old values.
         """
         system_id = self._vehicle.system_id
         async with self.ledger.transaction(ChangeSet.of(system_id, changes, origin=origin)):

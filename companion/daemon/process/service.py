@@ -83,6 +83,7 @@ class Service:
     ) -> None:
         self.config = config
         self.core = core = Core(config, link, offload, only_listening)
+        self._transport: Task = ("mavlink", partial(run_transport, core.link, config.mavlink.url))
         self.devices = Devices(core, imu_rate_hz)
         self.offsets = Offsets(core, self.devices)
         self.calibrating = Calibrating(core, self.devices, self.offsets)
@@ -108,10 +109,9 @@ class Service:
         """Work until cancelled, then leave the autopilot in order; without `mavlink` or `ports` a test feeds bytes."""
         for subsystem in (self.devices, self.offsets, self.calibrating):
             subsystem.load()
-        transport: list[Task] = [("mavlink", self._connect)] if mavlink else []
         tasks = [
             *self.faces.tasks(),
-            *transport,
+            *([self._transport] if mavlink else []),
             *self.devices.tasks(ports=ports),
             *self.offsets.tasks(),
             *self.arming.tasks(),
@@ -131,16 +131,13 @@ class Service:
         finally:
             self.core.vehicle.close()
 
-    async def _connect(self) -> None:
-        await run_transport(self.core.link, self.config.mavlink.url)
-
     async def listen(self, goes_on: Callable[[float], bool]) -> Object:
         """Open everything, listen while `goes_on` (seconds), and return the status; writes nothing.
 
         Seconds are turns of the event loop: a slow process listens longer.
         """
         self.devices.load()
-        tasks = [("mavlink", self._connect), *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]
+        tasks = [self._transport, *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]
         running = [asyncio.get_running_loop().create_task(run(), name=name) for name, run in tasks]
         try:
             turns = 0
