@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Tests run in two processes: the boards and machines this is made for have at least two cores. Those of the real clock
 # wait more than they work: several at once.
 JOBS ?= 2
-WAITING ?= 8
+WAITING ?= 6
 # Where it is set, every process of every test compiles the whole program anew.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -52,10 +52,11 @@ PYTEST = $(BIN)/python -m pytest -q --dist worksteal
 quick: $(VENV)/.dev
 	@$(PYTEST) -n $(JOBS) --quick
 
-# Both parts always run, and both have to be green. Real autopilots (sitl) want a core of their own.
+# Both parts always run, and both have to be green. Real autopilots (sitl) want a core of their own. The second part does
+# without the plugin of Hypothesis: it reads every source for constants, in every worker.
 test: $(VENV)/.dev
 	@$(PYTEST) -n $(JOBS) -m 'not real_clock or sitl' $(if $(DURATIONS),--write-durations); working=$$?; \
-	$(PYTEST) -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations) && exit $$working
+	$(PYTEST) -p no:hypothesispytest -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations) && exit $$working
 
 long: $(VENV)/.dev
 	@TESTS=long $(PYTEST) -n $(JOBS)

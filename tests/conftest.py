@@ -72,6 +72,11 @@ def _blocks(module: str) -> dict[str, str]:
 
 
 @functools.cache
+def _block_waits(module: str, name: str) -> bool:
+    return WAITS.search(_blocks(module).get(name, "")) is not None
+
+
+@functools.cache
 def _reached(module: str, name: str) -> frozenset[tuple[str, str]]:
     """What of the tests a function or class of the tests names."""
     known, reached = vars(sys.modules[module]), set()
@@ -82,6 +87,7 @@ def _reached(module: str, name: str) -> frozenset[tuple[str, str]]:
     return frozenset(reached)
 
 
+@functools.cache
 def waits(function: Callable[..., Any]) -> bool:
     """Whether a function of the tests, or whatever of the tests it reaches, waits for the real clock."""
     seen, ahead = set(), [(function.__module__, function.__name__)]
@@ -89,7 +95,7 @@ def waits(function: Callable[..., Any]) -> bool:
         if (here := ahead.pop()) in seen:
             continue
         seen.add(here)
-        if WAITS.search(_blocks(here[0]).get(here[1], "")):
+        if _block_waits(*here):
             return True
         ahead += _reached(*here)
     return False
@@ -98,6 +104,11 @@ def waits(function: Callable[..., Any]) -> bool:
 @functools.cache
 def _text(path: Path) -> str:
     return path.read_text(encoding="utf-8")
+
+
+@functools.cache
+def _names_wait(path: Path) -> bool:
+    return "real_clock" in _text(path) or WAITS.search(_text(path)) is not None
 
 
 @functools.cache
@@ -110,6 +121,7 @@ def _imports(path: Path) -> frozenset[Path]:
     return frozenset(each for each in found if each.exists())
 
 
+@functools.cache
 def may_wait(path: Path) -> bool:
     """Whether a file, or whatever of the tests it imports, has anything to do with the real clock; it is not run."""
     seen, ahead = set(), [path]
@@ -117,16 +129,20 @@ def may_wait(path: Path) -> bool:
         if (here := ahead.pop()) in seen:
             continue
         seen.add(here)
-        if WAITS.search(_text(here)) or "real_clock" in _text(here):
+        if _names_wait(here):
             return True
         ahead += _imports(here)
     return False
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Where only tests of the real clock are wanted, leave files without any alone: eight processes read all others."""
-    wanted = config.getoption("markexpr").startswith("real_clock")
-    return True if wanted and collection_path.name.startswith("test_") and not may_wait(collection_path) else None
+    """Skip files without any test of the real clock, where only those are wanted: every worker imports all others."""
+    wanted = config.getoption("markexpr")
+    if not wanted.startswith("real_clock") or not collection_path.name.startswith("test_"):
+        return None
+    if "not sitl" in wanted and "\npytestmark = pytest.mark.sitl\n" in _text(collection_path):
+        return True
+    return None if may_wait(collection_path) else True
 
 
 def _functions(item: pytest.Item) -> list[Callable[..., Any]]:
