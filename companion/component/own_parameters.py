@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import float32
+from companion.autopilot.parameters.change import float32
 from companion.component.commands import Permission
 from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import AtArm

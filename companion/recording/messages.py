@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.imu_messages import EkfBiasReading
-from companion.autopilot.parameters.reading import FirmwareName
+from companion.autopilot.parameters.change import FirmwareName
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts

@@ -447,7 +447,7 @@ def _spoofed_values(scene: Scene) -> None:
 
 def _forged_dates_and_places(scene: Scene) -> None:
     """Under the autopilot's own ids, beside what it says itself: a year that no calendar has, the equator, 20 km up."""
-    one, boot_ms = stranger(scene, 1, 1), round((scene.stage.service.core.vehicle.boot.clock.latest_s or 0.0) * 1e3)
+    one, boot_ms = stranger(scene, 1, 1), round((scene.stage.service.core.vehicle.boot.latest or (0.0, 0.0))[0] * 1e3)
     one.say(mavlink.MAVLink_system_time_message(2**63, boot_ms))
     for lat, alt in ((1000, 50_000), (400_000_000, 20_000_000)):
         one.say(mavlink.MAVLink_global_position_int_message(boot_ms, lat, 1_160_000_000, alt, 0, 0, 0, 0, 0))

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import Change, WriteFailedError, same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle

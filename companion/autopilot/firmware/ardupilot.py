@@ -35,14 +35,7 @@ from companion.autopilot.firmware.imu_calibration import (
 )
 from companion.autopilot.firmware.imu_messages import HIGHRES, SCALED, SCALED2, SCALED3, SCRIPT
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import (
-    SCALES,
-    FirmwareName,
-    Parameters,
-    read_integer,
-    read_vector,
-)
+from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters
 from companion.errors import AutopilotError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.rotations import ROTATION_NAMES
@@ -119,8 +112,8 @@ class ArduPilot(Firmware):
         names = parameters_of(instance)
         if await parameters.read_optional(names.gyro_offset[0]) is None:
             raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
-        gyro_id = await read_integer(parameters, names.gyro_id)
-        accel_id = await read_integer(parameters, names.accel_id)
+        gyro_id = await parameters.read_integer(names.gyro_id)
+        accel_id = await parameters.read_integer(names.accel_id)
         for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
             if found == 0:
                 raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
@@ -128,9 +121,9 @@ class ArduPilot(Firmware):
         calibration = ImuCalibration(
             instance=instance,
             parameters=names,
-            gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
-            accel_offset_m_s2=await read_vector(parameters, names.accel_offset),
-            accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
+            gyro_offset_rad_s=await parameters.read_vector(names.gyro_offset),
+            accel_offset_m_s2=await parameters.read_vector(names.accel_offset),
+            accel_scale=await parameters.read_vector(names.accel_scale, *SCALES),
             gyro_id=gyro_id,
             accel_id=accel_id,
             orientation=await _read_board_rotation(parameters),
@@ -138,7 +131,7 @@ class ArduPilot(Firmware):
             zero_is_uncalibrated=True,
             rivals=await self.read_rivals(parameters),
         )
-        used = await read_integer(parameters, names.use) != 0
+        used = await parameters.read_integer(names.use) != 0
         return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used))
 
     thermal_changes = staticmethod(own_calibration.thermal_changes)

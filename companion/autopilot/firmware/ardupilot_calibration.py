@@ -17,8 +17,7 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, ImuParameters, Thermal, vector_changes
-from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import Parameters, read_integer
+from companion.autopilot.parameters.change import Change, Parameters
 from companion.errors import AutopilotError
 from companion.estimation.temperature.curve import ZERO, Polynomial
 from companion.physics.frames import vector
@@ -109,7 +108,7 @@ async def read_thermal(parameters: Parameters, instance: int) -> Thermal:
         AutopilotError: it is learning, or as `Parameters.read`.
     """
     names = parameters_of(instance)
-    enable = await read_integer(parameters, names.tcal_enable)
+    enable = await parameters.read_integer(names.tcal_enable)
     if enable is None:
         return Thermal()
     if enable == _LEARNING:

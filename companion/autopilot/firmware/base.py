@@ -13,11 +13,9 @@ from typing import Any, Final, Literal
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, Range, Rival
 from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import FirmwareName, Parameters, read_integer
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import Change, FirmwareName, Parameters, same_float32
 from companion.config.sections import Profile
-from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.errors import AutopilotError
 from companion.estimation.temperature.curve import Polynomial
 from companion.links.mavlink.link import Message
 from companion.physics.frames import Matrix
@@ -115,12 +113,9 @@ class Firmware:
             AutopilotError: no such IMU, a value that cannot be worked with, or as `Parameters.read`; or the autopilot
                 restarted meanwhile (AutopilotRebootedError).
         """
-        vehicle = parameters.vehicle
-        boots = vehicle.boots
+        boots = parameters.boots
         found = await self._read_calibration(parameters, instance, memory)
-        await vehicle.hear_boot_time()
-        if vehicle.boots != boots:
-            raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
+        await parameters.ensure_same_boot(boots, f"while the parameters of IMU {instance} were read")
         return found
 
     async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
@@ -133,9 +128,9 @@ class Firmware:
         """
         found: list[Rival] = []
         seen = {} if seen is None else seen
-        boots = parameters.vehicle.boots
+        boots = parameters.boots
         for rival in self.rivals:
-            value = await read_integer(parameters, rival.parameter)
+            value = await parameters.read_integer(rival.parameter)
             if value:
                 found.append(dataclasses.replace(rival, value=value))
                 seen[rival.parameter] = boots

@@ -10,7 +10,7 @@ from companion.autopilot.firmware.base import Firmware, OtherFirmware
 from companion.autopilot.firmware.imu_calibration import ACCEL_OFFSET, GYRO_OFFSET, ImuCalibration, Range
 from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.reading import FirmwareName, Parameters
+from companion.autopilot.parameters.change import FirmwareName, Parameters
 from companion.config.sections import Profile
 from companion.estimation.records.record import Outcome, WrittenParameter
 from companion.samples import Triad
@@ -42,7 +42,7 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
 
     `memory`: what earlier writes have shown about PX4's slots.
     """
-    firmware = firmware_named(parameters.vehicle.firmware)
+    firmware = firmware_named(parameters.firmware)
     return await firmware.read_calibration(parameters, instance, memory or SlotMemory())
 
 

@@ -18,9 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import SCALES
-from companion.autopilot.parameters.wire import float32, same_float32
+from companion.autopilot.parameters.change import SCALES, Change, float32, same_float32
 from companion.errors import CalibrationRefusedError
 from companion.estimation.solution.solve import ImuSolution
 from companion.estimation.temperature.curve import NOTHING, Polynomial

@@ -10,27 +10,19 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
+from msgspec import structs
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink.link import Message
 from companion.physics.units import MG
-from companion.samples import ImuSample, Vector
+from companion.samples import ImuSample
 
 MRAD: Final = 1e-3
 
 
-class Reading(msgspec.Struct, frozen=True, gc=False):
-    """One message in SI units."""
-
-    t_device_s: float
-    gyro_rad_s: Vector
-    accel_m_s2: Vector
-    temperature_degc: float | None
-
-    @property
-    def all_zero(self) -> bool:
-        """No accelerometer at rest or in flight reads exactly nothing: it is not there."""
-        return not any(self.gyro_rad_s) and not any(self.accel_m_s2)
+def all_zero(sample: ImuSample) -> bool:
+    """No accelerometer at rest or in flight reads exactly nothing: it is not there."""
+    return not any(sample.gyro_rad_s) and not any(sample.accel_m_s2)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -39,8 +31,8 @@ class ImuMessage:
 
     name: str
     message: type[Message]
-    decode: Callable[[Message], Reading | str]
-    """Returns the reading, or why there is none."""
+    decode: Callable[[Message, float], ImuSample | str]
+    """Returns the sample in a message received at a time, or why there is none."""
     integers: bool = False
     """Values are cut toward zero to thousandths of rad/s and g."""
 
@@ -59,7 +51,7 @@ _ACCEL_AND_GYRO: Final = 0b111111
 """HIGHRES_IMU.fields_updated: all three axes of both."""
 
 
-def _highres(message: Any) -> Reading | str:
+def _highres(message: Any, t_s: float) -> ImuSample | str:
     if message.id != 0:  # the first usable one: not ours when the autopilot does not use its first IMU
         return f"HIGHRES_IMU shows IMU {message.id + 1}"
     if message.fields_updated & _ACCEL_AND_GYRO != _ACCEL_AND_GYRO:
@@ -69,16 +61,17 @@ def _highres(message: Any) -> Reading | str:
     if not all(map(math.isfinite, (*gyro, *accel))):
         return "HIGHRES_IMU with a value that is not a number"
     # Its temperature is the barometer's (ArduPilot) or the air's (PX4).
-    return Reading(message.time_usec * 1e-6, gyro, accel, None)
+    return ImuSample(t_s, gyro, accel, t_device_s=message.time_usec * 1e-6)
 
 
-def _scaled(message: Any) -> Reading:
-    return Reading(
-        message.time_boot_ms * 1e-3,
+def _scaled(message: Any, t_s: float) -> ImuSample:
+    return ImuSample(
+        t_s,
         (message.xgyro * MRAD, message.ygyro * MRAD, message.zgyro * MRAD),
         (message.xacc * MG, message.yacc * MG, message.zacc * MG),
         # Zero means that there is none: a sensor at 0 deg C says 0.01 (MAVLink common.xml).
         message.temperature * 0.01 if message.temperature else None,
+        t_device_s=message.time_boot_ms * 1e-3,
     )
 
 
@@ -93,14 +86,14 @@ _SCRIPT_NAME: Final = "CMP_IMU"
 _SCRIPT_FLOATS: Final = 7
 
 
-def _from_script(instance: int, message: Any) -> Reading | str:
+def _from_script(instance: int, message: Any, t_s: float) -> ImuSample | str:
     if message.name != _SCRIPT_NAME or message.array_id != 1:
         return ""  # somebody else's
     values = message.data[_SCRIPT_FLOATS * (instance - 1) :][:_SCRIPT_FLOATS]
     if not all(map(math.isfinite, values)):
         return "the script tells a value that is not a number"
     gx, gy, gz, ax, ay, az, degc = values
-    return Reading(message.time_usec * 1e-6, (gx, gy, gz), (ax, ay, az), degc or None)
+    return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), degc or None, t_device_s=message.time_usec * 1e-6)
 
 
 SCRIPT: Final = {
@@ -137,28 +130,31 @@ class EkfBiasReading(msgspec.Struct, frozen=True):
     """Squares of the same units."""
     read_s: float
 
-    def restored(self, reading: Reading, now_s: float) -> tuple[Reading, Six]:
-        """Return a HIGHRES_IMU as it was before the bias was taken off, and the variances of that bias."""
-        gx, gy, gz, ax, ay, az = (np.array(reading.gyro_rad_s + reading.accel_m_s2) + self.bias).tolist()
-        variance: Six = tuple((np.array(self.variance) + np.square(_WALK) * (now_s - self.read_s)).tolist())
-        return Reading(reading.t_device_s, (gx, gy, gz), (ax, ay, az), None), variance
+    def restored(self, sample: ImuSample) -> ImuSample:
+        """Return a HIGHRES_IMU as it was before the bias was taken off, with the variances of that bias."""
+        gx, gy, gz, ax, ay, az = (np.array(sample.gyro_rad_s + sample.accel_m_s2) + self.bias).tolist()
+        variance = (np.array(self.variance) + np.square(_WALK) * (sample.t_s - self.read_s)).tolist()
+        return structs.replace(
+            sample, gyro_rad_s=(gx, gy, gz), accel_m_s2=(ax, ay, az), shared_variance=tuple(variance)
+        )
 
 
 class ImuSamples:
-    """Turns readings into samples. Knows no clock: time comes in with the messages."""
+    """Completes the samples of one IMU's messages. Knows no clock: time comes in with the messages."""
 
     def __init__(self) -> None:
         self.temperature: tuple[float, float] | None = None
         """Temperature of the IMU in deg C and its time; None: none since the restart."""
         self._device_s: dict[str, float] = {}
 
-    def accept(self, message: str, reading: Reading, t_s: float) -> bool:
-        """Note the reading's temperature; False: the message is repeated or late."""
-        if -_LATE_S < reading.t_device_s - self._device_s.get(message, -math.inf) <= 0.0:
+    def accept(self, message: str, sample: ImuSample) -> bool:
+        """Note the sample's temperature; False: the message is repeated or late."""
+        device_s = sample.t_device_s or 0.0
+        if -_LATE_S < device_s - self._device_s.get(message, -math.inf) <= 0.0:
             return False
-        self._device_s[message] = reading.t_device_s
-        if reading.temperature_degc is not None:
-            self.temperature = (reading.temperature_degc, t_s)
+        self._device_s[message] = device_s
+        if sample.temperature_degc is not None:
+            self.temperature = (sample.temperature_degc, sample.t_s)
         return True
 
     def temperature_degc(self, now_s: float) -> float | None:
@@ -166,12 +162,7 @@ class ImuSamples:
         known = self.temperature
         return None if known is None or now_s - known[1] > TEMPERATURE_AGE_S else known[0]
 
-    def sample(self, reading: Reading, t_s: float, bias: EkfBiasReading | None = None) -> ImuSample:
-        """Return the sample of a reading that was accepted; `bias` is added to it."""
-        variance = None
-        if bias is not None:
-            reading, variance = bias.restored(reading, t_s)
-        degc = self.temperature_degc(t_s)
-        return ImuSample(
-            t_s, reading.gyro_rad_s, reading.accel_m_s2, degc, None, reading.t_device_s, shared_variance=variance
-        )
+    def complete(self, sample: ImuSample, bias: EkfBiasReading | None = None) -> ImuSample:
+        """Return a sample that was accepted with the IMU's temperature; `bias` is added to it."""
+        restored = sample if bias is None else bias.restored(sample)
+        return structs.replace(restored, temperature_degc=self.temperature_degc(sample.t_s))

@@ -33,8 +33,7 @@ from companion.autopilot.firmware.imu_calibration import (
 )
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
 from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Slot, SlotMemory, read_slots
-from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import SCALES, FirmwareName, Parameters, read_integer, read_vector
+from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters
 from companion.errors import AutopilotError
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import MG
@@ -144,18 +143,18 @@ class PX4(Firmware):
     # --- IMUs
 
     async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
-        boots = parameters.vehicle.boots
+        boots = parameters.boots
         accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
         gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
         names = parameters_of(gyro.number, accel.number)
-        offset = await read_vector(parameters, names.accel_offset)
+        offset = await parameters.read_vector(names.accel_offset)
         orientation = await _read_rotation(parameters, gyro, accel)
         calibration = ImuCalibration(
             instance=instance,
             parameters=names,
-            gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
+            gyro_offset_rad_s=await parameters.read_vector(names.gyro_offset),
             accel_offset_m_s2=offset,
-            accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
+            accel_scale=await parameters.read_vector(names.accel_scale, *SCALES),
             gyro_id=gyro.device_id,
             accel_id=accel.device_id,
             orientation=orientation,
@@ -247,9 +246,9 @@ class PX4(Firmware):
         closed: list[str] = []
         for number in range(_LINKS):
             # MAV_n_CONFIG = 0: there is no such link.
-            if await read_integer(parameters, f"MAV_{number}_CONFIG") == 0:
+            if await parameters.read_integer(f"MAV_{number}_CONFIG") == 0:
                 continue
-            if await read_integer(parameters, f"MAV_{number}_FORWARD") == 0:
+            if await parameters.read_integer(f"MAV_{number}_FORWARD") == 0:
                 closed.append(f"MAV_{number}")
         return closed
 
@@ -310,9 +309,9 @@ async def _read_level(parameters: Parameters) -> Vector:
 
 async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:
     """Read the rotation of a sensor against the vehicle, without the level adjustment."""
-    own = await read_integer(parameters, f"{PREFIX[sensor]}{slot.number}_ROT")
+    own = await parameters.read_integer(f"{PREFIX[sensor]}{slot.number}_ROT")
     internal = slot.bus == _SIMULATION_BUS or (slot.bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
-    number = await read_integer(parameters, "SENS_BOARD_ROT") if internal else own
+    number = await parameters.read_integer("SENS_BOARD_ROT") if internal else own
     # PX4 takes a number that it does not know for no rotation.
     if number is None or not 0 <= number < len(ROTATION_NAMES):
         number = 0

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Final
 
-from companion.autopilot.parameters.reading import Parameters, read_integer
+from companion.autopilot.parameters.change import Parameters
 from companion.errors import AutopilotError
 from companion.samples import Triad, Vector
 
@@ -43,9 +43,9 @@ async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
     """
     found: list[Slot] = []
     for number in range(SLOTS):
-        device_id = await read_integer(parameters, f"{PREFIX[sensor]}{number}_ID")
+        device_id = await parameters.read_integer(f"{PREFIX[sensor]}{number}_ID")
         if device_id:
-            priority = await read_integer(parameters, f"{PREFIX[sensor]}{number}_PRIO")
+            priority = await parameters.read_integer(f"{PREFIX[sensor]}{number}_PRIO")
             found.append(Slot(number, device_id, enabled=priority != 0))
     return tuple(found)
 

@@ -1,18 +1,93 @@
-"""Changes of parameters: planned, in the order that PX4's vectors need, and failed.
+"""Parameters as firmwares ask for them, their values as 32 bit floats, and changes of them.
 
 PX4 ignores a small change of a vector of offsets, unless the vector makes a far step first (`Change.via`).
 """
 
 from __future__ import annotations
 
+import abc
 import dataclasses
+import math
 import re
-from collections.abc import Awaitable, Callable, Sequence
+import struct
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import ClassVar, Final, Literal
 
-from companion.autopilot.parameters.wire import float32
 from companion.errors import AutopilotError, NotDisarmedError
 from companion.estimation.records.record import Outcome, WrittenParameter
+from companion.samples import Vector
+
+FirmwareName = Literal["ardupilot", "px4", "other"]
+
+SCALES: Final = (0.5, 2.0)
+"""Accelerometer scales with which a calibration works: it divides by them."""
+
+
+def float32(value: float) -> float:
+    """The nearest 32 bit float; infinite when there is none."""
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+def same_float32(one: float, other: float) -> bool:
+    """Compare two numbers as 32 bit floats, to within 1 ulp; NaN equals nothing."""
+    if not (math.isfinite(one) and math.isfinite(other)):
+        return False
+    return abs(_rank(one) - _rank(other)) <= 1
+
+
+def _rank(value: float) -> int:
+    """The position of a float among all 32 bit floats in order; both zeros are 0."""
+    bits: int = struct.unpack("<i", struct.pack("<f", value))[0]
+    return bits if bits >= 0 else -(bits & 0x7FFFFFFF)
+
+
+class Parameters(abc.ABC):
+    """Parameters read by name, of an autopilot that answers or of a log; `ParameterClient` says what they raise."""
+
+    @property
+    @abc.abstractmethod
+    def firmware(self) -> FirmwareName | None:
+        """None: not known yet."""
+
+    @property
+    @abc.abstractmethod
+    def boots(self) -> int:
+        """Starts of the autopilot that have been seen."""
+
+    @abc.abstractmethod
+    async def read(self, name: str) -> float:
+        """Read one that must exist."""
+
+    @abc.abstractmethod
+    async def read_optional(self, name: str) -> float | None:
+        """Read one; None: there is no such parameter."""
+
+    @abc.abstractmethod
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
+        """Read several; where `optional`, what does not exist is left out."""
+
+    @abc.abstractmethod
+    async def ensure_same_boot(self, boots: int, when: str) -> None:
+        """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
+
+    async def read_vector(self, names: tuple[str, str, str], low: float = -math.inf, high: float = math.inf) -> Vector:
+        """Read three numbers within limits, such as `SCALES`; raise AutopilotError where one is outside."""
+        x, y, z = [await self.read(name) for name in names]
+        for name, value in zip(names, (x, y, z), strict=True):
+            if not math.isfinite(value) or not low <= value <= high:
+                raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
+        return x, y, z
+
+    async def read_integer(self, name: str) -> int | None:
+        """Read a whole number; None where the firmware has none. Raise AutopilotError where it is not a number."""
+        value = await self.read_optional(name)
+        if value is not None and not math.isfinite(value):
+            raise AutopilotError(f"{name} is {value}; a whole number was expected")
+        return None if value is None else round(value)
+
 
 FailureKind = Literal[
     "refused",

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Final, Literal
 
 import numpy as np
@@ -32,6 +32,7 @@ SCALE_TOLERANCE: Final = 0.05
 """Besides noise: a sensor's scale error and cross-axis sensitivity change the step by a few percent at most."""
 
 AxisWord = Literal["seen", "too small to see", "not seen", "wrong"]
+_REFUTED: Final = ("not seen", "wrong")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -60,20 +61,11 @@ class Observation:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class AxisVerdict:
-    """One parameter, by the step in its axis."""
-
-    parameter: str
-    word: AxisWord
-    words: str
-    """The figures, and what is wrong."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
 class EffectVerdict:
     """One vector."""
 
-    axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
+    axes: Mapping[str, AxisWord]
+    """By parameter: the step in its axis."""
     fraction_sigma: float | None
     """Sigma of the share of the expected step that was made, over all axes; None when nothing had to move."""
     problems: tuple[str, ...]
@@ -87,10 +79,8 @@ class EffectVerdict:
 
     def outcome(self, parameter: str) -> Literal["verified", "stored", "failed"]:
         """Return the outcome of a parameter that read back right."""
-        word = next(axis.word for axis in self.axes if axis.parameter == parameter)
-        if word in ("not seen", "wrong"):
-            return "failed"
-        return "verified" if word == "seen" else "stored"
+        word = self.axes[parameter]
+        return "failed" if word in _REFUTED else "verified" if word == "seen" else "stored"
 
 
 def judge(seen: Observation) -> EffectVerdict:
@@ -104,26 +94,28 @@ def judge(seen: Observation) -> EffectVerdict:
     slack = 2.0 * seen.resolution
     fraction, fraction_sigma = _matched_filter(made, expected, sigma, seen.resolution)
     together = _together(fraction, fraction_sigma)
-    x, y, z = (
-        _judge_axis(name, float(e), float(m), float(s), slack, seen.unit)
-        for name, e, m, s in zip(seen.parameters, expected, made, sigma, strict=True)
-    )
+    axes: dict[str, AxisWord] = {}
+    problems: list[str] = []
+    for name, e, m, s in zip(seen.parameters, expected.tolist(), made.tolist(), sigma.tolist(), strict=True):
+        axes[name], why = _judge_axis(e, m, s, slack)
+        if axes[name] in _REFUTED:
+            figures = f"the output moved by {m:.3g} {seen.unit}, expected {e:.3g}, noise {s:.2g}"
+            problems.append(f"{name}: {figures}: {why}")
     residual = np.asarray(seen.after) - np.asarray(seen.truth)
     allowed = seen.tolerance + SIGMAS * np.asarray(seen.after_sigma) + seen.resolution
     within = [bool(inside) for inside in np.abs(residual) <= allowed]
-    axes = (x, y, z)
-    problems = [axis.words for axis in axes if axis.word in ("not seen", "wrong")]
-    if not problems and together in ("not seen", "wrong"):
-        problems.append(_together_words(seen.parameters, together, fraction or 0.0))
+    family = f"{seen.parameters[0]}, {', '.join('_' + name[-1] for name in seen.parameters[1:])}"
+    if not problems and together == "not seen":
+        problems.append(f"{family}: no axis moved as written; the autopilot stored the values but does not use them")
+    elif not problems and together == "wrong":
+        problems.append(f"{family}: the output made {fraction or 0.0:.0%} of the step that was written")
     for axis_name, inside, value, limit in zip("xyz", within, residual, allowed, strict=True):
         if not inside:
             problems.append(
                 f"after the write {axis_name} is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g}"
-                f" ({_family(seen.parameters)})"
+                f" ({family})"
             )
-    hidden = [
-        axis.parameter for axis, step in zip(axes, expected, strict=True) if axis.word == "too small to see" and step
-    ]
+    hidden = [name for name, step in zip(axes, expected, strict=True) if axes[name] == "too small to see" and step]
     return EffectVerdict(
         axes=axes,
         fraction_sigma=fraction_sigma,
@@ -132,22 +124,19 @@ def judge(seen: Observation) -> EffectVerdict:
     )
 
 
-def _judge_axis(parameter: str, expected: float, made: float, sigma: float, slack: float, unit: str) -> AxisVerdict:
+def _judge_axis(expected: float, made: float, sigma: float, slack: float) -> tuple[AxisWord, str]:
+    """Judge the step of one axis, and say what is wrong with it."""
     noise = SIGMAS * sigma + slack
     agrees = abs(made - expected) <= noise + SCALE_TOLERANCE * abs(expected)
-    word: AxisWord = "wrong"
     if not all(map(math.isfinite, (expected, made, sigma))):
-        why = "not a number"
-    elif abs(expected) < 2 * noise:
-        word, why = ("too small to see", "") if agrees else ("wrong", "it moved although it should not")
-    elif agrees:
-        word, why = "seen", ""
-    elif abs(made) <= noise:
-        word, why = "not seen", "the autopilot stored the value but does not use it"
-    else:
-        why = "not the step that was written (sign, orientation, scale, or it moved)"
-    figures = f"the output moved by {made:.3g} {unit}, expected {expected:.3g}, noise {sigma:.2g}"
-    return AxisVerdict(parameter, word, f"{parameter}: {figures}: {why}")
+        return "wrong", "not a number"
+    if abs(expected) < 2 * noise:
+        return ("too small to see", "") if agrees else ("wrong", "it moved although it should not")
+    if agrees:
+        return "seen", ""
+    if abs(made) <= noise:
+        return "not seen", "the autopilot stored the value but does not use it"
+    return "wrong", "not the step that was written (sign, orientation, scale, or it moved)"
 
 
 def _matched_filter(made: Array, expected: Array, sigma: Array, resolution: float) -> tuple[float | None, float | None]:
@@ -164,14 +153,3 @@ def _together(fraction: float | None, sigma: float | None) -> AxisWord:
     if abs(fraction - 1.0) <= SIGMAS * sigma + SCALE_TOLERANCE:
         return "seen"
     return "not seen" if abs(fraction) <= SIGMAS * sigma else "wrong"
-
-
-def _together_words(parameters: Sequence[str], word: AxisWord, fraction: float) -> str:
-    family = _family(parameters)
-    if word == "not seen":
-        return f"{family}: no axis moved as written; the autopilot stored the values but does not use them"
-    return f"{family}: the output made {fraction:.0%} of the step that was written"
-
-
-def _family(parameters: Sequence[str]) -> str:
-    return f"{parameters[0]}, {', '.join('_' + name[-1] for name in parameters[1:])}"

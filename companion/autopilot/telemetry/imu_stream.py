@@ -341,15 +341,15 @@ class ImuStream:
         source = next((each for each in self._sources if each.message.message is type(message)), None)
         if source is None or not self._usable(source):
             return
-        reading = source.message.decode(message)
-        if isinstance(reading, str):
-            source.reason = reading
+        sample = source.message.decode(message, t_s)
+        if isinstance(sample, str):
+            source.reason = sample
             return
-        if reading.all_zero:
+        if imu_messages.all_zero(sample):
             source.zeros = min(source.zeros + 1, _ABSENT_AFTER)
             self._arrived.set()
             return
-        if not self._reader.accept(source.message.name, reading, t_s):
+        if not self._reader.accept(source.message.name, sample):
             return
         source.last_s, source.zeros, source.reason = t_s, 0, ""
         source.recent += 1
@@ -358,7 +358,7 @@ class ImuStream:
             self.samples += 1
             self.problem = ""
             bias = self._ekf_bias.reading if source.message is imu_messages.PX4_FLOATS else None
-            self._on_sample(self._reader.sample(reading, t_s, bias))
+            self._on_sample(self._reader.complete(sample, bias))
 
     def _lose(self, problem: str) -> None:
         self._switch(None)

@@ -21,7 +21,6 @@ import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Final
 
-import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -30,7 +29,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
-from companion.samples import Vector
+from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
 
@@ -257,21 +256,6 @@ _STATUS: Final = re.compile(
 )
 
 
-class RawMean(msgspec.Struct, frozen=True):
-    """Mean of 0.1 s of one IMU's readings, nothing taken off, vehicle FRD."""
-
-    instance: int
-    """1 to 3."""
-    t_s: float
-    boot_us: int
-    """Time of its publication since the autopilot's boot."""
-    gyro_id: int
-    accel_id: int
-    gyro_rad_s: Vector
-    accel_m_s2: Vector
-    temperature_degc: float | None
-
-
 class ImuStatus:
     """Has the console print the status of the IMUs that want it, in turn; `run` it."""
 
@@ -280,15 +264,18 @@ class ImuStatus:
         console: Px4Console,
         ekf_bias: EkfBias,
         wanted: Callable[[], Collection[int]],
-        tell: Callable[[RawMean], None],
+        tell: Callable[[int, int, int, ImuSample], None],
         *,
         slow: bool,
     ) -> None:
-        """`wanted`: instances (1 to 3) whose telemetry is integers; `tell` is given every reading."""
+        """`wanted`: instances (1 to 3) whose telemetry is integers.
+
+        `tell` is given instance, device ids of gyro and accelerometer, and the mean of 0.1 s of raw readings.
+        """
         self._console, self._ekf_bias, self._wanted, self._tell = console, ekf_bias, wanted, tell
         self._pause_s = SLOW_PAUSE_S if slow else PAUSE_S
-        self._seen: dict[int, int] = {}
-        """Publication printed last, by instance."""
+        self._seen: dict[int, str] = {}
+        """Time of the publication printed last, by instance."""
 
     async def run(self) -> None:
         """Ask until cancelled."""
@@ -305,22 +292,17 @@ class ImuStatus:
         found = await self._console.listener("vehicle_imu_status", _STATUS, "-i", str(instance - 1))
         if found is None:
             return False
-        boot_us = int(found[1])
-        if not self._ekf_bias.may_ask or self._seen.get(instance) == boot_us:
+        if not self._ekf_bias.may_ask or self._seen.get(instance) == found[1]:
             return True  # offsets are being written meanwhile, or it is the same again
-        self._seen[instance] = boot_us
+        self._seen[instance] = found[1]
         ax, ay, az, gx, gy, gz = map(float, found.group(4, 5, 6, 7, 8, 9))
         degc = float(found[13])  # it may print "nan"
-        self._tell(
-            RawMean(
-                instance,
-                asyncio.get_running_loop().time(),
-                boot_us,
-                gyro_id=int(found[3]),
-                accel_id=int(found[2]),
-                gyro_rad_s=(gx, gy, gz),
-                accel_m_s2=(ax, ay, az),
-                temperature_degc=degc if math.isfinite(degc) else None,
-            )
+        mean = ImuSample(
+            asyncio.get_running_loop().time(),
+            (gx, gy, gz),
+            (ax, ay, az),
+            degc if math.isfinite(degc) else None,
+            t_device_s=int(found[1]) * 1e-6,
         )
+        self._tell(instance, int(found[3]), int(found[2]), mean)
         return True

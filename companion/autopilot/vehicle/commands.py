@@ -16,7 +16,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.reading import FirmwareName
+from companion.autopilot.parameters.change import FirmwareName
 from companion.links.mavlink.link import MavlinkLink, Message
 
 _COPY_S: Final = 0.5

@@ -16,9 +16,9 @@ from typing import Final, Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters, parameters_of
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
-from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
+from companion.errors import AutopilotError, NotDisarmedError
 
 logger = logging.getLogger(__name__)
 
@@ -45,8 +45,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     Raises:
         AutopilotError: one cannot be read, or the autopilot restarted meanwhile.
     """
-    vehicle, every = parameters.vehicle, [parameters_of(instance) for instance in INSTANCES]
-    boots = vehicle.boots
+    boots, every = parameters.boots, [parameters_of(instance) for instance in INSTANCES]
     found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
     present = [names for names in every if names.gyro_offset[0] in found]
     if not present:
@@ -54,8 +53,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     found |= await parameters.read_many(name for names in present for name in names.gyro_offset[1:])
     more = (name for names in present for name in (names.gyro_caltemp, names.gyro_id))
     found |= await parameters.read_many(more, optional=True)
-    if vehicle.boots != boots:
-        raise AutopilotRebootedError(f"{vehicle.name} restarted while its gyro parameters were read")
+    parameters.require_same_boot(boots, "while its gyro parameters were read")
     return found
 
 
@@ -84,11 +82,6 @@ async def calibrate(
     """
     vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
     boots = vehicle.boots
-
-    def require_same_boot() -> None:
-        if vehicle.boots != boots:
-            raise AutopilotRebootedError(f"{vehicle.name} restarted during its gyro calibration")
-
     go_on("the autopilot calibrates its gyros: keep the aircraft still")
     try:
         await vehicle.disarmed.ensure()
@@ -102,7 +95,7 @@ async def calibrate(
                 await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
             else:
                 await asyncio.wait([answer], timeout=_LOOK_S)
-            require_same_boot()
+            parameters.require_same_boot(boots, "during its gyro calibration")
             state = await _state(parameters, before)
             if state == "ended":
                 # An acknowledgement that is still on its way says more than its absence.
@@ -115,7 +108,7 @@ async def calibrate(
                 go_on(f"the autopilot calibrates its gyros for {loop.time() - sent_s:.0f} s: keep the aircraft still")
         await asyncio.sleep(_AFTERWARDS_S)
         after = await read_overwritten(parameters)
-        require_same_boot()
+        parameters.require_same_boot(boots, "during its gyro calibration")
         outcome, words = _judge(answer.result() if answer.done() else None, ran=bool(changed(before, after)))
         return outcome, words, after
     finally:

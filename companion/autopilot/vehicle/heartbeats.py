@@ -1,4 +1,4 @@
-"""Heartbeats: which of all on a network are the autopilot's, and whether it is armed. Pure, time comes in.
+"""Which heartbeats on a network are the autopilot's, whether it is armed, has restarted. Pure: time comes in.
 
 Anybody on an unsigned link can say "disarmed" under the autopilot's ids, as often as he likes; but the autopilot's own
 heartbeats are heard too. So "armed" outweighs "disarmed", and who says both by turns is not believed at all.
@@ -148,3 +148,61 @@ class Latch:
             return False
         first_s = self._candidates.setdefault((system, component), t_s)
         return t_s - first_s >= ADOPT_OTHER_COMPONENT_S
+
+
+_BACK_S: Final = 0.5
+"""Late and repeated packets step back by milliseconds; a restart by all the time it was up."""
+
+_GAP_S: Final = 2.0
+_CONFIRM_S: Final = 0.5
+_CLOCKS: Final = 1.01
+"""More than two quartz clocks ever differ by."""
+_WRAP_S: Final = 2**32 * 1e-3
+"""time_boot_ms is a 32 bit number: it starts again after 49.7 days."""
+
+
+class BootClock:
+    """Tells restarts from the time since boot that many messages carry; all of them count from the same boot.
+
+    A restart shows in one of two ways. The time goes back. Or, after a silence, it has advanced by less than half
+    of what the host's clock has, and is not longer than the silence: a restart while the link was lost, of which the
+    time since boot has meanwhile overtaken the old one. (Half, since a simulator may run slower than real time; on a
+    busy machine slower than that, but an autopilot that was up for longer than we heard nothing has not restarted
+    meanwhile. And the first messages after a silence of our own making are old ones from a buffer, so this second way
+    must hold for another half second.)
+    """
+
+    def __init__(self) -> None:
+        self.latest: tuple[float, float] | None = None
+        """The time since boot that was heard last, and when."""
+        self._before_gap: tuple[float, float] | None = None
+        self._suspected_s = 0.0
+
+    def rebooted(self, boot_s: float, t_s: float) -> bool:
+        """Note a time since boot received at `t_s`; return whether a restart lies between it and the last."""
+        if self.latest is None:
+            self.latest = (boot_s, t_s)
+            return False
+        last_boot_s, last_t_s = self.latest
+        advance_s = boot_s - last_boot_s
+        if advance_s < -_BACK_S and not (last_boot_s > _WRAP_S - 60.0 and boot_s < 60.0 + (t_s - last_t_s)):
+            self.latest, self._before_gap = (boot_s, t_s), None
+            return True
+        if self._before_gap is None and _too_slow(boot_s, t_s, self.latest):
+            self._before_gap, self._suspected_s = self.latest, t_s
+        elif self._before_gap is not None:
+            if not _too_slow(boot_s, t_s, self._before_gap):
+                self._before_gap = None
+            elif t_s - self._suspected_s >= _CONFIRM_S:
+                self.latest, self._before_gap = (boot_s, t_s), None
+                return True
+        if advance_s < -_BACK_S or advance_s >= 0.0:
+            self.latest = (boot_s, t_s)
+        return False
+
+
+def _too_slow(boot_s: float, t_s: float, since: tuple[float, float]) -> bool:
+    silence_s = t_s - since[1]
+    advance_s = (boot_s - since[0]) % _WRAP_S
+    fits_in_silence = boot_s <= silence_s * _CLOCKS + _BACK_S
+    return silence_s > _GAP_S and fits_in_silence and advance_s < 0.5 * silence_s - 0.5

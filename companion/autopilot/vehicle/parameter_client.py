@@ -11,13 +11,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import struct
 from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import INTEGER_FORMATS, REAL32, decode, encode, float32, same_float32
+from companion.autopilot.parameters.change import FirmwareName, Parameters, float32, same_float32
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
@@ -93,7 +94,7 @@ class _Inbox:
         return answer
 
 
-class ParameterClient:
+class ParameterClient(Parameters):
     """The parameters of one autopilot."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
@@ -114,6 +115,26 @@ class ParameterClient:
         vehicle.hear(mavlink.MAVLink_param_value_message, self._on_value)
         vehicle.hear(mavlink.MAVLink_param_error_message, self._on_error)
         vehicle.on_event.add(self._on_event)
+
+    @property
+    def firmware(self) -> FirmwareName | None:
+        """None before the first heartbeat."""
+        return self.vehicle.firmware
+
+    @property
+    def boots(self) -> int:
+        """Starts of the autopilot that have been seen."""
+        return self.vehicle.boots
+
+    async def ensure_same_boot(self, boots: int, when: str) -> None:
+        """Ask for the time since boot, then as `require_same_boot`."""
+        await self.vehicle.hear_boot_time()
+        self.require_same_boot(boots, when)
+
+    def require_same_boot(self, boots: int, when: str) -> None:
+        """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
+        if self.boots != boots:
+            raise AutopilotRebootedError(f"{self.vehicle.name} restarted {when}")
 
     async def read(self, name: str) -> float:
         """Ask for a parameter by name and return what comes.
@@ -200,9 +221,9 @@ class ParameterClient:
             AutopilotRebootedError: the autopilot restarted meanwhile; it may have had its effect.
         """
         kind = await self._type_of(name)
-        whole = kind in INTEGER_FORMATS
+        whole = kind in _INTEGER_FORMATS
         wanted = value if whole else float32(value)
-        carried = encode(wanted, kind, bytewise=self.integers_bytewise)
+        carried = _encode(wanted, kind, bytewise=self.integers_bytewise)
         if not math.isfinite(wanted) or carried is None:
             what = "a whole number" if whole else "a number"
             raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
@@ -300,10 +321,10 @@ class ParameterClient:
     async def _type_of(self, name: str) -> int:
         """The type to write a parameter as; only firmware that carries integers byte by byte minds."""
         if not self.integers_bytewise:
-            return REAL32
+            return _REAL32
         if name not in self._types:
             await self.read(name)
-        return self._types.get(name, REAL32)
+        return self._types.get(name, _REAL32)
 
     def _target(self) -> tuple[int, int]:
         if self.vehicle.system_id is None:
@@ -311,7 +332,7 @@ class ParameterClient:
         return self.vehicle.system_id, self.vehicle.component_id
 
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
-        name, value = message.param_id, decode(message, bytewise=self.integers_bytewise)
+        name, value = message.param_id, _decode(message, bytewise=self.integers_bytewise)
         self._absent.discard(name)
         if len(self._types) < _REMEMBERED_TYPES or name in self._types:
             self._types[name] = message.param_type
@@ -344,3 +365,48 @@ def _wire_name(name: str) -> bytes:
     if len(data) > 16:  # the codec would cut it, and the rest may be another parameter's name
         raise ValueError(f"{name!r} is longer than the 16 characters of a MAVLink parameter name")
     return data
+
+
+# ArduPilot sends every value as a number and ignores the type it is sent back. PX4 puts the bytes of an integer into
+# the float field, and refuses a PARAM_SET whose type is not the parameter's own (autopilots 7.5).
+
+_INTEGER_FORMATS: Final[dict[int, str]] = {
+    mavlink.MAV_PARAM_TYPE_UINT8: "<B",
+    mavlink.MAV_PARAM_TYPE_INT8: "<b",
+    mavlink.MAV_PARAM_TYPE_UINT16: "<H",
+    mavlink.MAV_PARAM_TYPE_INT16: "<h",
+    mavlink.MAV_PARAM_TYPE_UINT32: "<I",
+    mavlink.MAV_PARAM_TYPE_INT32: "<i",
+}
+_HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}
+"""Length of the header of MAVLink 1 and 2, by the first byte of a packet."""
+
+_REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
+
+
+def _decode(message: mavlink.MAVLink_param_value_message, *, bytewise: bool) -> float:
+    """Return the value that a PARAM_VALUE means; integers of 32 bits are exact in a Python float."""
+    if not bytewise or message.param_type not in _INTEGER_FORMATS:
+        return float(message.param_value)
+    # The bytes as they came: a float that is no number would lose some of its bits on the way through one. The value
+    # is the first field of the payload (param_value float, count, index, id, type).
+    packet = bytes(message.get_msgbuf() or b"")
+    start = _HEADER_BYTES.get(packet[0], len(packet)) if packet else 0
+    carried = packet[start : start + 4] or struct.pack("<f", message.param_value)
+    return float(struct.unpack_from(_INTEGER_FORMATS[message.param_type], carried.ljust(4, b"\0"))[0])
+
+
+def _encode(value: float, kind: int, *, bytewise: bool) -> float | None:
+    """Return the float that carries a value as a type; None when none can (a fraction, out of range, no number)."""
+    if not bytewise or kind not in _INTEGER_FORMATS:
+        return value
+    form = _INTEGER_FORMATS[kind]
+    try:
+        if value != int(value):
+            return None
+        carried = struct.pack(form, int(value)).ljust(4, b"\0")
+    except (struct.error, OverflowError, ValueError):
+        return None
+    number: float = struct.unpack("<f", carried)[0]
+    # A pattern that stands for a signalling NaN does not survive as a float.
+    return number if struct.pack("<f", number) == carried else None

@@ -25,8 +25,8 @@ from companion.autopilot.parameters.change import (
     PendingVector,
     WriteFailedError,
     by_vector,
+    same_float32,
 )
-from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer
 from companion.errors import (

@@ -11,19 +11,19 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.base import Firmware
 from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_with
-from companion.autopilot.parameters.reading import FirmwareName
-from companion.autopilot.vehicle.boot_clock import BootClock, BootWatch
+from companion.autopilot.parameters.change import FirmwareName
 from companion.autopilot.vehicle.commands import Commands, StandingRequests
 from companion.autopilot.vehicle.disarmed import DisarmedCheck
 from companion.autopilot.vehicle.heartbeats import (
     ArmingWatch,
     ArmState,
+    BootClock,
     Latch,
     is_aircraft,
     unique_id,
@@ -31,7 +31,9 @@ from companion.autopilot.vehicle.heartbeats import (
 )
 from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
+from companion.links.mavlink.signing import EARLIEST_S
 from companion.links.system.listeners import Listeners
+from companion.links.system.waiting import comes
 
 __all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 
@@ -85,7 +87,8 @@ class Vehicle:
         self.place = TimeAndPlace(is_carried)
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
         self.disarmed = DisarmedCheck(link, self.commands, lambda: self.arm_state, lambda: self.name)
-        self.boot = BootWatch(link, self.sent, self._restarted)
+        self.boot = BootClock()
+        self._boot_heard = asyncio.Event()
         self._link = link
         self._latch = Latch(system_id)
         self._heartbeat_s: float | None = None
@@ -105,6 +108,15 @@ class Vehicle:
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
+        # Before anybody else hears of the message that shows a restart.
+        for kind in (
+            mavlink.MAVLink_system_time_message, mavlink.MAVLink_global_position_int_message,
+            mavlink.MAVLink_attitude_message, mavlink.MAVLink_scaled_imu_message, mavlink.MAVLink_scaled_imu2_message,
+            mavlink.MAVLink_scaled_imu3_message,
+        ):  # fmt: skip
+            link.subscribe(kind, self._on_boot_ms)
+        link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us)
+        link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us)
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
         self.hear(mavlink.MAVLink_system_time_message, self.place.hear_time)
         self.hear(mavlink.MAVLink_timesync_message, self._on_timesync)
@@ -181,7 +193,8 @@ class Vehicle:
         """
         request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
-            return await self.boot.wait(timeout_s)
+            self._boot_heard.clear()
+            return await comes(self._boot_heard, timeout_s)
         finally:
             request.cancel()
 
@@ -251,7 +264,7 @@ class Vehicle:
             return False
         # Another firmware has been flashed while we heard nothing.
         self.kind = kind
-        self.boot.clock = BootClock()
+        self.boot = BootClock()
         self._arming.flashed()
         self._restarted()
         return True
@@ -314,6 +327,21 @@ class Vehicle:
 
     # --- what the other messages tell
 
+    def _on_boot_ms(self, message: Any, t_s: float) -> None:
+        if self.sent(message):
+            self._follow(message.time_boot_ms * 1e-3, t_s)
+
+    def _on_boot_us(self, message: Any, t_s: float) -> None:
+        # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
+        if self.sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
+            self._follow(message.time_usec * 1e-6, t_s)
+
+    def _follow(self, boot_s: float, t_s: float) -> None:
+        restarted = self.boot.rebooted(boot_s, t_s)
+        self._boot_heard.set()
+        if restarted:
+            self._restarted()
+
     def _restarted(self) -> None:
         self.boots += 1
         self._arming.restarted(asyncio.get_running_loop().time())
@@ -356,17 +384,17 @@ class VehicleTimer:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle, self._t_s = vehicle, asyncio.get_running_loop().time()
-        self._boot_s, self._boots = vehicle.boot.clock.latest_s, vehicle.boots
+        self._boot, self._boots = vehicle.boot.latest, vehicle.boots
 
     def has_passed(self, seconds: float) -> bool:
         """Check that so much time has passed on both clocks; on ours alone while the other is unknown."""
         gone_s = asyncio.get_running_loop().time() - self._t_s
         if gone_s < seconds:
             return False
-        vehicle, boot_s = self._vehicle, self._vehicle.boot.clock.latest_s
-        if self._boot_s is None or boot_s is None or vehicle.boots != self._boots or not vehicle.alive:
+        vehicle, boot = self._vehicle, self._vehicle.boot.latest
+        if self._boot is None or boot is None or vehicle.boots != self._boots or not vehicle.alive:
             return True
-        return boot_s - self._boot_s >= seconds or gone_s >= _SLOWEST * seconds
+        return boot[0] - self._boot[0] >= seconds or gone_s >= _SLOWEST * seconds
 
     async def let_pass(self, seconds: float) -> None:
         """Wait until `has_passed`."""

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import Thermal
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import same_float32
 from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.commands import Align, Calibrate, Cancel, Temperature, Undo
 from companion.component.service import MEASURED_PERCENT, Refusal

@@ -17,7 +17,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.imu_messages import ImuMessage, Six
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ImuStream
-from companion.autopilot.telemetry.px4_console import EkfBias, RawMean
+from companion.autopilot.telemetry.px4_console import EkfBias
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.component.service import JobResult
 from companion.config.sections import Imu
@@ -158,15 +158,15 @@ class AutopilotImu:
         kind = self.stream.kind
         return self.calibration is not None and kind is not None and kind.integers
 
-    def take_raw(self, raw: RawMean) -> None:
-        """Hand on a mean of raw readings, less the offsets in force."""
+    def take_raw(self, gyro_id: int, accel_id: int, raw: ImuSample) -> None:
+        """Hand on a mean of raw readings of these devices, less the offsets in force."""
         known = self.calibration
         if known is None:
             return
-        if (raw.gyro_id, raw.accel_id) != (known.gyro_id, known.accel_id):
+        if (gyro_id, accel_id) != (known.gyro_id, known.accel_id):
             # The console knows which device it is; the slots' order was a guess.
-            self._slots.learn("gyro", raw.gyro_id, self.instance)
-            self._slots.learn("accel", raw.accel_id, self.instance)
+            self._slots.learn("gyro", gyro_id, self.instance)
+            self._slots.learn("accel", accel_id, self.instance)
             self._stale.set()
             return
         output = known.output(raw.gyro_rad_s, raw.accel_m_s2, raw.temperature_degc)

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ask_script
-from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console, RawMean
+from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.configured import models
@@ -35,7 +35,7 @@ from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
 from companion.physics.units import G
-from companion.samples import Sample
+from companion.samples import ImuSample, Sample
 
 logger = logging.getLogger(__name__)
 
@@ -177,10 +177,10 @@ class Devices(Subsystem):
     def _wants_raw(self) -> list[int]:
         return [imu.instance for imu in self.imus.values() if imu.wants_raw]
 
-    def _take_raw(self, raw: RawMean) -> None:
+    def _take_raw(self, instance: int, gyro_id: int, accel_id: int, raw: ImuSample) -> None:
         for imu in self.imus.values():
-            if imu.instance == raw.instance:
-                imu.take_raw(raw)
+            if imu.instance == instance:
+                imu.take_raw(gyro_id, accel_id, raw)
 
     def _take(self, role: Role, part: Sample) -> None:
         reading = collect(self._core.collector, role, part)

@@ -242,10 +242,10 @@ def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> V
 
 def in_short(verdict: EffectVerdict) -> str:
     """Summarise a verdict in one short line for people; `verdict.problems` has the figures."""
-    unused = [axis.parameter for axis in verdict.axes if axis.word == "not seen"]
+    unused = [name for name, word in verdict.axes.items() if word == "not seen"]
     if unused:
         return f"the autopilot stored {', '.join(unused)} but does not use {'it' if len(unused) == 1 else 'them'}"
-    wrong = [axis.parameter for axis in verdict.axes if axis.word == "wrong"]
+    wrong = [name for name, word in verdict.axes.items() if word == "wrong"]
     if wrong:
         return f"the output did not follow {', '.join(wrong)} (orientation, sign or scale not as believed, or it moved)"
     return "; ".join(verdict.problems)

@@ -14,8 +14,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError, same_float32
 from companion.autopilot.vehicle.gyro_calibration import wait_until_over
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState

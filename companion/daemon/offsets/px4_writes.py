@@ -21,7 +21,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import FAR_ACCEL_M_S2, ImuCalibration, output_step, vector_changes
-from companion.autopilot.firmware.imu_messages import Reading
+from companion.autopilot.firmware.imu_messages import all_zero
 from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, accel_offset_with
 from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, SlotMemory
 from companion.autopilot.parameters.change import Change, FarProbe, WriteFailedError
@@ -33,7 +33,7 @@ from companion.daemon.offsets.ledger import Ledger
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.physics.frames import Array
 from companion.physics.units import DEG, MG
-from companion.samples import Triad, Vector
+from companion.samples import ImuSample, Triad, Vector
 from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
@@ -99,7 +99,7 @@ class Px4Writes:
         self._learned = False
         """The last verification learned something new of the slots."""
         self._boots = 0
-        self._samples: defaultdict[int, deque[tuple[float, Reading]]] = defaultdict(deque)
+        self._samples: defaultdict[int, deque[ImuSample]] = defaultdict(deque)
         self._before: dict[int, Mean | None] = {}
         self._unknown: set[int] = set()
         """IMUs that may exist and were not heard."""
@@ -269,20 +269,20 @@ class Px4Writes:
         kind = self._vehicle.kind.imu_messages[instance][-1]
 
         def take(message: Message, t_s: float) -> None:
-            reading = kind.decode(message) if self._vehicle.sent(message) else ""
-            if not isinstance(reading, str) and not reading.all_zero:
+            sample = kind.decode(message, t_s) if self._vehicle.sent(message) else ""
+            if not isinstance(sample, str) and not all_zero(sample):
                 kept = self._samples[instance]
-                kept.append((t_s, reading))
-                while kept[0][0] < t_s - KEPT_S:
+                kept.append(sample)
+                while kept[0].t_s < t_s - KEPT_S:
                     kept.popleft()
 
         return self._link.subscribe(kind.message, take)
 
     def _mean(self, instance: int, sensor: Triad, from_s: float, to_s: float) -> Mean | None:
         found = [
-            reading.gyro_rad_s if sensor == "gyro" else reading.accel_m_s2
-            for t_s, reading in self._samples.get(instance, ())
-            if from_s <= t_s <= to_s
+            sample.gyro_rad_s if sensor == "gyro" else sample.accel_m_s2
+            for sample in self._samples.get(instance, ())
+            if from_s <= sample.t_s <= to_s
         ]
         if len(found) < LEAST_SAMPLES:
             return None

@@ -143,13 +143,13 @@ class RebootOwed:
         # A small step after a large one leaves what the large one has left.
         left_deg = self._owed.tilt_deg if self._owed is not None and self.words is not None else 0.0
         tilt_deg = max(left_deg, stale_deg)
-        now_s, boot_s = asyncio.get_running_loop().time(), self._vehicle.boot.clock.latest_s
-        owed = _Owed(self._vehicle.system_id or 0, round(tilt_deg, 2), boot_s or 0.0, self._host, now_s)
+        now_s, (boot_s, _) = asyncio.get_running_loop().time(), self._vehicle.boot.latest or (0.0, 0.0)
+        owed = _Owed(self._vehicle.system_id or 0, round(tilt_deg, 2), boot_s, self._host, now_s)
         await self._offload(self._file.write, owed)
         self._owed, self._boots, self._earlier = owed, self._vehicle.boots, False
 
     def _restarted(self, owed: _Owed) -> bool:
-        latest = self._vehicle.boot.clock.latest
+        latest = self._vehicle.boot.latest
         if not self._earlier or latest is None:
             return self._vehicle.boots != self._boots
         boot_s, heard_s = latest

@@ -12,9 +12,8 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Final
 
-from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
+from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError, same_float32
 from companion.autopilot.parameters.verify import EffectVerdict
-from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
@@ -334,6 +333,6 @@ def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict
         log.warn(target.name, *verdict.problems)
         # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
         seen = verdict.ok and not verdict.hidden
-        for axis in verdict.axes:
-            plan.mark(log, [axis.parameter], "verified" if seen else verdict.outcome(axis.parameter))
+        for name in verdict.axes:
+            plan.mark(log, [name], "verified" if seen else verdict.outcome(name))
     return [f"imu {target.name}: {in_short(verdict)}" for verdict in verdicts if not verdict.ok]

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import same_float32
 from companion.component.service import JobResult
 from companion.config.sections import Config
 from companion.configured import models

@@ -15,9 +15,7 @@ import numpy as np
 from companion.autopilot.firmware.firmwares import firmware_named, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import FirmwareName
-from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.parameters.change import Change, FirmwareName, Parameters, same_float32
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.noise.allan import PROFILES, noise_profile
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Stages, Term
@@ -312,19 +310,17 @@ def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibra
 # --- offsets in force
 
 
-class _LoggedParameters:
-    """Parameters of a log, with the interface of an autopilot's parameters."""
+class _LoggedParameters(Parameters):
+    """Parameters of a log, which is of one start."""
+
+    firmware: FirmwareName | None = None
+    boots = 1
 
     def __init__(self, firmware: FirmwareName, values: Mapping[str, float]) -> None:
-        self._values = values
-        self.vehicle = self
-        self.name: Final = "log"
-        self.firmware: Final[FirmwareName] = firmware
-        self.boots: Final = 1
+        self.firmware, self._values = firmware, values
 
-    async def hear_boot_time(self) -> bool:
-        """Return True: a log is of one start."""
-        return True
+    async def ensure_same_boot(self, boots: int, when: str) -> None:
+        pass
 
     async def read(self, name: str) -> float:
         if name not in self._values:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.autopilot.parameters.reading import FirmwareName
+from companion.autopilot.parameters.change import FirmwareName
 from companion.estimation.records.flight_record import Drift
 from companion.physics.frames import Floats, rotations, running_products
 

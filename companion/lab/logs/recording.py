@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 import msgspec
 
 from companion.autopilot.firmware.firmwares import FIRMWARES, firmware_named
-from companion.autopilot.firmware.imu_messages import PX4_FLOATS, EkfBiasReading, ImuSamples, Reading
+from companion.autopilot.firmware.imu_messages import PX4_FLOATS, EkfBiasReading, ImuSamples, all_zero
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
 from companion.errors import StorageError
@@ -235,10 +235,10 @@ class Playback:
         header = message.get_header()
         if source is None or (header.srcSystem, header.srcComponent) != (state.sender[0], state.sender[1]):
             return None
-        reading = source.decode(message)
-        if not isinstance(reading, Reading) or reading.all_zero or not samples.accept(source.name, reading, t_s):
+        found = source.decode(message, t_s)
+        if isinstance(found, str) or all_zero(found) or not samples.accept(source.name, found):
             return None
         bias = self._bias if source is PX4_FLOATS else None
         if source.name != state.message or state.calibration is None or (source is PX4_FLOATS and bias is None):
             return None
-        return samples.sample(reading, t_s, bias)
+        return samples.complete(found, bias)

@@ -10,11 +10,11 @@ import pytest
 
 from companion.autopilot.firmware.base import Firmware
 from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_named, firmware_with, port_needs
-from companion.autopilot.parameters.reading import FirmwareName
+from companion.autopilot.parameters.change import FirmwareName
 from companion.errors import AutopilotError
 
 ROOT = Path(__file__).parents[3]
-AT_HOME = ("companion/autopilot/firmware/", "companion/autopilot/parameters/reading.py")
+AT_HOME = ("companion/autopilot/firmware/", "companion/autopilot/parameters/change.py")
 
 
 def test_no_other_package_names_a_firmware() -> None:

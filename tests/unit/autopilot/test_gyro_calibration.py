@@ -29,6 +29,9 @@ class _Autopilot:
         self.result, self.arm_state = result, arm_state
         self.looks = self.sent = 0
 
+    def require_same_boot(self, boots: int, when: str) -> None:
+        assert boots == self.boots, when
+
     async def ensure(self) -> None:
         if self.arm_state is not ArmState.DISARMED:
             raise NotDisarmedError(self.arm_state.why_not_written)

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console, RawMean
+from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
+from companion.samples import ImuSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double
@@ -26,7 +27,7 @@ BIASES = ((100.0, -60.0, 170.0), (-80.0, 40.0, 150.0))
 class Aboard:
     double: PX4Double
     ekf_bias: EkfBias
-    heard: list[RawMean]
+    heard: list[tuple[int, int, int, ImuSample]]
 
 
 @contextlib.asynccontextmanager
@@ -45,9 +46,9 @@ async def aboard(wanted: tuple[int, ...] = (1, 2), *, slow: bool = False, **more
     Wire(link, double, seed=1)
     vehicle = Vehicle(link)
     console = Px4Console(link, vehicle)
-    heard: list[RawMean] = []
+    heard: list[tuple[int, int, int, ImuSample]] = []
     ekf_bias = EkfBias(console, vehicle)
-    status = ImuStatus(console, ekf_bias, lambda: wanted, heard.append, slow=slow)
+    status = ImuStatus(console, ekf_bias, lambda: wanted, lambda *raw: heard.append(raw), slow=slow)
     tasks = [asyncio.create_task(run()) for run in (double.run, status.run)]
     try:
         async with asyncio.timeout(20.0):
@@ -65,10 +66,10 @@ def test_every_imu_tells_its_bias_whatever_its_offsets_are() -> None:
         async with aboard() as found:
             await asyncio.sleep(30.0)
             for instance in (1, 2):
-                own = [raw for raw in found.heard if raw.instance == instance]
+                own = [raw for number, _, _, raw in found.heard if number == instance]
                 assert len(own) > 35
                 imu = found.double.vehicle_imus[instance - 1]
-                assert {(raw.gyro_id, raw.accel_id) for raw in own} == {(imu.device_id, imu.device_id)}
+                assert {raw[1:3] for raw in found.heard if raw[0] == instance} == {(imu.device_id, imu.device_id)}
                 # The truth: what the sensor reads, turned by the board's rotation and nothing else.
                 true = imu.model.expected(0.0)
                 turned = np.concatenate((imu.gyro.rotation @ true[:3], imu.accel.rotation @ true[3:]))
@@ -85,7 +86,7 @@ def test_a_publication_counts_once() -> None:
     async def main() -> None:
         async with aboard((1,)) as found:
             await asyncio.sleep(10.0)
-            stamps = [raw.boot_us for raw in found.heard]
+            stamps = [raw.t_device_s for *_, raw in found.heard]
             assert len(stamps) == len(set(stamps)) > 20
 
     run_virtual(main())

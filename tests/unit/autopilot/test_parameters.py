@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import float32, same_float32
+from companion.autopilot.parameters.change import float32, same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import (

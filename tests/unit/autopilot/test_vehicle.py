@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.boot_clock import BootClock
-from companion.autopilot.vehicle.heartbeats import ArmingWatch
+from companion.autopilot.vehicle.heartbeats import ArmingWatch, BootClock
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.autopilot.vehicle.whereabouts import Position

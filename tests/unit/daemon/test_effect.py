@@ -99,6 +99,5 @@ def test_a_step_that_is_not_the_one_written_is_refused_all_the_same() -> None:
 def test_a_longer_look_is_worth_it_where_it_can_change_the_verdict(
     problems: tuple[str, ...], sigma: float, looked_s: float, words: str
 ) -> None:
-    axes: Any = ()
-    verdict = EffectVerdict(axes=axes, fraction_sigma=sigma, problems=problems, hidden=("INS_GYROFFS_X",))
+    verdict = EffectVerdict(axes={}, fraction_sigma=sigma, problems=problems, hidden=("INS_GYROFFS_X",))
     assert why_look_longer({"fc": [verdict]}, looked_s) == words

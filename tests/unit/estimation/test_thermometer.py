@@ -81,11 +81,11 @@ def test_of_the_autopilots_messages_only_those_that_carry_the_imus_temperature_g
 
     nine = (0.0, 0.0, -9.8, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
     floats = mavlink.MAVLink_highres_imu_message(5, *nine, 1013.0, 0.0, 50.0, 32.6, 0x3F)
-    found = imu_messages.HIGHRES.decode(floats)
+    found = imu_messages.HIGHRES.decode(floats, 0.0)
     assert not isinstance(found, str)
     assert found.temperature_degc is None  # the air's, or the barometer's
     for sent, degc in ((2513, 25.13), (0, None), (1, 0.01), (-1250, -12.5)):
         whole = mavlink.MAVLink_scaled_imu_message(5, 0, 0, -1000, 1, 0, 0, 0, 0, 0, sent)
-        found = imu_messages.SCALED.decode(whole)
+        found = imu_messages.SCALED.decode(whole, 0.0)
         assert not isinstance(found, str)
         assert found.temperature_degc == (None if degc is None else pytest.approx(degc))
