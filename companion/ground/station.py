@@ -18,9 +18,8 @@ from companion.errors import ConfigError, NobodyHeardError
 from companion.estimation.request import What
 from companion.formats import printable
 from companion.ground import heard
-from companion.ground.exchange import Exchange
 from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListener, Text
-from companion.ground.link import GroundLink
+from companion.ground.link import Exchange, GroundLink
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
 EVERYBODY_WITHIN_S: Final = 1.3

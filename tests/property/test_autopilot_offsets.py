@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.firmware.ardupilot_calibration import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import (
     FAR_GYRO_RAD_S,
     ImuCalibration,
@@ -96,7 +96,7 @@ def test_after_the_write_the_output_is_the_truth(
     residuals = tuple(map(float, gyro_residual)), tuple(map(float, accel_residual))
     calibration = ImuCalibration(
         instance=2,
-        parameters=parameters_of(2),
+        parameters=ArduPilotParameters(2),
         gyro_offset_rad_s=gyro_offset,
         accel_offset_m_s2=accel_offset,
         accel_scale=scale,

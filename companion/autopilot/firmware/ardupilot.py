@@ -7,7 +7,6 @@ data. A calibration leaves `CALTEMP` alone, for then new = old + residual holds 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -20,11 +19,9 @@ from companion.autopilot.firmware.ardupilot_calibration import (
     AT_START,
     INSTANCES,
     ArduPilotParameters,
-    parameters_of,
 )
 from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net
 from companion.autopilot.firmware.imu_calibration import (
-    ACCEL_SCALE_RANGE,
     DEGC_RANGE,
     DEVICE_ID_RANGE,
     SWITCH_RANGE,
@@ -64,7 +61,7 @@ _CUSTOM_NAMES: Final = {
 
 def _ranges() -> dict[str, Range]:
     found: dict[str, Range] = {AT_START: SWITCH_RANGE}
-    for names in map(parameters_of, INSTANCES):
+    for names in map(ArduPilotParameters, INSTANCES):
         # The firmware's own gyro calibration, which we start, sets CALTEMP and id: both are restored.
         found |= {**offset_ranges(names), **dict.fromkeys(names.tcal, _TCAL_RANGE)}
         found |= dict.fromkeys((names.gyro_caltemp, names.accel_caltemp, names.tcal_low, names.tcal_high), DEGC_RANGE)
@@ -108,8 +105,8 @@ class ArduPilot(Firmware):
 
     # --- IMUs
 
-    async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
-        names = parameters_of(instance)
+    async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+        names = ArduPilotParameters(instance)
         if await parameters.read_optional(names.gyro_offset[0]) is None:
             raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
         gyro_id = await parameters.read_integer(names.gyro_id)
@@ -118,21 +115,29 @@ class ArduPilot(Firmware):
             if found == 0:
                 raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
         thermal = await own_calibration.read_thermal(parameters, instance)
-        calibration = ImuCalibration(
+        accel_offset = await parameters.read_vector(names.accel_offset)
+        warnings: list[str] = []
+        if not any(accel_offset):
+            warnings.append(
+                f"{names.accel_offset[0]}, _Y and _Z are 0: the autopilot takes IMU {instance}'s accelerometers for"
+                ' uncalibrated and may still refuse to arm ("3D Accel calibration needed") until its accelerometer'
+                " calibration is accepted once (PREFLIGHT_CALIBRATION, param5 = 76)"
+            )
+        if await parameters.read_integer(names.use) == 0:
+            warnings.append(f"{names.use} = 0: the autopilot does not use IMU {instance}")
+        return ImuCalibration(
             instance=instance,
             parameters=names,
             gyro_offset_rad_s=await parameters.read_vector(names.gyro_offset),
-            accel_offset_m_s2=await parameters.read_vector(names.accel_offset),
+            accel_offset_m_s2=accel_offset,
             accel_scale=await parameters.read_vector(names.accel_scale, *SCALES),
             gyro_id=gyro_id,
             accel_id=accel_id,
             orientation=await _read_board_rotation(parameters),
             thermal=thermal,
             zero_is_uncalibrated=True,
-            rivals=await self.read_rivals(parameters),
+            warnings=tuple(warnings),
         )
-        used = await parameters.read_integer(names.use) != 0
-        return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used))
 
     thermal_changes = staticmethod(own_calibration.thermal_changes)
 
@@ -196,23 +201,6 @@ class ArduPilot(Firmware):
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
         return True, "none heard (none connected? or a link set not to forward: MAVn_OPTIONS bit 1)"
-
-
-def _warnings(calibration: ImuCalibration, names: ArduPilotParameters, *, used: bool) -> tuple[str, ...]:
-    instance = calibration.instance
-    found = [rival.words for rival in calibration.rivals]
-    if not any(calibration.accel_offset_m_s2):
-        found.append(
-            f"{names.accel_offset[0]}, _Y and _Z are 0: the autopilot takes IMU {instance}'s accelerometers for"
-            ' uncalibrated and may still refuse to arm ("3D Accel calibration needed") until its accelerometer'
-            " calibration is accepted once (PREFLIGHT_CALIBRATION, param5 = 76)"
-        )
-    low, high = ACCEL_SCALE_RANGE
-    if not all(low <= scale <= high for scale in calibration.accel_scale):
-        found.append(f"{names.accel_scale[0]}, _Y or _Z is outside {low} to {high}: the scale calibration looks wrong")
-    if not used:
-        found.append(f"{names.use} = 0: the autopilot does not use IMU {instance}")
-    return tuple(found)
 
 
 async def _read_board_rotation(parameters: Parameters) -> Matrix:

@@ -11,7 +11,6 @@ one ENABLE, TMIN and TMAX.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Final
 
 import numpy as np
@@ -37,65 +36,39 @@ AT_START: Final = "INS_GYR_CAL"
 Names = tuple[str, str, str]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ArduPilotParameters(ImuParameters):
-    """Parameter names of one IMU; the first instance is irregular, 4 and 5 are again (autopilots 1.1)."""
+    """Parameter names of one IMU, counting from 1; the first is irregular, 4 and 5 are again (autopilots 1.1)."""
 
-    use: str
-    gyro_caltemp: str
-    """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
-    accel_caltemp: str
-    tcal_enable: str
-    """0 off, 1 on, 2 learning until the next boot."""
-    tcal_low: str
-    tcal_high: str
-    tcal_gyro: tuple[Names, Names, Names]
-    """Coefficients by power of the temperature."""
-    tcal_accel: tuple[Names, Names, Names]
-
-    @property
-    def tcal(self) -> tuple[str, ...]:
-        """All names but the CALTEMPs, which the firmware's own calibrations set; the switch comes last."""
+    def __init__(self, instance: int) -> None:
+        """Raise AutopilotError where there is no such instance."""
+        if instance not in INSTANCES:
+            raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
+        # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
+        ins, n = (f"INS{instance}_", "") if instance > 3 else ("INS_", "" if instance == 1 else str(instance))
+        tcal = f"INS{instance}_TCAL_" if instance > 3 else f"INS_TCAL{instance}_"
+        caltemp = f"INS{instance}_{{}}_CALTEMP" if instance > 3 else f"INS_{{}}{instance}_CALTEMP"
+        super().__init__(
+            gyro_offset=_xyz(f"{ins}GYR{n}OFFS_"),
+            accel_offset=_xyz(f"{ins}ACC{n}OFFS_"),
+            accel_scale=_xyz(f"{ins}ACC{n}SCAL_"),
+            gyro_id=f"{ins}GYR{n}_ID",
+            accel_id=f"{ins}ACC{n}_ID",
+        )
+        self.use = f"{ins}USE{n}"
+        self.gyro_caltemp, self.accel_caltemp = caltemp.format("GYR"), caltemp.format("ACC")
+        """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
+        self.tcal_enable, self.tcal_low, self.tcal_high = f"{tcal}ENABLE", f"{tcal}TMIN", f"{tcal}TMAX"
+        """ENABLE: 0 off, 1 on, 2 learning until the next boot."""
+        self.tcal_gyro = [_xyz(f"{tcal}GYR{power}_") for power in (1, 2, 3)]
+        """Coefficients by power of the temperature."""
+        self.tcal_accel = [_xyz(f"{tcal}ACC{power}_") for power in (1, 2, 3)]
         coefficients = (name for names in (*self.tcal_accel, *self.tcal_gyro) for name in names)
-        return (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
+        self.tcal = (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
+        """All names but the CALTEMPs, which the firmware's own calibrations set; the switch comes last."""
 
 
-def parameters_of(instance: int) -> ArduPilotParameters:
-    """Return the parameter names of one IMU, `instance` counting from 1.
-
-    Raises:
-        AutopilotError: no such instance.
-    """
-    if instance not in INSTANCES:
-        raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
-    # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
-    ins, n = (f"INS{instance}_", "") if instance > 3 else ("INS_", "" if instance == 1 else str(instance))
-    tcal = f"INS{instance}_TCAL_" if instance > 3 else f"INS_TCAL{instance}_"
-    caltemp = f"INS{instance}_{{}}_CALTEMP" if instance > 3 else f"INS_{{}}{instance}_CALTEMP"
-
-    def xyz(pattern: str) -> Names:
-        x, y, z = (pattern.format(axis) for axis in "XYZ")
-        return x, y, z
-
-    def coefficients(triad: str) -> tuple[Names, Names, Names]:
-        one, two, three = (xyz(f"{tcal}{triad}{power}_{{}}") for power in (1, 2, 3))
-        return one, two, three
-
-    return ArduPilotParameters(
-        gyro_offset=xyz(f"{ins}GYR{n}OFFS_{{}}"),
-        accel_offset=xyz(f"{ins}ACC{n}OFFS_{{}}"),
-        accel_scale=xyz(f"{ins}ACC{n}SCAL_{{}}"),
-        gyro_id=f"{ins}GYR{n}_ID",
-        accel_id=f"{ins}ACC{n}_ID",
-        use=f"{ins}USE{n}",
-        gyro_caltemp=caltemp.format("GYR"),
-        accel_caltemp=caltemp.format("ACC"),
-        tcal_enable=f"{tcal}ENABLE",
-        tcal_low=f"{tcal}TMIN",
-        tcal_high=f"{tcal}TMAX",
-        tcal_gyro=coefficients("GYR"),
-        tcal_accel=coefficients("ACC"),
-    )
+def _xyz(stem: str) -> Names:
+    return f"{stem}X", f"{stem}Y", f"{stem}Z"
 
 
 # --- temperature
@@ -107,7 +80,7 @@ async def read_thermal(parameters: Parameters, instance: int) -> Thermal:
     Raises:
         AutopilotError: it is learning, or as `Parameters.read`.
     """
-    names = parameters_of(instance)
+    names = ArduPilotParameters(instance)
     enable = await parameters.read_integer(names.tcal_enable)
     if enable is None:
         return Thermal()
@@ -120,7 +93,7 @@ async def read_thermal(parameters: Parameters, instance: int) -> Thermal:
         return Thermal(values={names.tcal_enable: float(enable)})
     found = await parameters.read_many((*names.tcal, names.gyro_caltemp, names.accel_caltemp))
 
-    def polynomial(coefficients: tuple[Names, Names, Names]) -> Polynomial:
+    def polynomial(coefficients: list[Names]) -> Polynomial:
         one, two, three = (vector(np.array([found[name] for name in each]) * _UNIT) for each in coefficients)
         return Polynomial(
             coefficients=(ZERO, one, two, three),
@@ -146,7 +119,7 @@ async def thermal_changes(
     stays, held at the ends of the new span; one that is not is cleared, for it would come into force with the gyros'.
     """
     assert gyro.reference_degc == REFERENCE_DEGC
-    names, thermal = parameters_of(calibration.instance), calibration.thermal
+    names, thermal = ArduPilotParameters(calibration.instance), calibration.thermal
     if not thermal.values:
         raise AutopilotError(
             f"{names.tcal_enable} does not exist: this firmware has no temperature calibration"

@@ -60,23 +60,19 @@ class Firmware:
     name: FirmwareName | None = None
     words = "autopilot"
     mav_autopilot: int | None = None
-    """MAV_AUTOPILOT in its heartbeats."""
 
     # --- the link
 
     heartbeat_rate_hz: float | None = None
     """Heartbeat rate to ask for on our own link; None: the firmware has a fixed one."""
     late_heartbeat_on_request = False
-    """An overdue heartbeat is requested."""
     integers_bytewise: bool | None = None
     """Integer parameters travel as bytes in the float field; None: see AUTOPILOT_VERSION."""
     takes_nan_position = False
-    """An unknown position is sent as NaN."""
 
     settle_s = 2.0
     """Time after a write in which the telemetry may still show the old offsets."""
     write_s = 5.0
-    """Time to write the offsets of one IMU."""
     ekf_reset_s = 0.0
     """Time for the EKF to show that it has settled after the firmware's own gyro calibration."""
 
@@ -94,7 +90,6 @@ class Firmware:
         return 0.0
 
     faster_log = ""
-    """Setting that makes it log its IMUs faster."""
 
     # --- calibration of an IMU
 
@@ -104,21 +99,9 @@ class Firmware:
     parts: Mapping[tuple[int, int], Profile] = {}
     """Catalogue's names by the device types of gyro and accelerometer; the numbers are each firmware's own."""
     ignores_small_steps = False
-    """A small change of an offset may be stored and not used."""
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
-        """Read what the autopilot corrects one of its IMUs (1 to 3) with.
-
-        Raises:
-            AutopilotError: no such IMU, a value that cannot be worked with, or as `Parameters.read`; or the autopilot
-                restarted meanwhile (AutopilotRebootedError).
-        """
-        boots = parameters.boots
-        found = await self._read_calibration(parameters, instance, memory)
-        await parameters.ensure_same_boot(boots, f"while the parameters of IMU {instance} were read")
-        return found
-
-    async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+        """Read what the autopilot corrects one of its IMUs (1 to 3) with; see `firmwares.read_calibration`."""
         raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
 
     async def read_rivals(self, parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Final
 
 from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.autopilot.firmware.base import Firmware, OtherFirmware
-from companion.autopilot.firmware.imu_calibration import ACCEL_OFFSET, GYRO_OFFSET, ImuCalibration, Range
+from companion.autopilot.firmware.imu_calibration import (
+    ACCEL_OFFSET,
+    ACCEL_SCALE_RANGE,
+    GYRO_OFFSET,
+    ImuCalibration,
+    Range,
+)
 from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import FirmwareName, Parameters
@@ -38,12 +45,23 @@ def firmware_with(mav_autopilot: int) -> Firmware:
 
 
 async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory | None = None) -> ImuCalibration:
-    """Read what the autopilot corrects one of its IMUs (1 to 3) with; raises as `Firmware.read_calibration`.
+    """Read what the autopilot corrects one of its IMUs (1 to 3) with.
 
     `memory`: what earlier writes have shown about PX4's slots.
+
+    Raises:
+        AutopilotError: no such IMU, a value that cannot be worked with, or as `Parameters.read`; or the autopilot
+            restarted meanwhile (AutopilotRebootedError).
     """
-    firmware = firmware_named(parameters.firmware)
-    return await firmware.read_calibration(parameters, instance, memory or SlotMemory())
+    boots, firmware, memory = parameters.boots, firmware_named(parameters.firmware), memory or SlotMemory()
+    found = await firmware.read_calibration(parameters, instance, memory)
+    rivals = await firmware.read_rivals(parameters, memory.rivals)
+    await parameters.ensure_same_boot(boots, f"restarted while the parameters of IMU {instance} were read")
+    warnings, (low, high) = [*(rival.words for rival in rivals), *found.warnings], ACCEL_SCALE_RANGE
+    if not all(low <= scale <= high for scale in found.accel_scale):
+        name = found.parameters.accel_scale[0]
+        warnings.append(f"{name}, Y or Z is outside {low} to {high}: the scale calibration looks wrong")
+    return dataclasses.replace(found, rivals=rivals, warnings=tuple(warnings))
 
 
 def port_needs(firmware: FirmwareName | None, baud: int) -> str:

@@ -33,7 +33,6 @@ class Rival:
 
     parameter: str
     what: str
-    """Effect, in words."""
     at_start: bool = False
     """It acts at a start of the autopilot, and then only."""
     accelerometers: bool = False
@@ -133,7 +132,7 @@ DEVICE_ID_RANGE: Final = Range(0.0, 2.0**24, whole=True)
 SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+@dataclasses.dataclass(kw_only=True)
 class ImuParameters:
     """The names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2, an id of 0 is none."""
 
@@ -160,7 +159,6 @@ class Thermal:
     enabled_by: str = ""
     """Parameter that has switched it on; empty where it takes nothing off."""
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Parameters of it, as far as they were read."""
     gyro: Polynomial = NOTHING
     accel: Polynomial = NOTHING
 

@@ -35,6 +35,10 @@ class ImuMessage:
     """Returns the sample in a message received at a time, or why there is none."""
     integers: bool = False
     """Values are cut toward zero to thousandths of rad/s and g."""
+    from_script: bool = False
+    """ArduPilot's script sends it, while disarmed and asked (`SCRIPT_ASK`)."""
+    lacks_bias: bool = False
+    """The bias of the EKF is to be added to it."""
 
     @property
     def gyro_step_rad_s(self) -> float:
@@ -101,12 +105,13 @@ SCRIPT: Final = {
         "floats of the script",
         mavlink.MAVLink_debug_float_array_message,
         functools.partial(_from_script, instance),
+        from_script=True,
     )
     for instance in (1, 2, 3)
 }
-"""Means of four readings, calibrated and filtered, about eleven a second, only while disarmed and asked for."""
+"""Means of four readings, calibrated and filtered, about eleven a second."""
 
-PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias")
+PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias", lacks_bias=True)
 """HIGHRES_IMU of the IMU that PX4 flies by. PX4 takes EKF2's own estimate of the bias off it, so at rest it tells
 nothing until that is known and added again (`telemetry.px4_console`)."""
 
@@ -127,7 +132,6 @@ class EkfBiasReading(msgspec.Struct, frozen=True):
     bias: Six
     """Gyro in rad/s, accelerometer in m/s^2."""
     variance: Six
-    """Squares of the same units."""
     read_s: float
 
     def restored(self, sample: ImuSample) -> ImuSample:

@@ -11,7 +11,6 @@ acts, it counts as a part of the sensor.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -21,7 +20,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net
 from companion.autopilot.firmware.imu_calibration import (
-    ACCEL_SCALE_RANGE,
     DEGC_RANGE,
     DEVICE_ID_RANGE,
     SWITCH_RANGE,
@@ -42,7 +40,6 @@ from companion.samples import Triad, Vector
 
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 _LEVEL_RANGE: Final = Range(-45.0, 45.0, unit="deg")
-"""Anything that a user may have set."""
 _TC_RANGE: Final = Range(-10.0, 10.0)
 """rad/s, and per kelvin, square kelvin, cubic kelvin."""
 
@@ -142,14 +139,14 @@ class PX4(Firmware):
 
     # --- IMUs
 
-    async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+    async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
         boots = parameters.boots
         accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
         gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
         names = parameters_of(gyro.number, accel.number)
         offset = await parameters.read_vector(names.accel_offset)
         orientation = await _read_rotation(parameters, gyro, accel)
-        calibration = ImuCalibration(
+        return ImuCalibration(
             instance=instance,
             parameters=names,
             gyro_offset_rad_s=await parameters.read_vector(names.gyro_offset),
@@ -162,15 +159,7 @@ class PX4(Firmware):
             scale_unused_within=MARGIN * IGNORED_STEP,
             accel_offset_may_be_unused=_too_small_to_apply_at_boot(offset)
             and not memory.in_use(names.accel_offset, offset, boots),
-            rivals=await self.read_rivals(parameters, memory.rivals),
         )
-        warnings = [rival.words for rival in calibration.rivals]
-        low, high = ACCEL_SCALE_RANGE
-        if not all(low <= scale <= high for scale in calibration.accel_scale):
-            warnings.append(
-                f"{names.accel_scale[0]}, Y or Z is outside {low} to {high}: the scale calibration looks wrong"
-            )
-        return dataclasses.replace(calibration, warnings=tuple(warnings))
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
         """Return the tilt that EKF2 keeps: it learns a step of level or accelerometers very slowly."""
@@ -299,7 +288,6 @@ async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Mat
 
 
 async def _read_level(parameters: Parameters) -> Vector:
-    """Read the level adjustment: degrees of roll, pitch, yaw."""
     x, y, z = [await parameters.read(name) for name in LEVEL]
     for name, angle_deg in zip(LEVEL, (x, y, z), strict=True):
         if not math.isfinite(angle_deg):

@@ -58,7 +58,6 @@ class SlotMemory:
         self._enabled: dict[Triad, int] = {}
         self._in_use: dict[tuple[str, str, str], tuple[int, Vector]] = {}
         self.rivals: dict[str, int] = {}
-        """Kept for `Firmware.read_rivals`."""
 
     def learn(self, sensor: Triad, device_id: int, instance: int) -> None:
         """Note that the offsets in the slot of this device act on this IMU's telemetry (NO_IMU: on none)."""

@@ -70,7 +70,7 @@ class Parameters(abc.ABC):
         """Read several; where `optional`, what does not exist is left out."""
 
     @abc.abstractmethod
-    async def ensure_same_boot(self, boots: int, when: str) -> None:
+    async def ensure_same_boot(self, boots: int, words: str) -> None:
         """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
 
     async def read_vector(self, names: tuple[str, str, str], low: float = -math.inf, high: float = math.inf) -> Vector:
@@ -108,7 +108,6 @@ POLL_S: Final = 1.1
 After twice that without a write each looks at the next value at once."""
 
 _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
-"""Axis in the name of a vector's parameter."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -186,17 +185,9 @@ class PendingChange:
     confirmed: bool = False
     """The autopilot has answered with a value of ours: another one found later is somebody else's."""
     is_far: bool = False
-    """The value last written is the far one."""
     read_back: float | None = None
     outcome: Outcome = "failed"
     left: bool = False
-
-    def seen(self) -> WrittenParameter:
-        """Return its row in the record."""
-        change = self.change
-        return WrittenParameter(
-            before=change.before, after=change.after, read_back=self.read_back, outcome=self.outcome
-        )
 
 
 PendingVector = tuple[PendingChange, list[PendingChange]]

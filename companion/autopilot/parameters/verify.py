@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Matrix
 from companion.samples import Vector
 
 SIGMAS: Final = 4.0
@@ -53,7 +53,6 @@ class Observation:
     """Step that the output had to make (`imu_calibration.output_step`)."""
     truth: Vector
     tolerance: float
-    """Residual allowed besides noise."""
     orientation: Matrix | None = None
     """3x3, the parameters' axes to the vehicle's; None: they are the same."""
     resolution: float = 0.0
@@ -65,7 +64,6 @@ class EffectVerdict:
     """One vector."""
 
     axes: Mapping[str, AxisWord]
-    """By parameter: the step in its axis."""
     fraction_sigma: float | None
     """Sigma of the share of the expected step that was made, over all axes; None when nothing had to move."""
     problems: tuple[str, ...]
@@ -92,8 +90,13 @@ def judge(seen: Observation) -> EffectVerdict:
     sigma = np.sqrt((rotation.T**2) @ variance)
     # Both means may be misstated, each by up to a digit.
     slack = 2.0 * seen.resolution
-    fraction, fraction_sigma = _matched_filter(made, expected, sigma, seen.resolution)
-    together = _together(fraction, fraction_sigma)
+    floor = np.maximum(sigma, max(seen.resolution, 1e-12))
+    weight = float(np.sum((expected / floor) ** 2))
+    fraction, fraction_sigma = 0.0, None
+    together: AxisWord = "too small to see"
+    if math.isfinite(weight) and weight > 0.0:
+        fraction, fraction_sigma = float(np.sum(made * expected / floor**2)) / weight, 1.0 / math.sqrt(weight)
+        together = _together(fraction, fraction_sigma)
     axes: dict[str, AxisWord] = {}
     problems: list[str] = []
     for name, e, m, s in zip(seen.parameters, expected.tolist(), made.tolist(), sigma.tolist(), strict=True):
@@ -108,7 +111,7 @@ def judge(seen: Observation) -> EffectVerdict:
     if not problems and together == "not seen":
         problems.append(f"{family}: no axis moved as written; the autopilot stored the values but does not use them")
     elif not problems and together == "wrong":
-        problems.append(f"{family}: the output made {fraction or 0.0:.0%} of the step that was written")
+        problems.append(f"{family}: the output made {fraction:.0%} of the step that was written")
     for axis_name, inside, value, limit in zip("xyz", within, residual, allowed, strict=True):
         if not inside:
             problems.append(
@@ -139,16 +142,8 @@ def _judge_axis(expected: float, made: float, sigma: float, slack: float) -> tup
     return "wrong", "not the step that was written (sign, orientation, scale, or it moved)"
 
 
-def _matched_filter(made: Array, expected: Array, sigma: Array, resolution: float) -> tuple[float | None, float | None]:
-    floor = np.maximum(sigma, max(resolution, 1e-12))
-    weight = float(np.sum((expected / floor) ** 2))
-    if not math.isfinite(weight) or weight == 0.0:
-        return None, None
-    return float(np.sum(made * expected / floor**2)) / weight, 1.0 / math.sqrt(weight)
-
-
-def _together(fraction: float | None, sigma: float | None) -> AxisWord:
-    if fraction is None or sigma is None or VISIBLE_SIGMAS * sigma > 1.0:
+def _together(fraction: float, sigma: float) -> AxisWord:
+    if VISIBLE_SIGMAS * sigma > 1.0:
         return "too small to see"
     if abs(fraction - 1.0) <= SIGMAS * sigma + SCALE_TOLERANCE:
         return "seen"

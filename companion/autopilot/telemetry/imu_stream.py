@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import itertools
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -69,13 +68,8 @@ class _Source:
     reason: str = ""
 
     @property
-    def from_script(self) -> bool:
-        """ArduPilot's script sends it; `ask_script` asks for it."""
-        return self.message in imu_messages.SCRIPT.values()
-
-    @property
     def absent(self) -> bool:
-        """There is no such IMU: it read zeros for long enough."""
+        """There is no such IMU."""
         return self.zeros >= _ABSENT_AFTER
 
 
@@ -128,9 +122,12 @@ class ImuStream:
     @property
     def wants_script(self) -> bool:
         """The script's floats are better than the current source, or are the current source."""
-        sources = itertools.takewhile(lambda source: source is not self._current, self._sources)
-        here = [] if self._current is None else [self._current]
-        return any(source.from_script and self._usable(source) for source in (*sources, *here))
+        for source in self._sources:
+            if source.message.from_script and self._usable(source):
+                return True
+            if source is self._current:
+                break
+        return False
 
     @property
     def decided(self) -> bool:
@@ -177,25 +174,26 @@ class ImuStream:
             # Floats that begin late would begin a measurement anew.
             await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
         sources = [_Source(message, self._rates_hz) for message in messages]
-        self._sources = [source for source in sources if self._may_be_slow() or not source.from_script]
-        if messages[0] is imu_messages.PX4_FLOATS and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
+        self._sources = [source for source in sources if self._may_be_slow() or not source.message.from_script]
+        if messages[0].lacks_bias and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
             self._sources[0].rates_hz = [_BESIDE_CONSOLE * self._rates_hz[0], *self._rates_hz[1:]]
         self._reader = ImuSamples()
+        better: _Source | None = None
         while not self._restart.is_set():
-            found = await self._find()
+            found = better or await self._find()
             if found is None:
                 self._lose(self._why_none())
                 await self._pause(5.0)
                 for source in self._sources:
                     source.refused = False
             else:
-                await self._keep(found)
+                better = await self._keep(found)
 
     async def _find(self) -> _Source | None:
         """The first source, best first, that sends."""
         for source in filter(self._usable, self._sources):
             for _ in range(_ASKS):
-                if self._restart.is_set() or source.refused or source.from_script:
+                if self._restart.is_set() or source.refused or source.message.from_script:
                     break  # the script's take over as soon as they come
                 answered = await self._ask(source)
                 if await self._sends(source):
@@ -208,7 +206,7 @@ class ImuStream:
 
     async def _ask(self, source: _Source) -> bool:
         """Request a message at the fastest rate that is not denied; return whether an answer came in time."""
-        if source.from_script:
+        if source.message.from_script:
             return False
         while True:
             self.turns += 1
@@ -236,8 +234,8 @@ class ImuStream:
                 break
         return False
 
-    async def _keep(self, source: _Source) -> None:
-        """Serve from a source until it falls silent for good, a better one sends, or the autopilot is lost."""
+    async def _keep(self, source: _Source) -> _Source | None:
+        """Serve from a source until it is silent for good, the autopilot is lost, or a better one sends: return it."""
         loop = asyncio.get_running_loop()
         self._switch(source)
         silent_asks = 0
@@ -248,15 +246,14 @@ class ImuStream:
         while not await self._pause(_LOOK_S):
             now_s = loop.time()
             if not self._usable(source):
-                if not source.from_script:  # which has stopped by itself
+                if not source.message.from_script:  # which has stopped by itself
                     self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, source.message.message.id, 0.0)
-                return
+                return None
             better = self._better_than(source)
             if better is not None:
                 self._switch(better)
-                source = better
-                await self._ask(source)  # it may send by itself, at another rate
-                await self._ask_for_temperature(source)
+                await self._ask(better)  # it may send by itself, at another rate
+                return better
             if now_s - source.last_s < SILENCE_S:
                 silent_asks = 0
                 unknown = self._reader.temperature_degc(now_s) is None
@@ -265,18 +262,19 @@ class ImuStream:
                     await self._ask_for_temperature(source)
                 better_s = await self._ask_for_better(source, better_s)
             elif source.absent:
-                return
+                return None
             elif now_s - asked_s >= SILENCE_S:
                 self.problem = (
                     f"{source.message.name} has been silent for {now_s - source.last_s:.0f} s; asked for it again"
                 )
-                if silent_asks >= _ASKS:
-                    return
                 silent_asks += 1
+                if silent_asks > _ASKS:
+                    return None
                 asked_s = now_s
                 await self._ask(source)
                 if source.refused:
-                    return
+                    return None
+        return None
 
     def _better_than(self, source: _Source) -> _Source | None:
         """A better source that has begun to send at a useful rate."""
@@ -303,16 +301,16 @@ class ImuStream:
         """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
         if source.message.message is imu_messages.HIGHRES.message:
             rate_hz = _TEMPERATURE_RATE_HZ if source.message is imu_messages.HIGHRES else _SEEN_BY_RATE_HZ
-            for each in (each for each in self._sources[1:] if not each.from_script):
+            for each in (each for each in self._sources[1:] if not each.message.from_script):
                 result = await self._vehicle.commands.request_message_interval(each.message.message.id, rate_hz)
                 if result in (mavlink.MAV_RESULT_ACCEPTED, None):
                     return
 
     def _usable(self, source: _Source) -> bool:
         """Not while it wants a bias that is not known, or is of another IMU; from the script only while disarmed."""
-        if source.from_script:
+        if source.message.from_script:
             return self._vehicle.arm_state is ArmState.DISARMED
-        return source.message is not imu_messages.PX4_FLOATS or self._ekf_bias.known_of(self._instance)
+        return not source.message.lacks_bias or self._ekf_bias.known_of(self._instance)
 
     async def _pause(self, seconds: float) -> bool:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
@@ -357,7 +355,7 @@ class ImuStream:
         if source is self._current:
             self.samples += 1
             self.problem = ""
-            bias = self._ekf_bias.reading if source.message is imu_messages.PX4_FLOATS else None
+            bias = self._ekf_bias.reading if source.message.lacks_bias else None
             self._on_sample(self._reader.complete(sample, bias))
 
     def _lose(self, problem: str) -> None:
@@ -380,7 +378,7 @@ class ImuStream:
 
     def _why_none(self) -> str:
         ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]
-        sources = [source for source in self._sources if self._usable(source) and not source.from_script]
+        sources = [source for source in self._sources if self._usable(source) and not source.message.from_script]
         if all(source.absent for source in sources if not source.refused and not source.reason):
             zero = [source.message.name for source in sources if source.absent]
             if zero:

@@ -49,7 +49,6 @@ class Px4Console:
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.text = ""
-        """Latest answer."""
         self._link, self._vehicle = link, vehicle
         self._asked, self._number = "", -1
         self._answered, self._lock = asyncio.Event(), asyncio.Lock()
@@ -119,7 +118,6 @@ class EkfBias:
         self.reading: EkfBiasReading | None = None
         """Latest reading; `known_of` says whether it may be used."""
         self.on_read: Listeners[EkfBiasReading] = Listeners()
-        """Notified of every reading."""
         self._console, self._vehicle = console, vehicle
         self._held, self._misses = 0, 0
         self._woken = asyncio.Event()
@@ -178,7 +176,6 @@ class EkfBias:
         return math.inf if self.reading is None else asyncio.get_running_loop().time() - self.reading.read_s
 
     async def _look(self) -> float:
-        """Read once; seconds to the next look."""
         if not await self._read():
             self._misses += 1
             self.settled.set()
@@ -275,7 +272,6 @@ class ImuStatus:
         self._console, self._ekf_bias, self._wanted, self._tell = console, ekf_bias, wanted, tell
         self._pause_s = SLOW_PAUSE_S if slow else PAUSE_S
         self._seen: dict[int, str] = {}
-        """Time of the publication printed last, by instance."""
 
     async def run(self) -> None:
         """Ask until cancelled."""

@@ -24,17 +24,14 @@ MAX_WAITING: Final = 16
 """Commands of one kind that may wait; beyond that the newest is dropped, counted, and answered None at once."""
 
 
-@dataclasses.dataclass(slots=True)
-class _Request:
-    """One command: what is sent, how long its answer is awaited, and who waits."""
+_Answer = asyncio.Future[int | None]
+_Request = tuple[tuple[float, ...], float, _Answer]
+"""Parameters of a command, how long its answer is awaited, and the answer."""
 
-    parameters: tuple[float, ...]
-    timeout_s: float
-    answer: asyncio.Future[int | None]
 
-    def settle(self, result: int | None) -> None:
-        if not self.answer.done():
-            self.answer.set_result(result)
+def _settle(answer: _Answer, result: int | None) -> None:
+    if not answer.done():
+        answer.set_result(result)
 
 
 class Commands:
@@ -51,28 +48,27 @@ class Commands:
         self._last_ack = (0, 0, 0, -math.inf)
         link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 
-    def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> asyncio.Future[int | None]:
+    def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> _Answer:
         """Send when its turn comes; the future brings the MAV_RESULT, or None when none came in time.
 
         The time runs from the sending; IN_PROGRESS starts it anew. The future never carries an exception, so it may
         be left alone.
         """
-        answer: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
+        answer: _Answer = asyncio.get_running_loop().create_future()
         queue = self._queues.setdefault(command, deque())
-        request = _Request(parameters, timeout_s, answer)
         if len(queue) >= MAX_WAITING:
             self.results["dropped"] += 1
-            request.settle(None)
+            answer.set_result(None)
         else:
-            queue.append(request)
+            queue.append((parameters, timeout_s, answer))
             self._next(command)
         return answer
 
-    def request_message_interval(self, message_id: int, rate_hz: float) -> asyncio.Future[int | None]:
+    def request_message_interval(self, message_id: int, rate_hz: float) -> _Answer:
         """Ask for a message at a rate (MAV_CMD_SET_MESSAGE_INTERVAL)."""
         return self.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, round(1e6 / rate_hz))
 
-    def request_message(self, message_id: int) -> asyncio.Future[int | None]:
+    def request_message(self, message_id: int) -> _Answer:
         """Ask for a message once (MAV_CMD_REQUEST_MESSAGE)."""
         return self.send(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
 
@@ -81,8 +77,8 @@ class Commands:
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
-        for request in [*self._in_flight.values(), *(r for queue in self._queues.values() for r in queue)]:
-            request.settle(None)
+        for _, _, answer in [*self._in_flight.values(), *(each for queue in self._queues.values() for each in queue)]:
+            _settle(answer, None)
         self._in_flight.clear()
         self._queues.clear()
 
@@ -91,37 +87,35 @@ class Commands:
         target = self._target()
         while queue and command not in self._in_flight:
             request = queue.popleft()
-            if request.answer.done():  # whoever waited has gone
+            parameters, _, answer = request
+            if answer.done():  # whoever waited has gone
                 continue
             if target is None:
-                request.settle(None)
+                answer.set_result(None)
                 continue
-            padded = (*request.parameters, *(0.0,) * (7 - len(request.parameters)))
+            padded = (*parameters, *(0.0,) * (7 - len(parameters)))
             self._link.send(mavlink.MAVLink_command_long_message(*target, command, 0, *padded))
             self._in_flight[command] = request
-            self._arm_timer(command, request)
+            self._arm_timer(command)
 
-    def _arm_timer(self, command: int, request: _Request) -> None:
+    def _arm_timer(self, command: int) -> None:
         if command in self._timers:
             self._timers[command].cancel()
-        loop = asyncio.get_running_loop()
-        self._timers[command] = loop.call_later(request.timeout_s, self._finish, command, None)
+        loop, (_, timeout_s, _) = asyncio.get_running_loop(), self._in_flight[command]
+        self._timers[command] = loop.call_later(timeout_s, self._finish, command, None)
 
     def _finish(self, command: int, result: int | None) -> None:
         self._timers.pop(command).cancel()
-        request = self._in_flight.pop(command)
+        _, _, answer = self._in_flight.pop(command)
         self.results["no answer" if result is None else result_name(result)] += 1
-        request.settle(result)
+        _settle(answer, result)
         self._next(command)
 
     def _on_ack(self, message: mavlink.MAVLink_command_ack_message, t_s: float) -> None:
-        request = self._in_flight.get(message.command)
-        if request is None or (message.get_srcSystem(), message.get_srcComponent()) != self._target():
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        if message.command not in self._in_flight or sender != self._target():
             return
-        # Zero is everybody: older firmware does not say whom it answers.
-        if message.target_system not in (0, self._link.system_id):
-            return
-        if message.target_component not in (0, self._link.component_id):
+        if not self._link.is_for_us(message):
             return
         # Two routes bring a packet twice; the second must not answer the next request of the same command.
         copy = (message.command, message.get_seq(), message.result)
@@ -129,7 +123,7 @@ class Commands:
             return
         self._last_ack = (*copy, t_s)
         if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
-            self._arm_timer(message.command, request)
+            self._arm_timer(message.command)
         else:
             self._finish(message.command, message.result)
 

@@ -16,7 +16,7 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -55,10 +55,7 @@ class EkfWatch:
         vehicle.hear(mavlink.MAVLink_ahrs_message, self._on_ahrs)
 
     async def bias_rad_s(self) -> float | None:
-        """The largest axis of the estimate, mean of the last 2 s (or less, where less has come).
-
-        None: this autopilot does not tell.
-        """
+        """Return the largest axis of the estimate, mean of the last 2 s or less; None: this autopilot does not tell."""
         for _ in range(_ASKS):
             if (found := self._mean(0.0)) is not None:
                 return found
@@ -147,15 +144,6 @@ OLD_S: Final = 5.0
 _MAGNETOMETER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
 
 
-class Angles(NamedTuple):
-    """Angles of ATTITUDE, rad."""
-
-    t_s: float
-    roll: float
-    pitch: float
-    yaw: float
-
-
 class OwnCompass:
     """Health of the magnetometer and its agreement with the yaw; `wanted`: request the messages all the time."""
 
@@ -191,7 +179,7 @@ class OwnAttitude:
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._vehicle, self._wanted = vehicle, wanted
-        self._seen: deque[Angles] = deque(maxlen=256)
+        self._seen: deque[tuple[float, float, float, float]] = deque(maxlen=256)
         self._compass = OwnCompass(vehicle, wanted=wanted)
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, RATE_HZ if wanted else None)
 
@@ -201,8 +189,8 @@ class OwnAttitude:
         seen = self._since(now_s - KEPT_S)
         if len(seen) < 2 or not self._compass.agrees(now_s):
             return None
-        last = seen[-1].yaw
-        turned = [(one.yaw - last + math.pi) % (2.0 * math.pi) - math.pi for one in seen]
+        last = seen[-1][3]
+        turned = [math.remainder(yaw - last, 2.0 * math.pi) for _, _, _, yaw in seen]
         if max(turned) - min(turned) > STEADY_DEG * DEG:
             return None
         # Without a place it knows no declination.
@@ -224,9 +212,9 @@ class OwnAttitude:
     def up(self, since_s: float) -> Array | None:
         """Mean direction of up in the vehicle's axes, (3,), of a second at least from then on; None before that."""
         seen = self._since(since_s)
-        if len(seen) < LEAST or seen[-1].t_s - seen[0].t_s < LEAST_S:
+        if len(seen) < LEAST or seen[-1][0] - seen[0][0] < LEAST_S:
             return None
-        ups = [body_from_ned(one.roll, one.pitch, 0.0) @ (0.0, 0.0, -1.0) for one in seen]
+        ups = [body_from_ned(roll, pitch, 0.0) @ (0.0, 0.0, -1.0) for _, roll, pitch, _ in seen]
         return np.asarray(np.mean(ups, axis=0))
 
     async def up_since(self, since_s: float) -> Array | None:
@@ -237,10 +225,10 @@ class OwnAttitude:
             await asyncio.sleep(LOOK_S)
         return found
 
-    def _since(self, t_s: float) -> list[Angles]:
-        return [one for one in self._seen if one.t_s >= t_s]
+    def _since(self, t_s: float) -> list[tuple[float, float, float, float]]:
+        return [one for one in self._seen if one[0] >= t_s]
 
     def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
         angles = (message.roll, message.pitch, message.yaw)
         if all(map(math.isfinite, angles)):
-            self._seen.append(Angles(t_s, *angles))
+            self._seen.append((t_s, *angles))

@@ -15,7 +15,7 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters, parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters
 from companion.autopilot.parameters.change import same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.errors import AutopilotError, NotDisarmedError
@@ -45,7 +45,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     Raises:
         AutopilotError: one cannot be read, or the autopilot restarted meanwhile.
     """
-    boots, every = parameters.boots, [parameters_of(instance) for instance in INSTANCES]
+    boots, every = parameters.boots, [ArduPilotParameters(instance) for instance in INSTANCES]
     found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
     present = [names for names in every if names.gyro_offset[0] in found]
     if not present:
@@ -53,7 +53,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     found |= await parameters.read_many(name for names in present for name in names.gyro_offset[1:])
     more = (name for names in present for name in (names.gyro_caltemp, names.gyro_id))
     found |= await parameters.read_many(more, optional=True)
-    parameters.require_same_boot(boots, "while its gyro parameters were read")
+    parameters.require_same_boot(boots, "restarted while its gyro parameters were read")
     return found
 
 
@@ -95,7 +95,7 @@ async def calibrate(
                 await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
             else:
                 await asyncio.wait([answer], timeout=_LOOK_S)
-            parameters.require_same_boot(boots, "during its gyro calibration")
+            parameters.require_same_boot(boots, "restarted during its gyro calibration")
             state = await _state(parameters, before)
             if state == "ended":
                 # An acknowledgement that is still on its way says more than its absence.
@@ -108,7 +108,7 @@ async def calibrate(
                 go_on(f"the autopilot calibrates its gyros for {loop.time() - sent_s:.0f} s: keep the aircraft still")
         await asyncio.sleep(_AFTERWARDS_S)
         after = await read_overwritten(parameters)
-        parameters.require_same_boot(boots, "during its gyro calibration")
+        parameters.require_same_boot(boots, "restarted during its gyro calibration")
         outcome, words = _judge(answer.result() if answer.done() else None, ran=bool(changed(before, after)))
         return outcome, words, after
     finally:
@@ -139,8 +139,7 @@ async def _state(parameters: ParameterClient, before: Mapping[str, float]) -> Li
 
 
 def _present(values: Mapping[str, float]) -> list[ArduPilotParameters]:
-    """Return the names of the instances whose gyro offsets were read."""
-    return [names for names in map(parameters_of, INSTANCES) if set(names.gyro_offset) <= values.keys()]
+    return [names for names in map(ArduPilotParameters, INSTANCES) if set(names.gyro_offset) <= values.keys()]
 
 
 def _judge(result: int | None, *, ran: bool) -> tuple[GyroOutcome, str]:

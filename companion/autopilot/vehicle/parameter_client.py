@@ -37,7 +37,6 @@ _REMEMBERED_TYPES: Final = 4096
 """More parameters than any firmware has; what is not remembered is asked for."""
 
 _TIMEOUT_S: Final = 1.0
-"""Time limit of each request."""
 _TRIES: Final = 4
 _TRIES_MORE: Final = 8
 """While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
@@ -126,15 +125,15 @@ class ParameterClient(Parameters):
         """Starts of the autopilot that have been seen."""
         return self.vehicle.boots
 
-    async def ensure_same_boot(self, boots: int, when: str) -> None:
+    async def ensure_same_boot(self, boots: int, words: str) -> None:
         """Ask for the time since boot, then as `require_same_boot`."""
         await self.vehicle.hear_boot_time()
-        self.require_same_boot(boots, when)
+        self.require_same_boot(boots, words)
 
-    def require_same_boot(self, boots: int, when: str) -> None:
+    def require_same_boot(self, boots: int, words: str) -> None:
         """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
         if self.boots != boots:
-            raise AutopilotRebootedError(f"{self.vehicle.name} restarted {when}")
+            raise AutopilotRebootedError(f"{self.vehicle.name} {words}")
 
     async def read(self, name: str) -> float:
         """Ask for a parameter by name and return what comes.
@@ -291,7 +290,6 @@ class ParameterClient(Parameters):
         self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
 
     async def _ask(self, inbox: _Inbox, name: str, index: int) -> _Answer | None:
-        """One PARAM_REQUEST_READ and the first answer to it."""
         message = mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
         self._link.send(message)
         answer = await inbox.get(asyncio.get_running_loop().time() + _TIMEOUT_S)
@@ -300,7 +298,6 @@ class ParameterClient(Parameters):
         return answer
 
     async def _ask_repeatedly(self, name: str, tries: Iterable[int]) -> tuple[_Answer | None, int]:
-        """The first answer, and how many requests there were."""
         count = 0
         with self._exchange(name) as inbox:
             for count in tries:
@@ -342,10 +339,7 @@ class ParameterClient(Parameters):
         self.on_value.tell(name, value)
 
     def _on_error(self, message: mavlink.MAVLink_param_error_message, _t_s: float) -> None:
-        system, component = (0, self._link.system_id), (0, self._link.component_id)
-        if message.target_system not in system or message.target_component not in component:
-            return
-        if message.error == _NO_ERROR:
+        if message.error == _NO_ERROR or not self._link.is_for_us(message):
             return
         for inbox in self._inboxes:
             if inbox.name == message.param_id:

@@ -306,7 +306,6 @@ class ParameterWriter:
             self._publish(items)
 
     async def _put_back_one(self, item: PendingChange, value: float, *, leave_foreign: bool) -> None:
-        """Set one parameter to its old value, or to the far one."""
         change = item.change
         if not await self._wait_disarmed() or self._late():
             return
@@ -358,7 +357,12 @@ class ParameterWriter:
         return "changed by someone else" if foreign else "answered another value"
 
     def _publish(self, items: list[PendingChange]) -> dict[str, WrittenParameter]:
-        self.written = {item.change.parameter: item.seen() for item in items}
+        self.written = {
+            (c := item.change).parameter: WrittenParameter(
+                before=c.before, after=c.after, read_back=item.read_back, outcome=item.outcome
+            )
+            for item in items
+        }
         self.left_changed = tuple(item.change.parameter for item in items if item.left)
         self.left_far = tuple(item.change.parameter for item in items if item.left and item.is_far)
         return self.written

@@ -72,7 +72,6 @@ class Vehicle:
         self.system_id: int | None = None
         self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
         self.kind: Firmware = UNHEARD
-        """Firmware of the latched autopilot, and all that is particular to it."""
         self.version: str | None = None
         """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
         self.capabilities: int | None = None
@@ -80,7 +79,6 @@ class Vehicle:
         self.uid: str | None = None
         """The board's unique id, hex digits (`unique_id`); None until AUTOPILOT_VERSION has come, or it tells none."""
         self.system_status: int | None = None
-        """MAV_STATE of the last heartbeat."""
         self.signs = False
         """The autopilot signed its last heartbeat (MAVLink 2)."""
         self.boots = 0
@@ -98,9 +96,7 @@ class Vehicle:
         self._conflict_logged = False
         self._lost = True
         self.on_event: Listeners[[VehicleEvent]] = Listeners()
-        """Notified of events, in the order in which they are seen."""
         self.found = asyncio.Event()
-        """Set while the autopilot is being heard."""
         self._wanted = StandingRequests(self.commands)
         for each in FIRMWARES:
             if each.heartbeat_rate_hz is not None:

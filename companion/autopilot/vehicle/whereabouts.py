@@ -51,15 +51,6 @@ class Position:
     source: str
 
 
-@dataclasses.dataclass(slots=True)
-class _Claim:
-    """A place that is said and not believed yet; None: nowhere on Earth."""
-
-    place: Position | None
-    since_s: float
-    heard_s: float
-
-
 class TimeAndPlace:
     """Takes the autopilot's messages; whoever calls has made sure that they are the autopilot's.
 
@@ -68,11 +59,12 @@ class TimeAndPlace:
 
     def __init__(self, is_carried: Callable[[], bool] = lambda: False) -> None:
         self.position: Position | None = None
-        """The place that is believed."""
         self._is_carried = is_carried
         self._anchor: Position | None = None
         """Place that others are compared with; it stays while the aircraft stands still."""
-        self._claim: _Claim | None = None
+        self._claim: Position | None = None
+        """Place that is said and not believed yet, first and last at these times; None: nowhere on Earth."""
+        self._since_s = self._heard_s = -math.inf
         self._unix_minus_loop_s: float | None = None
 
     @property
@@ -85,17 +77,18 @@ class TimeAndPlace:
     @property
     def doubt(self) -> str | None:
         """Why the place is not known for sure at this moment, and what helps; None while it is, or none is said."""
-        claim, now_s = self._claim, asyncio.get_running_loop().time()
-        if claim is None or now_s - claim.heard_s >= SILENT_S:
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._heard_s >= SILENT_S:
             return None
         if self._anchor is None:
             return f"waiting for the position to be confirmed {_OR_SET}"
-        left_s = max(1.0, SETTLED_AFTER_S - (now_s - claim.since_s))
-        return f"{_apart(self._anchor, claim.place)} while still: waiting {left_s:.0f} s for it to stay {_OR_SET}"
+        left_s = max(1.0, SETTLED_AFTER_S - (now_s - self._since_s))
+        return f"{_apart(self._anchor, self._claim)} while still: waiting {left_s:.0f} s for it to stay {_OR_SET}"
 
     def restarted(self) -> None:
         """Forget what the autopilot has said; an aircraft that stands still is where it was."""
         self.position = self._claim = self._unix_minus_loop_s = None
+        self._heard_s = -math.inf
 
     def hear_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
         """Take the date, unless it cannot be one."""
@@ -105,7 +98,7 @@ class TimeAndPlace:
     def hear_estimate(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
         """Take the place that the autopilot flies by."""
         place = _position(message.lat, message.lon, message.alt, _ESTIMATE)
-        said = (self.position, None if self._claim is None else self._claim.place)
+        said = (self.position, self._claim)
         if place is not None or any(each is not None and each.source == _ESTIMATE for each in said):
             self._hear(place, t_s)
 
@@ -116,22 +109,20 @@ class TimeAndPlace:
             self._hear(_position(message.lat, message.lon, message.alt, _RECEIVER), t_s)
 
     def _hear(self, place: Position | None, t_s: float) -> None:
-        claim = self._claim
         if _is_near(place, self._anchor):
             self.position = place
-            if claim is not None:
-                claim.since_s = t_s  # who contradicts it begins anew
+            self._since_s = t_s  # who contradicts it begins anew
         elif place is not None and _is_near(place, self.position) and self._is_carried():
             self.position = self._anchor = place
-        elif claim is None or t_s - claim.heard_s >= SILENT_S or not _is_near(place, claim.place):
-            self._claim = _Claim(place, t_s, t_s)
+        elif t_s - self._heard_s >= SILENT_S or not _is_near(place, self._claim):
+            self._claim, self._since_s, self._heard_s = place, t_s, t_s
             if self._anchor is not None:
                 logger.warning("%s while the aircraft stands still: not believed yet", _apart(self._anchor, place))
         else:
-            claim.heard_s = t_s
-            if t_s - claim.since_s >= (CONFIRMED_AFTER_S if self._anchor is None else SETTLED_AFTER_S):
+            self._heard_s = t_s
+            if t_s - self._since_s >= (CONFIRMED_AFTER_S if self._anchor is None else SETTLED_AFTER_S):
                 self.position = self._anchor = place
-                self._claim = None
+                self._claim, self._heard_s = None, -math.inf
 
 
 def _position(latitude_1e7: int, longitude_1e7: int, height_mm: int, source: str) -> Position | None:
@@ -150,14 +141,10 @@ def _is_near(one: Position | None, other: Position | None) -> bool:
 
 
 def _distance_m(one: Position, other: Position) -> float:
-    """Along the surface (haversine)."""
-    north, east = math.radians(other.latitude_deg), math.radians(other.longitude_deg)
-    from_north, from_east = math.radians(one.latitude_deg), math.radians(one.longitude_deg)
-    half = (
-        math.sin((north - from_north) / 2) ** 2
-        + math.cos(north) * math.cos(from_north) * math.sin((east - from_east) / 2) ** 2
-    )
-    return 2.0 * _EARTH_RADIUS_M * math.asin(math.sqrt(min(half, 1.0)))
+    north, from_north = math.radians(one.latitude_deg), math.radians(other.latitude_deg)
+    turn = math.cos(math.radians(one.longitude_deg - other.longitude_deg))
+    cosine = math.sin(north) * math.sin(from_north) + math.cos(north) * math.cos(from_north) * turn
+    return _EARTH_RADIUS_M * math.acos(max(-1.0, min(cosine, 1.0)))
 
 
 def _apart(before: Position, now: Position | None) -> str:

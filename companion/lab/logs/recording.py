@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 import msgspec
 
 from companion.autopilot.firmware.firmwares import FIRMWARES, firmware_named
-from companion.autopilot.firmware.imu_messages import PX4_FLOATS, EkfBiasReading, ImuSamples, all_zero
+from companion.autopilot.firmware.imu_messages import EkfBiasReading, ImuSamples, all_zero
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
 from companion.errors import StorageError
@@ -238,7 +238,7 @@ class Playback:
         found = source.decode(message, t_s)
         if isinstance(found, str) or all_zero(found) or not samples.accept(source.name, found):
             return None
-        bias = self._bias if source is PX4_FLOATS else None
-        if source.name != state.message or state.calibration is None or (source is PX4_FLOATS and bias is None):
+        bias = self._bias if source.lacks_bias else None
+        if source.name != state.message or state.calibration is None or (source.lacks_bias and bias is None):
             return None
         return samples.complete(found, bias)

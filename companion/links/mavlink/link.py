@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -68,6 +68,10 @@ class MavlinkLink:
         """Belong to this autopilot's vehicle from here on: we send under its system id."""
         self.autopilot = autopilot
         self._codec.srcSystem = autopilot[0]
+
+    def is_for_us(self, message: Any) -> bool:
+        """Check a message's target: ourselves, or 0, everybody (older firmware does not say whom it answers)."""
+        return message.target_system in (0, self.system_id) and message.target_component in (0, self.component_id)
 
     @property
     def half_received(self) -> bytes:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot_calibration import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
@@ -69,7 +69,7 @@ def read(parameters: dict[str, float], instance: int = 1, autopilot: ScriptedAut
 
 
 def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
-    one, two, three = parameters_of(1), parameters_of(2), parameters_of(3)
+    one, two, three = ArduPilotParameters(1), ArduPilotParameters(2), ArduPilotParameters(3)
     assert one.gyro_offset == ("INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z")
     assert one.accel_offset[1] == "INS_ACCOFFS_Y"
     assert one.accel_scale[2] == "INS_ACCSCAL_Z"
@@ -82,14 +82,14 @@ def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
     assert (two.gyro_caltemp, two.tcal_enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
     assert three.accel_offset[2] == "INS_ACC3OFFS_Z"
     assert one.tcal_enable == "INS_TCAL1_ENABLE"
-    four = parameters_of(4)
+    four = ArduPilotParameters(4)
     assert four.gyro_offset == ("INS4_GYROFFS_X", "INS4_GYROFFS_Y", "INS4_GYROFFS_Z")
     assert (four.gyro_id, four.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
     for names in (one, two, three, four):
         for name in (*names.gyro_offset, *names.accel_scale, names.tcal_enable):
             assert len(name) <= 16
     with pytest.raises(AutopilotError, match="IMU 6"):
-        parameters_of(6)
+        ArduPilotParameters(6)
 
 
 def test_reads_what_is_there() -> None:
@@ -206,7 +206,7 @@ def test_a_restart_while_reading_is_no_calibration() -> None:
 def plain(**changes: object) -> ImuCalibration:
     calibration = ImuCalibration(
         instance=1,
-        parameters=parameters_of(1),
+        parameters=ArduPilotParameters(1),
         gyro_offset_rad_s=(0.001, 0.002, 0.003),
         accel_offset_m_s2=(0.1, 0.2, 0.3),
         accel_scale=(1.0, 1.0, 1.0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import whole_bias
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
@@ -13,7 +13,7 @@ from companion.estimation.solution.prior import curve_of
 from companion.estimation.temperature.curve import Polynomial, of_curve
 from tests.unit.autopilot.test_ardupilot import IMU1, read
 
-ON: dict[str, float] = dict.fromkeys(parameters_of(1).tcal, 0.0) | {
+ON: dict[str, float] = dict.fromkeys(ArduPilotParameters(1).tcal, 0.0) | {
     "INS_TCAL1_ENABLE": 1.0,
     "INS_TCAL1_TMIN": 10.0,
     "INS_TCAL1_TMAX": 45.0,
@@ -65,17 +65,17 @@ def test_somebody_who_sets_one_of_them_contradicts_what_is_known() -> None:
 
 
 def test_names_from_the_fourth_instance_on_are_others_and_all_fit_into_a_message() -> None:
-    four = parameters_of(4)
+    four = ArduPilotParameters(4)
     assert (four.tcal_enable, four.gyro_caltemp, four.tcal_gyro[2][1]) == (
         "INS4_TCAL_ENABLE",
         "INS4_GYR_CALTEMP",
         "INS4_TCAL_GYR3_Y",
     )
-    assert (parameters_of(2).accel_caltemp, parameters_of(2).tcal_accel[0][0]) == (
+    assert (ArduPilotParameters(2).accel_caltemp, ArduPilotParameters(2).tcal_accel[0][0]) == (
         "INS_ACC2_CALTEMP",
         "INS_TCAL2_ACC1_X",
     )
-    assert max(len(name) for n in (1, 2, 3, 4, 5) for name in parameters_of(n).tcal) == 16
+    assert max(len(name) for n in (1, 2, 3, 4, 5) for name in ArduPilotParameters(n).tcal) == 16
 
 
 def test_a_polynomial_is_held_at_the_ends_of_its_span_and_can_be_nothing_anywhere() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import EffectVerdict
@@ -23,7 +23,7 @@ def calibration() -> ImuCalibration:
     zero = (0.0, 0.0, 0.0)
     return ImuCalibration(
         instance=1,
-        parameters=parameters_of(1),
+        parameters=ArduPilotParameters(1),
         gyro_offset_rad_s=zero,
         accel_offset_m_s2=zero,
         accel_scale=(1.0, 1.0, 1.0),
@@ -58,7 +58,9 @@ def verdict_of(
     """Judge a write of `step` (3,) after which the output moved by `made`; None: by `step`."""
     before = window(rng.normal(0.0, noise, (spans[0], 3)), 0.0)
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if made is None else made)
-    changes = [Change(name, 0.0, float(each)) for name, each in zip(parameters_of(1).gyro_offset, step, strict=True)]
+    changes = [
+        Change(name, 0.0, float(each)) for name, each in zip(ArduPilotParameters(1).gyro_offset, step, strict=True)
+    ]
     (verdict,) = judge_vectors(before, after, (np.asarray(step), None), calibration(), changes, "icm42688p", {})
     return verdict
 

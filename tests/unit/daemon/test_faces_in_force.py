@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, whole_accelerometer
 from companion.cli.client import sides_lines
 from companion.config import parse
@@ -32,7 +32,7 @@ def calibration(
 ) -> ImuCalibration:
     return ImuCalibration(
         instance=1,
-        parameters=parameters_of(1),
+        parameters=ArduPilotParameters(1),
         gyro_offset_rad_s=(0.0, 0.0, 0.0),
         accel_offset_m_s2=offset,
         accel_scale=scale,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.daemon.offsets.plan import as_good
 from companion.estimation.solution.solve import ImuSolution, Shared
@@ -17,7 +17,7 @@ from companion.physics.units import DEG_H
 ESTIMATED_DEG_H, NEXT_MINUTES_DEG_H = 1.0, 17.0
 CALIBRATION = ImuCalibration(
     instance=1,
-    parameters=parameters_of(1),
+    parameters=ArduPilotParameters(1),
     gyro_offset_rad_s=(1e-3, 1e-3, 1e-3),
     accel_offset_m_s2=(0.0, 0.0, 0.0),
     accel_scale=(1.0, 1.0, 1.0),
@@ -46,7 +46,7 @@ def is_left(residual_deg_h: float, estimated_deg_h: float = ESTIMATED_DEG_H, wri
         sigma_in_force=lambda triad: (sigma,) * 3,
         gyro_sigma_stat_rad_s=averaged,
         accel_sigma_stat_m_s2=averaged,
-        written={name: SimpleNamespace(after=written_rad_s) for name in parameters_of(1).gyro_offset},
+        written={name: SimpleNamespace(after=written_rad_s) for name in ArduPilotParameters(1).gyro_offset},
     )
     return as_good(CALIBRATION, found, shared, earlier) == {"gyro"}
 

@@ -9,8 +9,7 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.exchange import Exchange
-from companion.ground.link import GroundLink
+from companion.ground.link import Exchange, GroundLink
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,
