@@ -168,8 +168,10 @@ class CalibrationRun(Job):
         self._machine.on(Event.MOVED)
         logger.warning("%s; put back, measuring again", error.reason)
         self._forget()
-        anew = "written where it belongs" if error.kind == "not as believed" else "tried again"
-        self.log.warnings.append(f"{error.reason}; put back, and {anew}")
+        if error.kind == "not as believed":
+            self.log.warnings.append(f"{error.reason}; put back, and written where it belongs")
+        else:
+            self.log.warnings.append(f"{error.reason}; put back, and tried again")
         self.check_cancelled()
 
     # --- the phases

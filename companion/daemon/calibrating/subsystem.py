@@ -216,8 +216,9 @@ class Calibrating(Subsystem):
             level=asked.level and on_turn,
         )
         if self._core.config.vehicle.platform == "deck":
-            what = "a zero is" if _KINDS[action] == ALIGNMENT else "accelerometers are"
-            return Refusal("other", f"{what} not measured on a deck that moves: align ashore")
+            if _KINDS[action] == ALIGNMENT:
+                return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
+            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
         task: PoseTask
         if action == "faces":
             task = SidesTask(request, self._imus, self.faces)
