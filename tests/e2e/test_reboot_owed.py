@@ -74,8 +74,8 @@ async def test_a_restart_that_nobody_saw_shows_in_the_time_since_boot(
     def known(boot_s: float | None, host: str) -> RebootOwed:
         monkeypatch.setenv("COMPANION_BOOT_ID", host)
         now_s = asyncio.get_running_loop().time()
-        boot = SimpleNamespace(latest_s=boot_s, latest=None if boot_s is None else (boot_s, now_s))
-        vehicle = SimpleNamespace(kind=PX4(), system_id=1, boots=0, boot=SimpleNamespace(clock=boot))
+        boot = SimpleNamespace(latest=None if boot_s is None else (boot_s, now_s))
+        vehicle = SimpleNamespace(kind=PX4(), system_id=1, boots=0, boot=boot)
         config = SimpleNamespace(storage=SimpleNamespace(path=tmp_path))
         core: Any = SimpleNamespace(config=config, vehicle=vehicle, offload=inline)
         made = RebootOwed(core)
