@@ -1,4 +1,4 @@
-"""Which heartbeats on a network are the autopilot's, whether it is armed, has restarted. Pure: time comes in.
+"""Sort heartbeats: which are the autopilot's, whether it is armed, whether it has restarted. Pure: time comes in.
 
 Anybody on an unsigned link can say "disarmed" under the autopilot's ids, as often as he likes; but the autopilot's own
 heartbeats are heard too. So "armed" outweighs "disarmed", and who says both by turns is not believed at all.
