@@ -39,8 +39,10 @@ def stack(runs: Sequence[object], name: str) -> Any:
 def rms(errors: Array) -> Figure:
     """Root mean square of errors (stands, …), the standard error by the scatter between stands; NaN are left out."""
     each = np.square(errors).reshape(len(errors), -1)
-    square = float(np.nanmean(each))
     counted = np.isfinite(each).sum(axis=1)
+    if not counted.any():
+        return Figure(math.nan, math.nan)
+    square = float(np.nanmean(each))
     # A ratio of sums over stands, for stands may count differently.
     apart = np.nansum(each - square, axis=1)
     error = math.sqrt(float(np.square(apart).sum())) / float(counted.sum())
