@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,8 +91,12 @@ class ImuAlignment:
     gyro_bias_rad_s: Figures
 
 
-Complaint = tuple[ResidualLabel, float, float]
-"""The residual that fits worst: its label, how far it is off in its own sigmas, and in SI units."""
+class Complaint(NamedTuple):
+    """The residual that fits worst: in its own sigmas, and in SI units."""
+
+    label: ResidualLabel
+    sigmas: float
+    size: float
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +233,7 @@ def _worst(found: LeastSquares, model: Model) -> Complaint | None:
     alone = labels[k][0] in ("zero", "prior")
     axes = [k] if alone else [j for j, label in enumerate(labels) if label == labels[k] and usable[j]]
     size = float(np.linalg.norm(residual[axes] * model.row_sigma[axes] / redundancy[axes]))
-    return labels[k], abs(float(w[k])), size
+    return Complaint(labels[k], abs(float(w[k])), size)
 
 
 def _imu(model: Model, at: Array, covariance: Matrix, ground: Ground, k: int) -> ImuAlignment:

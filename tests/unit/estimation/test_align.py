@@ -232,9 +232,9 @@ def test_a_spot_that_moved_is_noticed(headings: list[float], bumped: int) -> Non
         if found.complaint is None:
             missed += 1
         else:
-            assert found.complaint[0][0] == "spot"
+            assert found.complaint.label[0] == "spot"
             assert "the spot moved" in in_words(found.complaint)
-            assert 0.1 < found.complaint[2] / DEG < 0.6
+            assert 0.1 < found.complaint.size / DEG < 0.6
     # Between the second and the third of four quarters the tip looks half like a zero.
     assert missed <= (2 if len(headings) == 3 else 6)
 
@@ -248,7 +248,7 @@ def test_without_the_way_back_only_a_gross_movement_shows_and_it_is_said_that_no
     world.zero_deg = np.array([6.0, 0.0])
     gross = world.align([world.stand(before[0]), world.stand(on_spot([180.0], (0.5, -0.4))[0])])
     assert gross.complaint is not None
-    assert gross.complaint[0][0] == "zero"
+    assert gross.complaint.label[0] == "zero"
     assert "stand level on its base" in in_words(gross.complaint)
 
 

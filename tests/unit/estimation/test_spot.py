@@ -179,7 +179,7 @@ def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
 
 
 def test_without_a_gradienter_none_is_blamed() -> None:
-    loose: Complaint = ("accelerometer", 2, "fc"), 7.0, 3.0 * MG
+    loose = Complaint(("accelerometer", 2, "fc"), 7.0, 3.0 * MG)
     assert "gradienter" in in_words(loose)
     assert in_words(loose, gradienter=False).startswith(
         "stand 2: imu fc is off by 3.0 mg (7 sigma): is something loose"
