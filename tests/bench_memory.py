@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from companion.errors import DaemonUnreachableError
-from companion.links.system.control_client import ask
+from companion.links.system.connection import ask
 from tests.bench_arming import running
 from tests.support.broker import Broker
 from tests.support.installed import install

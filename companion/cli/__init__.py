@@ -29,13 +29,13 @@ from companion.cli.terminal import (
     seconds,
 )
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
-from companion.links.system import logs
+from companion.links.system.process import OneLineFormatter
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     if logging.lastResort is not None:
-        logging.lastResort.setFormatter(logs.OneLineFormatter())
+        logging.lastResort.setFormatter(OneLineFormatter())
     try:
         options = _parser().parse_args(arguments, argparse.Namespace(json=False))
         return asyncio.run(_run(options))

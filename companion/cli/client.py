@@ -14,7 +14,7 @@ from companion import commands
 from companion.cli import show
 from companion.cli.terminal import conclude, load_config, print_lines, request_of
 from companion.formats import Object
-from companion.links.system.control_client import ask
+from companion.links.system.connection import ask
 
 SILENT_S: Final = 2.0
 """Silence after which the command says that it waits for an answer."""

@@ -26,7 +26,7 @@ from companion.cli.terminal import (
 )
 from companion.commands import Calibrate, Interface
 from companion.errors import ConfigError, LinkError, NobodyHeardError
-from companion.links.system import logs
+from companion.links.system.process import set_up_logs
 
 if TYPE_CHECKING:
     from companion.fleet.server import Server
@@ -152,7 +152,7 @@ async def _run(options: argparse.Namespace) -> int:
     from companion.fleet.store import Store
 
     mqtt = load_broker(options.config) if hasattr(options, "config") else Mqtt(host="127.0.0.1")
-    logs.set_up("info")
+    set_up_logs("info")
     collector = Collector(mqtt, Store(options.database))
     pages = [] if options.page == "off" else [_server(options).run()]
     await _until_stopped(collector.run(), *pages)

@@ -22,7 +22,7 @@ from companion.cli import show
 from companion.cli.terminal import DONE, load_config, print_json, print_lines
 from companion.errors import DaemonUnreachableError
 from companion.formats import Object, printable
-from companion.links.system.control_client import ask
+from companion.links.system.connection import ask
 
 SILENT_S: Final = 5.0
 """A daemon that says nothing for so long stands still."""

@@ -365,7 +365,7 @@ def _parts_given(options: Sequence[str]) -> dict[str, str]:
 
 async def _daemon_status(config: Config) -> Object | None:
     """Ask the running daemon for its status; None: none runs; empty: one runs and refuses to answer."""
-    from companion.links.system.control_client import ask
+    from companion.links.system.connection import ask
 
     found: Object = {}
     try:

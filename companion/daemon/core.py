@@ -20,7 +20,7 @@ from companion.estimation.means.windows import Window
 from companion.estimation.solution.site import LocalEarth, local_earth
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 
 CATCH_UPS: Final = 3
 """Most estimates in a row: while one is computed the next may become due."""

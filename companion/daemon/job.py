@@ -12,7 +12,7 @@ from companion.estimation.records.align_record import AlignmentRecord, FacesReco
 from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.formats import Object
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from companion.storage.changes import BY_TEMPERATURE
 
 ALIGNMENT: Final = "gradienter alignment"

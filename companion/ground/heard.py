@@ -8,7 +8,7 @@ from typing import Final, Literal, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import GOES_ON, to_ascii
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.protocols.heartbeat import AUTOPILOT_NAMES
 
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})

@@ -35,8 +35,7 @@ from companion.ground.heard import Address, Fields, GroundListener, whole
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.mavlink.signing import Signing
 from companion.links.mavlink.transport import parse_url, run_transport
-from companion.links.system.listeners import Listeners
-from companion.links.system.waiting import comes
+from companion.links.system.events import Listeners, comes
 
 logger = logging.getLogger(__name__)
 

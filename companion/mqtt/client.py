@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from companion.config.sections import Mqtt
 from companion.links.system.connection import Backoff, Reconnection
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from companion.mqtt.broker import causes, explain, is_of_protocol, is_open_to_all, read_password, tls_context
 
 if TYPE_CHECKING:

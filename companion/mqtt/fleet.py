@@ -22,7 +22,7 @@ import msgspec
 from companion.config.sections import Fleet, Location
 from companion.errors import CompanionError
 from companion.formats import Object, decode, utc_now
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Daemon
 from companion.mqtt.fleet_sources import CurrentAircraft, Sources, utc

@@ -13,9 +13,9 @@ import msgspec
 
 from companion.config.sections import Mqtt
 from companion.formats import Object
-from companion.links.system.child import ChildSettings
-from companion.links.system.control_client import ask
-from companion.links.system.waiting import comes
+from companion.links.system.connection import ask
+from companion.links.system.events import comes
+from companion.links.system.process import ChildSettings
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Ask, Daemon, Requests
 from companion.mqtt.fleet import AircraftFleet

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from companion.links.system.child import ChildSettings, ChildWork, run_child
+from companion.links.system.process import ChildSettings, ChildWork, run_child
 
 MEMORY_MIB: Final = 80
 """Twice the largest use measured: 22 MiB with a viewer, 39 with 16 deaf viewers and 1000 hostile connections."""
@@ -12,7 +12,7 @@ MEMORY_MIB: Final = 80
 
 def _page(settings: ChildSettings) -> ChildWork:
     # Imported here: by now the process is nice, so that the daemon's start does not wait for it.
-    from companion.links.system.control_client import ask
+    from companion.links.system.connection import ask
     from companion.web.server import Page
 
     config = settings.config

@@ -133,7 +133,7 @@ def _guarded(app: ASGIApp) -> ASGIApp:
         except asyncio.CancelledError:
             pass  # the server is closing
         except MemoryError as error:
-            # A child process ends itself then (companion.links.system.child).
+            # A child process ends itself then (companion.links.system.process).
             asyncio.get_running_loop().call_exception_handler({"message": "out of memory", "exception": error})
 
     return guarded

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from companion.formats import Object
-from companion.links.system.child import ChildSettings, run_child
+from companion.links.system.process import ChildSettings, run_child
 
 
 class Work:

@@ -9,7 +9,7 @@ from companion.daemon.interfaces.child import Child, StartChild
 from companion.daemon.process.service import Service
 from companion.errors import CompanionError, RequestRefusedError
 from companion.formats import Object
-from companion.links.system.child import ChildSettings
+from companion.links.system.process import ChildSettings
 from companion.mqtt.process import MqttProcess
 
 

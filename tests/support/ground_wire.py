@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.ground.heard import Address, Fields, GroundListener
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from tests.support.component import Ground, command_message
 
 COMPANION = Address(1, 191)

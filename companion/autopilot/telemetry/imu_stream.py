@@ -21,7 +21,7 @@ from companion.autopilot.firmware.imu_messages import TEMPERATURE_AGE_S, ImuMess
 from companion.autopilot.telemetry.px4_console import EkfBias
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from companion.lua import to_script
 from companion.samples import ImuSample
 

@@ -27,8 +27,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.imu_messages import EkfBiasReading
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.listeners import Listeners
-from companion.links.system.waiting import comes
+from companion.links.system.events import Listeners, comes
 from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)

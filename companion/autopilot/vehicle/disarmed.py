@@ -25,7 +25,7 @@ from companion.autopilot.vehicle.commands import Commands
 from companion.autopilot.vehicle.heartbeats import ArmState
 from companion.errors import NotDisarmedError
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 
 PROOF_HOLDS_S: Final = 1.5
 """The longest from the question to the write: a heartbeat that cannot be requested comes once a second."""

@@ -26,7 +26,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.estimation.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
 from companion.estimation.solution.truth import OwnHeading
 from companion.links.mavlink.link import Message
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from companion.physics.frames import Array, body_from_ned
 from companion.physics.units import DEG
 

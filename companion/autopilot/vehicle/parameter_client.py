@@ -28,8 +28,7 @@ from companion.errors import (
     ParameterTimeoutError,
 )
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.listeners import Listeners
-from companion.links.system.waiting import comes
+from companion.links.system.events import Listeners, comes
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1

@@ -32,8 +32,7 @@ from companion.autopilot.vehicle.heartbeats import (
 from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
 from companion.links.mavlink.signing import EARLIEST_S
-from companion.links.system.listeners import Listeners
-from companion.links.system.waiting import comes
+from companion.links.system.events import Listeners, comes
 
 __all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 

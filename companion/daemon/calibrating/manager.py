@@ -28,7 +28,7 @@ from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.formats import utc_now
 from companion.links.system.connection import Budget
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.storage.changes import BY_HAND, ChangeSet
 from companion.storage.records import RecordStore
 

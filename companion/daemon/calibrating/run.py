@@ -48,7 +48,7 @@ from companion.estimation.solution.results import imu_records, in_words, record_
 from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.estimation.solution.truth import Otherwise
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.changes import AUTOMATIC

@@ -38,8 +38,7 @@ from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise
 from companion.estimation.temperature.curve import Curve, Polynomial, of_curve
 from companion.formats import Object
-from companion.links.system.listeners import Listeners
-from companion.links.system.waiting import comes
+from companion.links.system.events import Listeners, comes
 from companion.storage.changes import BY_TEMPERATURE
 from companion.storage.records import RecordStore
 

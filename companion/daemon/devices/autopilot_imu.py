@@ -26,7 +26,7 @@ from companion.daemon.core import Core
 from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError
 from companion.estimation.records.validity import Why
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from companion.daemon.core import Offload
 from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.connection import BYTES_PER_S, Budget
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.decoding.clock import LATE
 from companion.protocols.registry import Kind

@@ -33,7 +33,7 @@ from companion.estimation.solution.site import IN_CONFIGURATION
 from companion.estimation.stillness.plausible import misplaced
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.physics.units import G
 from companion.samples import ImuSample, Sample
 

@@ -1,6 +1,6 @@
 """One child process of the daemon: started, watched, and restarted when it ends or falls silent.
 
-The child side is `companion.links.system.child`.
+The child side is `companion.links.system.process`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import msgspec
 
 from companion.errors import LinkError
 from companion.formats import Object
-from companion.links.system.child import OUT_OF_MEMORY, REPORT_EVERY_S, ChildSettings
 from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.process import OUT_OF_MEMORY, REPORT_EVERY_S, ChildSettings
 
 logger = logging.getLogger(__name__)
 

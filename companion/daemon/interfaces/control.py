@@ -22,7 +22,7 @@ from typing import Final, Self
 from companion.commands import ALL
 from companion.errors import CompanionError, LinkError, RequestRefusedError
 from companion.formats import Object, parse_request
-from companion.links.system.control_client import READ_TIMEOUT_S, write_line
+from companion.links.system.connection import READ_TIMEOUT_S, write_line
 
 logger = logging.getLogger(__name__)
 

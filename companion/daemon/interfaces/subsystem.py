@@ -83,7 +83,7 @@ class Interfaces(Subsystem):
     def _child(self, name: str, module: str) -> Child:
         # Imported here: the start is shorter without.
         from companion.daemon.interfaces.child import Child
-        from companion.links.system.child import ChildSettings
+        from companion.links.system.process import ChildSettings
 
         level = logging.getLevelName(logging.getLogger().level)
         settings = ChildSettings(self._core.config, level, only_listening=self._core.only_listening)

@@ -22,7 +22,7 @@ from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
 from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, list_ports, port_faults, same_ports
-from companion.links.system.control_client import ask
+from companion.links.system.connection import ask
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, main_kind
 

@@ -40,8 +40,7 @@ from companion.formats import Object, printable
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
 from companion.links.serial import bytestream
-from companion.links.system import logs
-from companion.links.system.service_manager import ServiceManager
+from companion.links.system.process import ServiceManager, set_up_logs
 from companion.storage.profiles import saved_profile
 from companion.storage.state import only_daemon
 
@@ -199,7 +198,7 @@ def main(path: str, *verbose: str) -> int:
     """Run the daemon with a configuration file until SIGTERM or SIGINT; return the command line's exit code."""
     # The watchdog's SIGABRT may be the only witness of a process that hangs: let it print where.
     faulthandler.enable()
-    logs.set_up("debug" if verbose else "info")
+    set_up_logs("debug" if verbose else "info")
     try:
         wanted = configuration.load(Path(path), partial(saved_profile, forgiving=True))
         if not verbose:

@@ -33,7 +33,7 @@ from companion.estimation.records.align_record import (
 from companion.estimation.records.record import AlignmentUsed
 from companion.estimation.solution.truth import aged_m_s2
 from companion.formats import Object, utc_now
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 from companion.physics.units import MG
 from companion.storage.changes import PREDICTION, ChangeSet
 from companion.storage.records import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot

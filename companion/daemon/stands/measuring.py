@@ -26,7 +26,7 @@ from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
 from companion.estimation.solution.truth import Otherwise
-from companion.links.system.listeners import Listeners
+from companion.links.system.events import Listeners
 
 POLL_S: Final = 0.2
 """Interval of checks; a complete second is handled at once."""

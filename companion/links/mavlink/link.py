@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink.signing import NEVER_SIGNED, Signing
-from companion.links.system.listeners import Listeners, Unsubscribe
+from companion.links.system.events import Listeners, Unsubscribe
 
 Codec = mavlink.MAVLink
 Message = mavlink.MAVLink_message

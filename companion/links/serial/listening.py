@@ -15,7 +15,7 @@ from typing import Final
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.serial.ports import ROOT, SerialPort, find_holders
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from companion.protocols.guess import (
     ENOUGH_BYTES,
     Candidate,

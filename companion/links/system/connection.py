@@ -1,19 +1,28 @@
-"""Opening a connection, over TCP with a dead peer noticed within seconds, and again after every loss; and a budget.
+"""Connections that come back by themselves, TCP, requests to the daemon's control socket, and limits on what comes in.
 
-A budget is how many bytes may come: a device that goes mad, or a loop-back, must not occupy the daemon.
+The server of the control socket is `daemon/interfaces/control.py`; its clients are the command line and the daemon's
+own child processes.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
+import grp
 import logging
 import math
 import os
 import socket
-from collections.abc import Awaitable, Callable
+import stat
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from pathlib import Path
 from typing import Final, NoReturn
 
-from companion.errors import LinkError
+import msgspec
+
+from companion.errors import DaemonDeniedError, DaemonUnreachableError, LinkError
+from companion.formats import Object
 
 logger = logging.getLogger(__name__)
 
@@ -166,3 +175,54 @@ class Budget:
             return True
         self._left, self.exceeded_s = 0.0, now_s
         return False
+
+
+LINE_LIMIT: Final = 32 * 1024 * 1024
+READ_TIMEOUT_S: Final = 10.0
+
+
+async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
+    """Send one request and yield the replies; raise DaemonUnreachableError where no daemon answers to the end."""
+    try:
+        reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
+    except OSError as error:
+        why = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "nobody listens there"}.get(
+            error.errno or 0, str(error)
+        )
+        if error.errno == errno.EACCES:
+            raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
+        raise DaemonUnreachableError(f"no daemon answers at {path} ({why})") from None
+    try:
+        await write_line(writer, request)
+        while line := await reader.readline():
+            reply: Object = msgspec.json.decode(line)
+            yield reply
+            if reply.get("kind") in ("result", "error"):
+                return
+        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer")
+    except ConnectionError:
+        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer") from None
+    finally:
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
+
+
+async def write_line(writer: asyncio.StreamWriter, reply: Object) -> None:
+    """Send one JSON object; raise ConnectionError where the peer is gone or does not read."""
+    writer.write(msgspec.json.encode(reply) + b"\n")
+    try:
+        async with asyncio.timeout(READ_TIMEOUT_S):
+            await writer.drain()
+    except TimeoutError:
+        raise ConnectionAbortedError from None
+
+
+def _who_may(path: Path) -> str:
+    try:
+        found = path.stat()
+        if found.st_mode & stat.S_IWGRP:
+            return f"only group {grp.getgrgid(found.st_gid).gr_name} and root may: usermod -aG, log in again; or sudo"
+    except (OSError, KeyError):
+        pass
+    return "permission denied, try with sudo"

@@ -235,7 +235,7 @@ class LineDecoder(Decoder):
     LIMIT: ClassVar[int] = 80
     _cut = False
 
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+    def interrupted(self) -> None:
         super().interrupted()
         self._cut = False
 

@@ -49,10 +49,10 @@ class PollDialogue(Dialogue):
         self._since_asked = self._unanswered = 0
         self._set_up = False
 
-    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+    def opened(self, t_s: float) -> None:
         self._quiet_until_s, self._asked_s, self._set_up, self._unanswered = t_s + SILENT_S, None, False, 0
 
-    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:
         if not data.strip(b"\r\n"):  # the rest of a line that is known already
             return
         if self._asked_s is None:
@@ -61,7 +61,7 @@ class PollDialogue(Dialogue):
             self._asked_s, self._unanswered = None, 0
         self._since_asked += len(data)
 
-    def due(self, t_s: float) -> bytes:  # noqa: D102
+    def due(self, t_s: float) -> bytes:
         if self._asked_s is not None:
             if t_s - self._asked_s < (ANSWER_S if self._unanswered < PATIENCE else AGAIN_S):
                 return b""
@@ -86,16 +86,16 @@ class WakeDialogue(Dialogue):
     _pause_s = SILENT_S
     _next = 0
 
-    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+    def opened(self, t_s: float) -> None:
         self._quiet_since_s, self._pause_s, self._next, self.words = t_s, SILENT_S, 0, ""
 
-    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102 - as in the base class
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:
         if data:
             self._quiet_since_s = t_s
         if samples:
             self._pause_s, self._next = SILENT_S, 0
 
-    def due(self, t_s: float) -> bytes:  # noqa: D102 - as in the base class
+    def due(self, t_s: float) -> bytes:
         if self._quiet_since_s is None or t_s - self._quiet_since_s < self._pause_s:
             return b""
         saying, self.words = self.SAYINGS[self._next]

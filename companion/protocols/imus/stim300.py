@@ -137,7 +137,7 @@ class Stim300Decoder(Decoder):
         self._counter: int | None = None
         self._imu_unit_right = self._inclination_unit_right = True
 
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+    def interrupted(self) -> None:
         super().interrupted()
         self._forget()
 

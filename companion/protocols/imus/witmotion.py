@@ -49,7 +49,7 @@ class WitMotionDecoder(Decoder):
     _accel: tuple[int, Vector, float] | None = None
     """End of the last acceleration's frame, which waits for its rate; m/s^2, degrees Celsius."""
 
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+    def interrupted(self) -> None:
         super().interrupted()
         self._drop_accel()
 

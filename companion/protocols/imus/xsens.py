@@ -47,7 +47,7 @@ class XsensDecoder(Decoder):
     sequence_modulus: ClassVar[int | None] = 2**16
     _temperature_degc: float | None = None
 
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+    def interrupted(self) -> None:
         super().interrupted()
         self._temperature_degc = None
 
@@ -145,18 +145,18 @@ class XsensDialogue(WakeDialogue):
     _tail = b""
     _woken = False
 
-    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+    def opened(self, t_s: float) -> None:
         super().opened(t_s)
         self._tail, self._woken = b"", False
 
-    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102 - as in the base class
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:
         super().heard(data, samples, t_s)
         text = self._tail + data
         self._tail = text[-(len(self.WAKE_UP) - 1) :]
         # What it said after the WakeUp shows that it has gone on by itself.
         self._woken = text.endswith(self.WAKE_UP) or (self._woken and not data)
 
-    def due(self, t_s: float) -> bytes:  # noqa: D102 - as in the base class
+    def due(self, t_s: float) -> bytes:
         if not self._woken:
             return super().due(t_s)
         self._woken, self._quiet_since_s = False, t_s

@@ -37,7 +37,7 @@ class InclinometerXyDecoder(LineDecoder):
     """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
     _decimals = _fewer_running = 0
 
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+    def interrupted(self) -> None:
         super().interrupted()
         self._drop_x()
 

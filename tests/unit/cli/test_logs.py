@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from companion.links.system.logs import LimitedHandler
+from companion.links.system.process import LimitedHandler
 
 
 class Clock:
@@ -47,9 +47,9 @@ def test_a_flood_is_counted_and_the_next_line_of_its_place_says_so() -> None:
 
 WITHOUT_DESCRIPTORS = """
 import logging, os, resource
-from companion.links.system import logs
+from companion.links.system.process import set_up_logs
 
-logs.set_up("info")
+set_up_logs("info")
 resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))
 try:
     while True:

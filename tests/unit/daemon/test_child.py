@@ -15,7 +15,7 @@ import pytest
 from companion.config import parse
 from companion.daemon.interfaces import child as daemon_side
 from companion.daemon.interfaces.child import Child
-from companion.links.system.child import ChildSettings
+from companion.links.system.process import ChildSettings
 
 MODULE = "tests.support.child_process"
 CONFIG = """

@@ -17,8 +17,8 @@ from companion.daemon.interfaces import control
 from companion.daemon.interfaces.control import ControlServer
 from companion.errors import CalibrationRefusedError, LinkError
 from companion.formats import Object
-from companion.links.system import control_client
-from companion.links.system.control_client import ask
+from companion.links.system import connection
+from companion.links.system.connection import ask
 
 
 async def _echo(request: Object) -> AsyncIterator[Object]:
@@ -186,7 +186,7 @@ def test_a_burst_of_silent_clients_leaves_no_descriptor_open(tmp_path: Path) -> 
 
 
 def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control_client, "READ_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(connection, "READ_TIMEOUT_S", 0.2)
     monkeypatch.setattr(control, "READ_TIMEOUT_S", 0.2)
     path = tmp_path / "control.sock"
 

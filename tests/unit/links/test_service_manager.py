@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.links.system.service_manager import ServiceManager
+from companion.links.system.process import ServiceManager
 
 
 @pytest.fixture(params=["path", "abstract"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from companion.links.system.waiting import comes
+from companion.links.system.events import comes
 from tests.support.virtual_time import run_virtual
 
 

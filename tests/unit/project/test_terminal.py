@@ -26,7 +26,7 @@ from companion.errors import LinkError
 from companion.formats import printable
 from companion.ground.heard import Address, GroundListener
 from companion.links.serial.ports import Holder, SerialPort
-from companion.links.system.logs import JournalFormatter, OneLineFormatter
+from companion.links.system.process import JournalFormatter, OneLineFormatter
 from tests.support.ground_wire import StationOnTheWire
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

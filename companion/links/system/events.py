@@ -1,7 +1,8 @@
-"""Listeners to an event, called in the order of their subscription; a failing one does not stop the others."""
+"""Listeners to an event, and waiting for one with a time limit."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable
 from typing import Generic, ParamSpec
@@ -13,7 +14,7 @@ Unsubscribe = Callable[[], None]
 
 
 class Listeners(Generic[P]):
-    """Callbacks of one kind."""
+    """Callbacks, called in the order of their subscription; a failing one does not stop the others."""
 
     def __init__(self) -> None:
         self._callbacks: list[Callable[P, object]] = []
@@ -22,7 +23,6 @@ class Listeners(Generic[P]):
         return len(self._callbacks)
 
     def add(self, callback: Callable[P, object]) -> Unsubscribe:
-        """Tell the callback from now on; returns how to stop that."""
         self._callbacks.append(callback)
 
         def unsubscribe() -> None:
@@ -32,7 +32,7 @@ class Listeners(Generic[P]):
         return unsubscribe
 
     def tell(self, *args: P.args, **kwargs: P.kwargs) -> int:
-        """Call all of them; how many of them failed."""
+        """Call all listeners and return how many failed."""
         failed = 0
         for callback in tuple(self._callbacks):
             try:
@@ -41,3 +41,15 @@ class Listeners(Generic[P]):
                 failed += 1
                 logger.exception("a listener failed on %.200s", args[0] if args else "nothing")
         return failed
+
+
+async def comes(event: asyncio.Event, within_s: float) -> bool:
+    """Wait until an event is set; False: it was not in time."""
+    if event.is_set():
+        return True
+    # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4: clean-ups wait here too.
+    waiting = asyncio.ensure_future(event.wait())
+    try:
+        return bool((await asyncio.wait([waiting], timeout=within_s))[0])
+    finally:
+        waiting.cancel()
