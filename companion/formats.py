@@ -27,12 +27,10 @@ def decode(data: bytes, kind: Any, newest: int | None) -> Any:
 
 
 def utc_now() -> str:
-    """Return the time now as records have it: ISO 8601, UTC."""
     return datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
 
 
-Object = dict[str, Any]
-"""A request or an answer, as JSON can hold it."""
+Object = dict[str, Any]  # a request or an answer, as JSON can hold it
 
 Value = str | int | float | bool | None
 

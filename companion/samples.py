@@ -18,7 +18,6 @@ TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
 
 def rows_of(triad: Triad) -> slice:
-    """Return the rows of a triad in a vector of six."""
     return slice(0, 3) if triad == "gyro" else slice(3, 6)
 
 

@@ -6,8 +6,7 @@ from typing import Final, Literal
 
 from companion.formats import Object
 
-_HEARTBEAT_S: Final = 2.0
-"""An older heartbeat is a lost link."""
+_HEARTBEAT_S: Final = 2.0  # an older heartbeat is a lost link
 
 
 StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str]
@@ -15,7 +14,6 @@ StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str]
 
 
 def headline(status: Object) -> str:
-    """Give the big word and its reason."""
     return f"{status['headline']['word']}: {status['headline']['reason']}"
 
 

@@ -11,8 +11,7 @@ from companion.config.sections import Parity
 from companion.protocols.registry import DEVICES, Kind, main_kind
 
 COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
-ENOUGH_BYTES: Final = 1500
-"""Six frames of the longest kind: if no decoder has understood one, none will."""
+ENOUGH_BYTES: Final = 1500  # six frames of the longest kind: if no decoder has understood one, none will
 
 _LEAST_FRAMES: Final = 2
 _SURE_FRAMES: Final = 4
@@ -36,8 +35,6 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A protocol that the bytes may be."""
-
     protocol: str
     kinds: tuple[Kind, ...]
     accepted: int
@@ -45,12 +42,10 @@ class Candidate:
 
     @property
     def likely(self) -> bool:
-        """Return whether it is more than chance."""
         return self.accepted >= _LEAST_FRAMES and self.accepted >= 2 * self.rejected
 
     @property
     def sure(self) -> bool:
-        """Return whether it needs no more bytes."""
         return self.accepted >= _SURE_FRAMES and self.accepted >= 4 * self.rejected
 
 
@@ -69,7 +64,6 @@ def candidates(data: bytes) -> list[Candidate]:
 
 
 def likeliest(data: bytes) -> Candidate | None:
-    """Return the first of `candidates` if it is more than chance."""
     return next((one for one in candidates(data) if one.likely), None)
 
 

@@ -9,8 +9,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-AUTOPILOT_NAMES: Final = {3: "ArduPilot", 12: "PX4"}
-"""MAV_AUTOPILOT of those that the companion can calibrate."""
+AUTOPILOT_NAMES: Final = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT of those that the companion can calibrate
 
 _FRAMES: Final = (
     # Version 2: length 9, two bytes of flags, sequence, system, component, the message's number in three bytes.
@@ -27,8 +26,6 @@ _POLYNOMIAL: Final = 0x8408
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Sender of a HEARTBEAT."""
-
     system_id: int
     component_id: int
     kind: int
@@ -36,11 +33,9 @@ class Heartbeat:
 
     @property
     def is_autopilot(self) -> bool:
-        """Return whether it is an autopilot, and not a ground station, a radio or another companion."""
         return self.autopilot != _NO_AUTOPILOT
 
     def __str__(self) -> str:
-        """Format it as people say it: ArduPilot, system 1."""
         if self.is_autopilot:
             who = AUTOPILOT_NAMES.get(self.autopilot, f"autopilot of kind {self.autopilot}")
         else:

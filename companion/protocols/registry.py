@@ -41,13 +41,11 @@ class ProtocolInfo:
     baud: int
     decoder: type[Decoder]
     dialogue: Callable[[], Dialogue] | None = None
-    lag_s: float = 0.0
-    """Time constant with which its reading follows the truth: fluid, pendulum, filters."""
+    lag_s: float = 0.0  # time constant with which its reading follows the truth: fluid, pendulum, filters
     sigma_deg: float | None = None
     """Sigma of such a device's tilt (gradienter) or level heading (compass) without a configured one."""
     tilted_sigma_deg: float | None = None
-    law: Law | None = None
-    """Meaning of a gradienter's two readings by its documents; None: the user must say."""
+    law: Law | None = None  # meaning of a gradienter's two readings by its documents; None: the user must say
     parity: Parity = "none"
 
 

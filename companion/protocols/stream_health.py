@@ -38,8 +38,7 @@ _HARMLESS: Final = frozenset(
         "unknown sentence",
     }
 )
-_MUCH_TEXT: Final = 0.9
-"""Least share of plain text; a line with less is read at a wrong speed or parity."""
+_MUCH_TEXT: Final = 0.9  # least share of plain text; a line with less is read at a wrong speed or parity
 _DAMAGED_SHARE: Final = 0.1
 _DAMAGED_FRAMES: Final = 3
 _MOST_DAMAGE_NAMED: Final = 3
@@ -54,13 +53,10 @@ class Trouble:
     implausible: bool = False
 
 
-_Counts = tuple[int, Counter[str]]
-"""Frames accepted, and rejected by reason."""
+_Counts = tuple[int, Counter[str]]  # frames accepted, and rejected by reason
 
 
 class StreamHealth:
-    """Watches one stream; `protocol`: its name in the configuration."""
-
     def __init__(self, protocol: str, decoder: Decoder) -> None:
         self._protocol, self._decoder = protocol, decoder
         self.last_sample_s: float | None = None

@@ -21,8 +21,7 @@ from companion.errors import StorageError
 from companion.recording import messages
 from companion.recording.messages import Message, Start
 
-CHUNK_BYTES: Final = 256 * 1024
-"""A second of a busy aircraft has less."""
+CHUNK_BYTES: Final = 256 * 1024  # a second of a busy aircraft has less
 RESERVE_BYTES: Final = 32 * 1024 * 1024
 """Bytes left free on the disk: the values for undo and the records are worth more than any recording."""
 LEAST_FREE: Final = 0.1
@@ -43,9 +42,7 @@ class Beginning:
     offset_ns: int
     """UTC minus the daemon's clock, fixed when the daemon started: setting the host's clock makes no jump."""
     config: bytes
-    """JSON."""
-    states: Sequence[Message]
-    """States in force at `t_s`."""
+    states: Sequence[Message]  # states in force at `t_s`
 
 
 Opener = Callable[[Path], IO[bytes]]
@@ -80,8 +77,6 @@ def is_available() -> bool:
 
 
 class RecordingFile:
-    """One MCAP file in the making."""
-
     def __init__(self, path: Path, opener: Opener = open_new, free_bytes: FreeBytes = _free_bytes) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
 
@@ -109,7 +104,6 @@ class RecordingFile:
 
     @property
     def bytes_written(self) -> int:
-        """Size of the file so far."""
         return 0 if self._file is None else int(self._file.tell())
 
     def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
@@ -133,7 +127,6 @@ class RecordingFile:
             raise
 
     def close(self) -> None:
-        """Finish the file."""
         if self._file is None:
             return
         try:
@@ -196,7 +189,6 @@ def unused_path(folder: Path) -> Path:
 
 
 def create_on_request(path: Path) -> RecordingFile:
-    """Create the file of a recording on request."""
     if (shortage := disk_shortage(path.parent)) is not None:
         raise StorageError(f"{path}: not recorded, with {shortage}; make room")
     return RecordingFile(path)
@@ -212,17 +204,14 @@ class Ring:
         self.bytes_in_all = 0
         self._opener, self._free_bytes = opener, free_bytes
         self._current: RecordingFile | None = None
-        self._continues = False
-        """True: the next file begins where the one before ended."""
+        self._continues = False  # True: the next file begins where the one before ended
 
     @property
     def path(self) -> Path | None:
-        """The file being written."""
         return None if self._current is None else self._current.path
 
     @property
     def is_full(self) -> bool:
-        """True: the present file has its share of the ring."""
         return self._current is not None and self._current.bytes_written >= self.most_bytes // PARTS
 
     def write(self, batch: Sequence[Message], beginning: Beginning) -> None:
@@ -246,7 +235,6 @@ class Ring:
             raise StorageError(f"{self.folder}: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Finish the present file."""
         current, self._current = self._current, None
         if current is not None:
             current.close()

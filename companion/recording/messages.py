@@ -21,48 +21,37 @@ from companion.estimation.solution.truth import Otherwise
 from companion.estimation.turning.turn import Turn
 
 FORMAT_VERSION: Final = "4"
-METADATA: Final = "companion"
-"""Name of the metadata record with versions and clocks."""
-CONFIG: Final = "configuration.json"
-"""Name of the attachment with the configuration in force."""
-SERIAL: Final = "/serial/"
-"""Prefix of the raw bytes of a port; the name of the device follows."""
+METADATA: Final = "companion"  # name of the metadata record with versions and clocks
+CONFIG: Final = "configuration.json"  # name of the attachment with the configuration in force
+SERIAL: Final = "/serial/"  # prefix of the raw bytes of a port; the name of the device follows
 MAVLINK: Final = "/mavlink/in"
-IMU: Final = "/autopilot/imu/"
-"""Prefix of `ImuState`; the name of the IMU follows."""
+IMU: Final = "/autopilot/imu/"  # prefix of `ImuState`; the name of the IMU follows
 EKF_BIAS: Final = "/autopilot/ekf_bias"
 RAW_MEAN: Final = "/autopilot/raw_mean"
 PLACE: Final = "/companion/place"
 START: Final = "/companion/start"
-TICK: Final = "/companion/tick"
-"""Empty: the collector was told the time."""
+TICK: Final = "/companion/tick"  # empty: the collector was told the time
 MEASURED, SOLVED, RECORD = "/companion/measured", "/companion/solved", "/companion/record"
 
-Message = tuple[str, float, bytes]
-"""Topic, time on the daemon's clock, data."""
+Message = tuple[str, float, bytes]  # topic, time on the daemon's clock, data
 
 
 class Start(msgspec.Struct, frozen=True):
     """A recording begins here, or begins anew after a gap."""
 
-    lost: int = 0
-    """Messages dropped right before, because the disk did not keep up."""
-    continues: bool = False
-    """True: the file before this one in the ring ends where this one begins."""
+    lost: int = 0  # messages dropped right before, because the disk did not keep up
+    continues: bool = False  # True: the file before this one in the ring ends where this one begins
 
 
 class ImuState(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU of the autopilot from here on: its messages, and the parameters that correct it."""
 
-    sender: tuple[int, int]
-    """System and component id of the autopilot."""
+    sender: tuple[int, int]  # system and component id of the autopilot
     firmware: FirmwareName | None
     instance: int
-    message: str | None
-    """Name of the `ImuMessage` that its samples come in; None: none come."""
+    message: str | None  # name of the `ImuMessage` that its samples come in; None: none come
     input: ImuInput
-    calibration: ImuCalibration | None
-    """None: not known, so that its samples do not count."""
+    calibration: ImuCalibration | None  # None: not known, so that its samples do not count
 
 
 class RawOutput(msgspec.Struct, frozen=True):
@@ -92,8 +81,7 @@ class Solved(msgspec.Struct, frozen=True, kw_only=True):
 
     where: Whereabouts
     what: str
-    alignment: tuple[float, float, float] | None
-    """The gradienter's zero: offset x and y, and sigma, in degrees."""
+    alignment: tuple[float, float, float] | None  # the gradienter's zero: offset x and y, and sigma, in degrees
     otherwise: Otherwise
     expectation: Expectation
 
@@ -106,8 +94,7 @@ _TYPES: Final[dict[str, Any]] = {
     MEASURED: Measured,
     SOLVED: Solved,
 }
-MOST_BYTES: Final = 1024 * 1024
-"""The most bytes of one of these messages; ours have some thousand."""
+MOST_BYTES: Final = 1024 * 1024  # the most bytes of one of these messages; ours have some thousand
 
 
 def encoding(topic: str) -> str:
@@ -118,12 +105,10 @@ def encoding(topic: str) -> str:
 
 
 def encode(message: Any) -> bytes:
-    """Encode one of the structs above."""
     return msgspec.msgpack.encode(message, enc_hook=_plain)
 
 
 def decode(topic: str, data: bytes) -> Any:
-    """Decode the struct of a topic."""
     if len(data) > MOST_BYTES:
         raise ValueError(f"found {len(data)} bytes; allowed: {MOST_BYTES}")
     kind = ImuState if topic.startswith(IMU) else _TYPES[topic]
@@ -144,18 +129,15 @@ def _array(_kind: Any, plain: Any) -> Any:
 
 MOST_MESSAGES: Final = 12_000
 """The most messages that wait: 15 s of a 200 Hz IMU beside 100 Hz telemetry, longer than a memory card stalls."""
-MOST_WAITING_BYTES: Final = 2 * 1024 * 1024
-"""The most bytes among them: 15 s of an IMU at 1 kHz have 1.4 MB."""
+MOST_WAITING_BYTES: Final = 2 * 1024 * 1024  # the most bytes among them: 15 s of an IMU at 1 kHz have 1.4 MB
 
 
 class Tape:
     """Bounded queue. What finds no room is dropped together with all that waits: no replay bridges a gap."""
 
     def __init__(self) -> None:
-        self.is_on = False
-        """True: messages are kept; states always are."""
-        self.lost = 0
-        """Messages dropped since `begin`; while there are any, nothing is taken."""
+        self.is_on = False  # True: messages are kept; states always are
+        self.lost = 0  # messages dropped since `begin`; while there are any, nothing is taken
         self.lost_in_all = 0
         self._waiting: list[Message] = []
         self._bytes = 0
@@ -167,13 +149,11 @@ class Tape:
         return len(self._waiting)
 
     def begin(self, t_s: float) -> None:
-        """Take messages from here on."""
         self._waiting = [(START, t_s, encode(Start(lost=self.lost))), *self._states.values()]
         self.is_on, self.lost, self._bytes = True, 0, 0
         self._since_s, self._states_before = t_s, []
 
     def end(self) -> None:
-        """Take no more messages."""
         self.is_on, self.lost, self._bytes, self._waiting = False, 0, 0, []
 
     def drain(self, now_s: float) -> tuple[float, list[Message], list[Message]]:
@@ -184,7 +164,6 @@ class Tape:
         return batch
 
     def put(self, topic: str, t_s: float, data: bytes) -> None:
-        """Add a message."""
         if not self.is_on:
             return
         if self.lost:
@@ -221,8 +200,7 @@ class KeyFilter:
 
     def __init__(self) -> None:
         self._before = b""
-        self._left = 0
-        """Bytes of such a payload that are still to come."""
+        self._left = 0  # bytes of such a payload that are still to come
 
     def __call__(self, data: bytes) -> bytes:
         """Return the same bytes without keys."""

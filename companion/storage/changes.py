@@ -22,8 +22,7 @@ from companion.storage.state import BoundedList, StateFile, numbers_in, remove_d
 
 _UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
-MOST_STEPS: Final = 10
-"""Writes that can be undone one after the other; the oldest one makes room."""
+MOST_STEPS: Final = 10  # writes that can be undone one after the other; the oldest one makes room
 AUTOMATIC: Final = "auto calibration"
 BY_TEMPERATURE: Final = "temperature"
 PREDICTION: Final = "gyro prediction"
@@ -49,18 +48,14 @@ Moment = Annotated[str, msgspec.Meta(pattern=r"^[-+:.0-9T]{0,40}\Z")]
 
 
 class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Origin of a write."""
-
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
     """Name: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
     at: Moment = ""
     """UTC, ISO 8601, by the host's clock: when that began; for calibrations `started_at` of the record."""
-    since: Moment = ""
-    """Begin of the first of several writes in one step; empty: it is the only one."""
+    since: Moment = ""  # begin of the first of several writes in one step; empty: it is the only one
 
     @property
     def first(self) -> str:
-        """When the first of them began."""
         return self.since or self.at
 
 
@@ -89,11 +84,9 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def names(self) -> list[str]:
-        """Names of the parameters."""
         return [changed.parameter for changed in self.changes]
 
     def shown(self) -> Object:
-        """For `companion status`: what it was, when, and which parameters."""
         origin = self.origin
         return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names}
 
@@ -133,8 +126,7 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
     system_id: int
     steps: tuple[ChangeSet, ...] = ()
-    changes: tuple[Changed, ...] = ()
-    """Step of versions that kept a single one."""
+    changes: tuple[Changed, ...] = ()  # step of versions that kept a single one
 
     @property
     def all(self) -> tuple[ChangeSet, ...]:
@@ -167,8 +159,6 @@ class ChangeLog:
         self.journal: StateFile[ChangeSet] = StateFile(directory / "journal.json", ChangeSet, self._check)
 
     def undo_of(self, system_id: int) -> StateFile[Undoable]:
-        """The values from before the last finished writes on one vehicle."""
-
         def check(found: Undoable) -> None:
             for changes in (ChangeSet(found.system_id, ()), *found.all):
                 self._check(changes, system_id)
@@ -176,7 +166,6 @@ class ChangeLog:
         return StateFile(self._directory / f"undo-{system_id}.json", Undoable, check)
 
     def undos(self) -> list[StateFile[Undoable]]:
-        """List the undo files of all vehicles."""
         try:
             return [self.undo_of(number) for number in numbers_in(self._directory, _UNDO)]
         except StorageError:
@@ -201,28 +190,20 @@ class ChangeLog:
                     raise msgspec.ValidationError(f"found {name} = {value:.9g}; allowed: {self._allowed[name]}")
 
 
-KEEP_INTERRUPTIONS: Final = 50
-"""Interruptions kept: years of them."""
+KEEP_INTERRUPTIONS: Final = 50  # years of interruptions
 PENDING: Final = "old values not restored yet: disarm and keep the link up"
 
 
 class Interruption(msgspec.Struct, frozen=True, kw_only=True):
-    """One interrupted write."""
-
     what: str
-    """Kind of write, as `Origin.what`."""
-    began_at: str
-    """Begin of the calibration or alignment that wrote, UTC, ISO 8601; empty: not kept."""
-    ended_at: str | None
-    """End of the restore, UTC, ISO 8601; None: pending."""
+    began_at: str  # begin of the calibration or alignment that wrote, UTC, ISO 8601; empty: not kept
+    ended_at: str | None  # end of the restore, UTC, ISO 8601; None: pending
     system_id: int
     parameters: tuple[str, ...]
-    reason: str
-    """Result of the restore, for people."""
+    reason: str  # result of the restore, for people
 
     @classmethod
     def of(cls, step: ChangeSet, reason: str = PENDING, ended_at: str | None = None) -> Interruption:
-        """Describe the interrupted write of this step."""
         return cls(
             what=step.origin.what,
             began_at=step.origin.at,
@@ -234,5 +215,4 @@ class Interruption(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def interruptions_in(directory: Path) -> BoundedList[Interruption]:
-    """Return the list of interruptions that are over, `interrupted.json` in a storage directory."""
     return BoundedList(directory / "interrupted.json", Interruption, KEEP_INTERRUPTIONS)

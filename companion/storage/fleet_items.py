@@ -21,62 +21,45 @@ from companion.storage.state import set_aside
 
 FILE: Final = "fleet.sqlite"
 FORMAT_VERSION: Final = 1
-MOST_BYTES: Final = 16 * 1024 * 1024
-"""Most bytes of all items; some 2500 calibrations."""
-MAKE_ROOM: Final = 1 / 16
-"""Share that is dropped at once when it is full, so that a loss is reported rarely."""
+MOST_BYTES: Final = 16 * 1024 * 1024  # most bytes of all items; some 2500 calibrations
+MAKE_ROOM: Final = 1 / 16  # share that is dropped at once when it is full, so that a loss is reported rarely
 CACHE_KIB: Final = 128
 LOG_PAGES: Final = 64
 
 Clock = Literal["good", "unknown"]
-Range = tuple[int, int]
-"""First and last sequence, both included."""
+Range = tuple[int, int]  # first and last sequence, both included
 
 
 class Item(NamedTuple):
-    """Item for the fleet."""
-
     kind: str
-    at: str
-    """Time of the event: UTC, ISO 8601."""
+    at: str  # time of the event: UTC, ISO 8601
     clock: Clock
     body: bytes
-    """A JSON object."""
 
 
 class Mark(NamedTuple):
     """State up to which a source has been read."""
 
-    stamp: str
-    """Stamp of the source's file, to notice a change quickly."""
+    stamp: str  # stamp of the source's file, to notice a change quickly
     value: str
 
 
 class SourceItems(NamedTuple):
-    """Items, and the marks of their sources."""
-
     marks: dict[str, Mark]
     items: Sequence[Item] = ()
 
 
 class Kept(NamedTuple):
-    """Items of one aircraft."""
-
     aircraft: str
     epoch: str
-    first: int
-    """First sequence that is kept; `last` + 1: none is."""
-    last: int
-    """Last sequence that was given; 0: none yet."""
+    first: int  # first sequence that is kept; `last` + 1: none is
+    last: int  # last sequence that was given; 0: none yet
     waiting: int
     confirmed_at: str | None
 
 
 class Waiting(NamedTuple):
-    """Item that is not confirmed yet."""
-
-    number: int
-    """Number over all aircraft, in order."""
+    number: int  # number over all aircraft, in order
     aircraft: str
     epoch: str
     sequence: int
@@ -114,18 +97,15 @@ class FleetItems:
             self._make_room(db, now)
 
     def marks(self, prefix: str) -> dict[str, Mark]:
-        """Return the marks whose key begins with a prefix."""
         with self._transaction() as db:
             found = db.execute("SELECT key, stamp, value FROM mark WHERE substr(key, 1, ?) = ?", (len(prefix), prefix))
             return {key: Mark(stamp, value) for key, stamp, value in found}
 
     def forget(self, keys: Iterable[str]) -> None:
-        """Drop the marks of sources that are gone."""
         with self._transaction() as db:
             db.executemany("DELETE FROM mark WHERE key = ?", [(key,) for key in keys])
 
     def aircraft(self) -> list[Kept]:
-        """List all aircraft with an item ever."""
         with self._transaction() as db:
             found = db.execute(
                 "SELECT id, epoch, ifnull(min(sequence), last + 1), last, ifnull(sum(NOT confirmed), 0), confirmed_at"
@@ -134,7 +114,6 @@ class FleetItems:
             return [Kept(*row) for row in found]
 
     def waiting(self, after: int, limit: int) -> list[Waiting]:
-        """Return the first unconfirmed items of all aircraft behind a number."""
         with self._transaction() as db:
             found = db.execute(
                 "SELECT number, aircraft, epoch, sequence, kind, at, clock, body FROM item"

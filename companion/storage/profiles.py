@@ -26,29 +26,21 @@ _FILE: Final = re.compile(rf"({_NAME.pattern})\.json")
 
 
 class ProfileSource(msgspec.Struct, frozen=True, kw_only=True):
-    """One recording that a profile was learned from."""
-
     file: str
-    began_at: str | None
-    """UTC, where the recording tells it."""
+    began_at: str | None  # UTC, where the recording tells it
     still_s: float
-    temperature_degc: tuple[float, float] | None
-    """Lowest and highest."""
+    temperature_degc: tuple[float, float] | None  # lowest and highest
 
 
 class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
-    """The file."""
-
     format_version: int
     name: str
     saved_at: str
     imu: str
     gyro: AllanModel
     accel: AllanModel
-    kept_from: str
-    """The profile whose figures stand for those in `kept`."""
-    kept: tuple[str, ...]
-    """Figures that the recordings were too short to tell."""
+    kept_from: str  # the profile whose figures stand for those in `kept`
+    kept: tuple[str, ...]  # figures that the recordings were too short to tell
     sources: tuple[ProfileSource, ...]
     notes: tuple[str, ...] = ()
     warm_up: tuple[float, float] | None = None
@@ -56,7 +48,6 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def profile(self) -> NoiseProfile:
-        """The profile for the configuration and the estimator."""
         seconds, many = sum(source.still_s for source in self.sources), len(self.sources)
         recordings = f"{many} recording{'s' if many != 1 else ''}"
         origin = f"learned from {seconds / 3600.0:.1f} h at rest in {recordings}, saved {self.saved_at[:10]}"
@@ -79,17 +70,13 @@ def _plain(name: str) -> str:
 
 
 class ProfileStore:
-    """The folder `profiles` of a storage directory."""
-
     def __init__(self, directory: Path) -> None:
         self._folder = directory / "profiles"
 
     def path(self, name: str) -> Path:
-        """Return the file of a profile."""
         return self._folder / f"{name}.json"
 
     def names(self) -> list[str]:
-        """List all profiles, unreadable ones too; raises StorageError."""
         return named_in(self._folder, _FILE)
 
     def read(self, name: str) -> SavedProfile:

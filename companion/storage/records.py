@@ -32,11 +32,9 @@ class NumberedFiles(Generic[T]):
     """Files `000001.json`, ... in a folder, in the order of their making: the wall clock may be wrong in the field."""
 
     name: ClassVar[str]
-    """Name of the folder."""
     kind: ClassVar[Any]
     newest_format: ClassVar[int]
-    keep: ClassVar[int]
-    """Most files; the oldest make room."""
+    keep: ClassVar[int]  # most files; the oldest make room
     mode: ClassVar[int] = 0o600
 
     def __init__(self, directory: Path) -> None:
@@ -47,7 +45,6 @@ class NumberedFiles(Generic[T]):
         return numbers_in(self.folder, _NAME)
 
     def file(self, number: int) -> StateFile[T]:
-        """Return the file of a number."""
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
@@ -74,7 +71,6 @@ class NumberedFiles(Generic[T]):
                     yield number, found
 
     def newest(self, limit: int | None = None) -> dict[int, T]:
-        """Return the latest by number, the newest first."""
         return dict(islice(self.latest(), limit))
 
 
@@ -84,7 +80,6 @@ class RecordStore(NumberedFiles[Record]):
     name, kind, newest_format, keep = "records", Record, record.FORMAT_VERSION, 1000
 
     def history(self, limit: int | None = None) -> list[Record]:
-        """List the latest records, newest first."""
         return list(self.newest(limit).values())
 
     def mark_undone(self, step: ChangeSet, undone_at: str) -> list[str]:
@@ -114,8 +109,7 @@ class FlightStore(NumberedFiles[KeptFlight]):
     """Flights read from logs: some 10 kB for each IMU."""
 
     name, kind, newest_format, keep = "flights", KeptFlight, flight_record.FORMAT_VERSION, 100
-    mode = 0o644
-    """Root reads the logs; the service, with an account of its own, reads the flights."""
+    mode = 0o644  # root reads the logs; the service, with an account of its own, reads the flights
 
     def save(self, value: KeptFlight) -> int:
         """Add a flight, or replace the same flight of an earlier reading; return its number."""
@@ -127,44 +121,34 @@ class FlightStore(NumberedFiles[KeptFlight]):
 
 
 def alignment_in(directory: Path) -> StateFile[align_record.AlignmentRecord]:
-    """Return the alignment, `alignment.json` in a storage directory."""
     kind, newest = align_record.AlignmentRecord, align_record.FORMAT_VERSION
     return StateFile(directory / "alignment.json", kind, align_record.check, newest)
 
 
 def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
-    """Return the measurement of all sides, `faces.json` in a storage directory."""
     kind, newest = align_record.FacesRecord, align_record.FORMAT_VERSION
     return StateFile(directory / "faces.json", kind, align_record.check, newest)
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of one alignment."""
-
-    what: str
-    """"zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1."""
-    state: str
-    """"done", "failed", or "predicted" of version 0.1."""
+    what: str  # "zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1
+    state: str  # "done", "failed", or "predicted" of version 0.1
     measured_at: str
     reason: str
     system_id: int | None
-    written: dict[str, float]
-    """Values in the autopilot, by parameter."""
+    written: dict[str, float]  # values in the autopilot, by parameter
     undone_at: str | None = None
 
 
 KEEP_DONE: Final = 50
-KEEP_ARMINGS: Final = 200
-"""A season of flying, below 100 kB at some 400 bytes each."""
+KEEP_ARMINGS: Final = 200  # a season of flying, below 100 kB at some 400 bytes each
 
 
 def alignments_in(directory: Path) -> BoundedList[Done]:
-    """Return the list of the latest alignments, `by-hand.json` in a storage directory."""
     return BoundedList(directory / "by-hand.json", Done, KEEP_DONE)
 
 
 def armings_in(directory: Path) -> BoundedList[ArmingRecord]:
-    """Return the list of the latest armings, `armings.json` in a storage directory."""
     return BoundedList(directory / "armings.json", ArmingRecord, KEEP_ARMINGS)
 
 
@@ -173,8 +157,6 @@ KEEP_IMUS: Final = 8
 
 
 class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
-    """Identity and points of one IMU, oldest first."""
-
     identity: dict[str, str]
     points: tuple[history.Point, ...] = ()
 
@@ -185,8 +167,6 @@ class _File(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BiasStore:
-    """`biases.json` in the storage directory."""
-
     def __init__(self, directory: Path) -> None:
         self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=BIASES_VERSION)
 
@@ -215,12 +195,9 @@ class SigningTime(msgspec.Struct, frozen=True):
     """Latest time in our signatures. Ticks are 10 us since 2015."""
 
     ticks: int
-    reserved: int
-    """Largest tick that may have been used before the next write."""
+    reserved: int  # largest tick that may have been used before the next write
     uptime_s: float
-    """Uptime of the board at the write."""
-    boot_id: str
-    """Boot of the board; empty: unknown."""
+    boot_id: str  # boot of the board; empty: unknown
 
 
 def this_boot() -> str:
@@ -236,7 +213,6 @@ def this_boot() -> str:
 
 
 def signing_time_in(directory: Path) -> StateFile[SigningTime]:
-    """Return the signing time of a storage directory."""
     return StateFile(directory / SIGNING_FILE, SigningTime, _check_time)
 
 

@@ -77,7 +77,6 @@ MOST_BYTES: Final = 2_000_000
 
 ASIDE: Final = ".unusable"
 MOST_ASIDE: Final = 3
-"""The most set-aside files of each name; the last one makes room."""
 
 UNREADABLE: Final = (ValueError, RecursionError, OverflowError, msgspec.MsgspecError)
 """Errors of reading any bytes as JSON of a type."""
@@ -112,7 +111,6 @@ def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
 
 
 def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
-    """Return the numbers in such names, ascending; raises as `named_in`."""
     return sorted(map(int, named_in(folder, kind)))
 
 
@@ -152,8 +150,7 @@ class StateFile(Generic[T]):
     ) -> None:
         self.path, self._mode = path, mode
         self._kind, self._check, self._newest = kind, check, newest
-        self.unusable: str | None = None
-        """Error of the last `load`, in one line; None: there was none."""
+        self.unusable: str | None = None  # error of the last `load`, in one line; None: there was none
 
     def read(self) -> T | None:
         """Read the file; None: there is none. Raises StorageError, where and why in one line."""
@@ -194,7 +191,6 @@ class StateFile(Generic[T]):
         write_atomically(self.path, data, mode=self._mode)
 
     def clear(self) -> None:
-        """Remove the file; raises StorageError."""
         remove_durably(self.path)
 
 
@@ -229,11 +225,9 @@ class BoundedList(Generic[T]):
         return _listed(self._file.read())
 
     def append(self, entry: T) -> None:
-        """Add an entry; raises StorageError."""
         self.write([*self.read(), entry][-self._keep :])
 
     def write(self, entries: list[T]) -> None:
-        """Replace the entries; raises StorageError."""
         self._file.write(_Entries(entries))
 
 

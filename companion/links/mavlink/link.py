@@ -61,7 +61,6 @@ class MavlinkLink:
 
     @property
     def system_id(self) -> int:
-        """The system id under which we send."""
         return self._codec.srcSystem
 
     def join(self, autopilot: Sender) -> None:
@@ -75,16 +74,13 @@ class MavlinkLink:
 
     @property
     def half_received(self) -> bytes:
-        """Bytes of a message that is not complete yet."""
         return bytes(self._codec.buf[self._codec.buf_index :])
 
     @property
     def connected(self) -> bool:
-        """Return whether a transport is attached, with or without a peer."""
         return self._transmit is not None
 
     def turn(self) -> None:
-        """Count a turn of the transport's loop."""
         self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
@@ -118,7 +114,6 @@ class MavlinkLink:
         return left
 
     def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
-        """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""
         return self._handlers.setdefault(kind.msgname, Listeners()).add(handler)  # type: ignore[arg-type]
 
     def receive(self, data: bytes, t_s: float) -> None:

@@ -38,8 +38,7 @@ MAX_STREAMS: Final = 64
 """Remembered senders with the key, by system, component and link; later ones are refused."""
 NEVER_SIGNED: Final = frozenset({mavlink.MAVLINK_MSG_ID_RADIO_STATUS, mavlink.MAVLINK_MSG_ID_RADIO})
 """Messages that a telemetry radio adds by itself, without a key."""
-EARLIEST_S: Final = 1577836800.0
-"""2020: an earlier clock has not been set."""
+EARLIEST_S: Final = 1577836800.0  # 2020: an earlier clock has not been set
 
 _SIGNED: Final = mavlink.MAVLINK_IFLAG_SIGNED
 _MARKER_1: Final = mavlink.PROTOCOL_MARKER_V1
@@ -97,7 +96,6 @@ class SigningClock:
         self._base, self._base_s, self._is_set = ticks, self._uptime_s(), is_set
 
     def now(self) -> int:
-        """Return the time in ticks."""
         now_s = self._uptime_s()
         ticks = self._base + int((now_s - self._base_s) * TICKS_PER_S)
         ahead = ticks_of(self._wall_s()) - ticks
@@ -108,13 +106,11 @@ class SigningClock:
         return min(max(ticks, self._used), LAST)
 
     def next(self) -> int:
-        """Return the ticks for one message."""
         self._used = min(max(self.now(), self._used + 1), LAST)
         return self._used
 
     @property
     def ahead_of_wall_s(self) -> float:
-        """Lead over the system's clock; 0 while that clock has not been set."""
         wall = ticks_of(self._wall_s())
         return max(0, self.now() - wall) / TICKS_PER_S if wall else 0.0
 
@@ -141,11 +137,9 @@ class Signing:
         self._newest: dict[tuple[int, int], int] = {}
 
     def __repr__(self) -> str:
-        """Without the key."""
         return f"Signing(required={self.required})"
 
     def sign(self, frame: bytes, crc_extra: int) -> bytes:
-        """Sign a MAVLink 2 packet; unchanged while there is no key."""
         if self.key is None:
             return frame
         return sign(frame, crc_extra, self.key, link_id=0, ticks=self.clock.next())
@@ -185,7 +179,6 @@ class Signing:
         return None
 
     def link_id_of(self, frame: bytes | bytearray) -> int | None:
-        """Return the sender's link id in a packet signed with our key; None for any other packet."""
         signed = frame[0] != _MARKER_1 and frame[2] & _SIGNED
         return frame[-_TAIL] if signed and self._is_ours(frame) else None
 

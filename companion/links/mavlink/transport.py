@@ -110,7 +110,7 @@ class _Udp(asyncio.DatagramProtocol):
         return self._failed.result()
 
     def _turn(self) -> None:
-        """Do the work of each second."""
+        pass
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         self._socket = transport.get_extra_info("socket").dup()
@@ -145,7 +145,6 @@ class _Udp(asyncio.DatagramProtocol):
         return False
 
     def send_to(self, data: bytes, peer: Peer | None) -> bool:
-        """Send one datagram; False when the socket is gone or has no room."""
         if self._socket is None:
             return False
         try:

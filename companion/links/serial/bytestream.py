@@ -14,23 +14,19 @@ from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.system.connection import Backoff, Budget, OnState, Reconnection, connect_tcp, words_of
 
-READ_BYTES = 4096
-"""Size of a tty's buffer: one read empties the port, so one time stamp holds for it all."""
+READ_BYTES = 4096  # size of a tty's buffer: one read empties the port, so one time stamp holds for it all
 QUICK_READS = 20
-QUICK_S = 0.0015
-"""Mean interval of `QUICK_READS` reads of a stream whose every byte would wake the loop."""
+QUICK_S = 0.0015  # mean interval of `QUICK_READS` reads of a stream whose every byte would wake the loop
 COLLECT_S = 0.0205
 """Time for which such a stream is collected before the next read, as behind a USB adapter: a wake-up costs far more
 than its bytes. A little more than the 20 ms within which an autopilot takes one heading (autopilots 6)."""
-FULLEST_LINE = 0.9
-"""The greatest share of a line's time that a stream may fill to be collected."""
+FULLEST_LINE = 0.9  # the greatest share of a line's time that a stream may fill to be collected
 OUT_BUFFER_BYTES = 16384
 LONGEST_PAUSE_S = 1.0
 BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 FLOOD_PAUSE_S = 0.05
-MOST_READS = 64
-"""Reads of a port before something may be written to it; the kernel keeps less than these bring."""
+MOST_READS = 64  # reads of a port before something may be written to it; the kernel keeps less than these bring
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 WORTH_S = 2.0
@@ -46,7 +42,6 @@ class PortSettings:
 
     @property
     def is_tcp(self) -> bool:
-        """Return whether the other end is a socket (ser2net, a simulator) and not a device."""
         return self.url.startswith("tcp://")
 
     def __str__(self) -> str:
@@ -98,8 +93,7 @@ class ByteLink:
         self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
         self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
         self._descriptor: int | None = None
-        self._reads = 0
-        """Reads that brought bytes since `_reads_since`, a time and the bytes received by then."""
+        self._reads = 0  # reads that brought bytes since `_reads_since`, a time and the bytes received by then
         self._reads_since = (0.0, 0)
         self._collecting: asyncio.TimerHandle | None = None
         self._lost: asyncio.Future[str] | None = None
@@ -110,16 +104,13 @@ class ByteLink:
 
     @property
     def connected(self) -> bool:
-        """Return whether the port is open, with or without a device that speaks."""
         return self._descriptor is not None
 
     @property
     def last_error(self) -> str:
-        """Why the port is, or last was, not open; one line for people."""
         return self._reconnection.last_error
 
     async def run(self) -> None:
-        """Keep the port open until cancelled; a loss is an event to report, never an exception."""
         try:
             await self._reconnection.keep(self._once)
         finally:

@@ -71,7 +71,6 @@ def _finish_settings(descriptor: int, parity: Parity) -> None:
 
 
 def explain(path: str, baud: int, error: Exception) -> str:
-    """One line for people: which port, what is wrong, what to do."""
     number = _errno_of(error)
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return f"{path}: no such device; is it plugged in? (`companion ports` lists what is there)"

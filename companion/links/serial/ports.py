@@ -23,8 +23,6 @@ _TEXT_LIMIT = 80
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """A process that has the port open."""
-
     pid: int
     name: str
 

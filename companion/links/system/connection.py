@@ -37,13 +37,11 @@ class Backoff:
         self._next_s = first_s
 
     def next_s(self) -> float:
-        """The delay to wait now; the one after it is twice as long, at most the cap."""
         delay_s = self._next_s
         self._next_s = min(delay_s * 2.0, self._cap_s)
         return delay_s
 
     def reset(self) -> None:
-        """Begin again at the first delay."""
         self._next_s = self._first_s
 
 
@@ -80,21 +78,18 @@ class Reconnection:
             self.retry_s = None
 
     def up(self, words: str) -> None:
-        """There is a connection."""
         logger.info("%s: %s%s", self._name, words, " again" if self._warned else "")
         self._up_s = asyncio.get_running_loop().time()
         self._warned = False
         self._say(True, words)  # noqa: FBT003
 
     def down(self, reason: str) -> None:
-        """There is none."""
         self.last_error = reason
         logger.log(logging.DEBUG if self._warned else logging.WARNING, "%s: %s", self._name, reason)
         self._warned = True
         self._say(False, reason)  # noqa: FBT003
 
     def end(self) -> None:
-        """It is not wanted any more."""
         self._say(False, "stopped")  # noqa: FBT003
 
     def _say(self, connected: bool, words: str) -> None:  # noqa: FBT001
@@ -164,7 +159,6 @@ class Budget:
         self.exceeded_s: float | None = None
 
     def left(self, now_s: float) -> float:
-        """Return how many may be taken."""
         gained = max(now_s - self._t_s, 0.0) * self._bytes_per_s
         return min(self._left + gained, self._burst_bytes)
 
@@ -209,7 +203,6 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
 
 
 async def write_line(writer: asyncio.StreamWriter, reply: Object) -> None:
-    """Send one JSON object; raise ConnectionError where the peer is gone or does not read."""
     writer.write(msgspec.json.encode(reply) + b"\n")
     try:
         async with asyncio.timeout(READ_TIMEOUT_S):

@@ -48,7 +48,6 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         self._left_out: Counter[tuple[str, int, int]] = Counter()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the record with the count of those left out before it, or count it."""
         now_s = self._clock()
         place = record.pathname, record.lineno, record.levelno
         budget = self._budgets.setdefault(place, Budget(LINES_PER_S, BURST))
@@ -67,7 +66,6 @@ class OneLineFormatter(logging.Formatter):
     """A message is one line, whatever has come over a wire into it; only a traceback has more."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Make control characters visible: a terminal would obey them."""
         said = copy.copy(record)
         said.msg, said.args = printable(record.getMessage()), None
         return "\n".join(map(printable, super().format(said).splitlines()))
@@ -77,13 +75,11 @@ class JournalFormatter(OneLineFormatter):
     """Lines as journald wants them; it stamps the time itself."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Every line of a traceback gets the priority too."""
         prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
         return "\n".join(prefix + line for line in super().format(record).splitlines() or [""])
 
 
 def set_up_logs(level: str) -> None:
-    """Log to stderr from a level on: debug, info, warning or error."""
     handler = LimitedHandler(sys.stderr)
     if goes_to_journal(sys.stderr):
         handler.setFormatter(JournalFormatter("%(levelname)s %(message)s"))
@@ -135,11 +131,9 @@ class ServiceManager:
 
     @property
     def listens(self) -> bool:
-        """Return whether a service manager listens."""
         return self._socket is not None
 
     def status(self, words: str) -> bool:
-        """Send the status line, unless it is the last one."""
         line = " ".join(words.split())
         if line == self._status:
             return True
@@ -149,7 +143,6 @@ class ServiceManager:
         return sent
 
     def close(self) -> None:
-        """Stop to notify."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -171,10 +164,8 @@ class ServiceManager:
 
 
 REPORT_EVERY_S: Final = 1.0
-NICENESS: Final = 19
-"""The daemon answers an arming request within 20 ms whatever its children are busy with."""
-OUT_OF_MEMORY: Final = 12
-"""Exit code of a child that needed more than its limit: ENOMEM."""
+NICENESS: Final = 19  # the daemon answers an arming request within 20 ms whatever its children are busy with
+OUT_OF_MEMORY: Final = 12  # exit code of a child that needed more than its limit: ENOMEM
 STACK_BYTES: Final = 1024 * 1024
 """Stack of a thread: it counts as data, and the usual 8 MiB would use up the limit."""
 OOM_SCORE: Final = "900"
@@ -182,16 +173,12 @@ OOM_SCORE: Final = "900"
 
 
 class ChildSettings(msgspec.Struct, frozen=True):
-    """Settings that the daemon hands to a child: the configuration in force, and the level of the log."""
-
     config: Config
     log_level: str = "INFO"
     only_listening: str | None = None
 
 
 class ChildWork(Protocol):
-    """Work of a child process."""
-
     async def run(self) -> None:
         """Work until cancelled."""
 

@@ -35,7 +35,6 @@ class Hmr3300Decoder(LineDecoder):
     _triples = _singles = 0
 
     def interrupted(self) -> None:
-        """Forget the line under way, and do not believe the next one: it may lack its first digits."""
         super().interrupted()
         self._follows_line_end = False
 

@@ -62,7 +62,6 @@ class NmeaDecoder(SentenceDecoder):
     _heading_s = _tilt_s = 0.0
 
     def interrupted(self) -> None:
-        """Forget the sentence under way, and which one leads: it may be another device."""
         super().interrupted()
         self._heading_from = self._tilt_from = _NOBODY
 

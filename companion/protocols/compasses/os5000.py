@@ -27,8 +27,7 @@ _VECTOR: Final = re.compile(rb"Mx%bMy%bMz%b" % ((_NUMBER,) * 3))
 class Os5000Decoder(SentenceDecoder):
     """`$C` sentences; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
 
-    LIMIT = 250
-    """Bytes from the "$" on; with every field that can be switched on there are some 150."""
+    LIMIT = 250  # bytes from the "$" on; with every field that can be switched on there are some 150
 
     def _read(self, body: bytes, t_s: float) -> list[Sample]:
         match = _TAGS.fullmatch(body)

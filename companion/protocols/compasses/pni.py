@@ -157,7 +157,6 @@ def _components(frame: bytes, size: int) -> list[tuple[int, int]]:
 
 
 def frame(frame_id: int, payload: bytes = b"") -> bytes:
-    """A whole frame, as it is sent to a device."""
     body = struct.pack(">HB", SHORTEST + len(payload), frame_id) + payload
     return body + struct.pack(">H", binascii.crc_hqx(body, 0))
 

@@ -24,8 +24,7 @@ _STALL_S = 10.0
 
 NO_FRAME: Final = 0
 WAIT: Final = -1
-ECHO: Final = "echo of a command"
-"""A command of ours, or of another master, on a line that both sides hear."""
+ECHO: Final = "echo of a command"  # a command of ours, or of another master, on a line that both sides hear
 
 
 class RejectedError(Exception):
@@ -43,7 +42,6 @@ class Decoder(ABC):
     """
 
     START: ClassVar[re.Pattern[bytes]]
-    """The bytes that may begin a frame."""
     device_clock_wraps_s: ClassVar[float | None] = None
     """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
     clock_from_start: ClassVar[bool] = False
@@ -61,10 +59,8 @@ class Decoder(ABC):
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
         self.warned: Counter[str] = Counter()
-        self._buffer = b""
-        """Bytes of a possible frame; never longer than the longest frame."""
-        self._received = self._origin = 0
-        """Stream positions of the last byte and of the buffer."""
+        self._buffer = b""  # bytes of a possible frame; never longer than the longest frame
+        self._received = self._origin = 0  # stream positions of the last byte and of the buffer
         self._chunks: deque[tuple[int, float]] = deque()
         """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""
 
@@ -109,7 +105,6 @@ class Decoder(ABC):
         return samples
 
     def interrupted(self) -> None:
-        """Forget the frame under way: bytes are missing before the next ones (the port was opened again)."""
         if self._buffer:
             self.rejected["cut short"] += 1
         self._buffer = b""
@@ -185,10 +180,8 @@ def body_of_sentence(sentence: bytes) -> bytes:
     return body
 
 
-GYRO_LIMIT_RAD_S = 100.0
-"""5730 deg/s; the widest ranges sold are 4000 deg/s."""
-ACCEL_LIMIT_M_S2 = 2000.0
-"""204 g; the widest range of a part with a gyro in it is 200 g."""
+GYRO_LIMIT_RAD_S = 100.0  # 5730 deg/s; the widest ranges sold are 4000 deg/s
+ACCEL_LIMIT_M_S2 = 2000.0  # 204 g; the widest range of a part with a gyro in it is 200 g
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
 """Limit for an IMU, in kelvin or tenths too: `estimation/seconds/thermometer.py` names what cannot be degC."""
@@ -209,7 +202,6 @@ DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
 
 
 def out_of_range(value: float) -> RejectedError:
-    """For a value that is beyond its range, or no number."""
     return RejectedError("out of range" if math.isfinite(value) else "non-finite")
 
 
@@ -223,7 +215,6 @@ def full_circle(heading_deg: float) -> float:
 
 
 def check_vector(vector: Vector) -> None:
-    """Raise RejectedError where a component is not finite."""
     if not math.isfinite(sum(vector)):
         raise RejectedError("non-finite")
 
@@ -270,8 +261,7 @@ class SentenceDecoder(Decoder):
 
     START = re.compile(rb"\$")
     END: ClassVar[re.Pattern[bytes]] = re.compile(rb"[\r\n$]")
-    LIMIT: ClassVar[int] = 160
-    """The most bytes of a sentence, from the "$" to before the line end."""
+    LIMIT: ClassVar[int] = 160  # the most bytes of a sentence, from the "$" to before the line end
 
     def _size(self, buffer: bytes, at: int) -> int:
         limit = at + 1 + self.LIMIT

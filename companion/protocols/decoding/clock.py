@@ -22,8 +22,7 @@ CREEP: Final = 100e-6
 STEP_S: Final = 0.005
 """If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
 SPAN_S: Final = 1.0
-SPAN_SAMPLES: Final = 20
-"""The fewest samples in a span: of a few all may have had to wait for the adapter."""
+SPAN_SAMPLES: Final = 20  # the fewest samples in a span: of a few all may have had to wait for the adapter
 
 LATE_S: Final = 1.0
 """A sample that seems later than this is dropped: as old as that nobody waits for it, or its clock is wrong."""
@@ -38,10 +37,8 @@ class DeviceClock:
     """Maps one device's clock to the host's; it starts again at 0 after `wraps_s`, by its format, or never."""
 
     def __init__(self, wraps_s: float | None) -> None:
-        self.breaks = 0
-        """Breaks: samples before and after need not be one device's without a pause."""
+        self.breaks = 0  # samples before and after a break need not be from one device without a pause
         self.device_s = 0.0
-        """The clock as of the last sample, unwrapped."""
         self._wraps_s = wraps_s
         self._raw_s = self._arrival_s = self._offset_s = math.nan
         self._new_span(math.nan)

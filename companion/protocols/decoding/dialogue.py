@@ -8,10 +8,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Final
 
-SILENT_S: Final = 2.0
-"""Silence of a streaming device before anything is sent to it."""
-ANSWER_S: Final = 1.0
-"""Wait for an answer before the next question; no polled device documents a delay."""
+SILENT_S: Final = 2.0  # silence of a streaming device before anything is sent to it
+ANSWER_S: Final = 1.0  # wait for an answer before the next question; no polled device documents a delay
 PATIENCE: Final = 3
 AGAIN_S: Final = 5.0
 LONGEST_PAUSE_S: Final = 64.0
@@ -45,7 +43,6 @@ class PollDialogue(Dialogue):
         """Sent first, and after a question in vain: the device may have been without power."""
         self._quiet_until_s = self._next_s = 0.0
         self._asked_s: float | None = None
-        """Time of the question that has not been answered yet."""
         self._since_asked = self._unanswered = 0
         self._set_up = False
 

@@ -100,9 +100,7 @@ RANGE_NOT_KNOWN = "accelerometer range not known"
 OUTPUT_UNIT = "output unit"
 
 REST_TICKS: Final = 2000
-"""Internal samples at rest (a second of them) that decide the accelerometers' range."""
-REST_DEG_S: Final = 3.0
-"""The fastest rate that counts as "at rest"; a turn-on bias is a tenth of it."""
+REST_DEG_S: Final = 3.0  # the fastest rate that counts as "at rest"; a turn-on bias is a tenth of it
 
 _ASSUMED_BITS = 19
 _BITS = (16, 18, 19, 20, 21)
@@ -251,7 +249,6 @@ def _temperature(values: tuple[int, ...], at: int | None) -> float | None:
 
 
 def _check_status(status: int) -> None:
-    """Table 5-23."""
     if status & _START_UP:
         raise RejectedError(STARTING)
     if status & (_SYSTEM | _CHANNEL):

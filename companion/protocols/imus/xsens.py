@@ -31,16 +31,13 @@ _COUNTER, _TIME, _TEMPERATURE, _STATUS = 0x1020, 0x1060, 0x0810, 0xE020
 _ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR = 0x4020, 0x4040, 0x8020, 0x8040
 _VECTORS = frozenset((_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR))
 _TICKS_A_SECOND = 10_000.0
-_CLIPPED = 0x3F00
-"""Bits 8 to 10 of the status word: acceleration out of range on X, Y, Z; bits 11 to 13: rate."""
+_CLIPPED = 0x3F00  # bits 8 to 10 of the status word: acceleration out of range on X, Y, Z; bits 11 to 13: rate
 
 _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 _FLOAT32 = struct.Struct(">3f")
 
 
 class XsensDecoder(Decoder):
-    """MTData2 messages; gives `ImuSample`."""
-
     START = re.compile(rb"\xfa(?:\xff|\Z)")
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
     clock_from_start: ClassVar[bool] = True

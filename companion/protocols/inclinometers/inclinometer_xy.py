@@ -23,8 +23,7 @@ _DEGREES = re.compile(rb"[+-]\d\d\.(\d{2,3})")
 _SENTINEL = re.compile(rb"\+{3,}|-{3,}")
 _SINGLE_AXIS = re.compile(rb"[+-]\d\d\.\d{2,3}")
 _ECHO = re.compile(rb"[A-Za-z*]{1,8}")
-_SURE = 4
-"""Readings in a row with fewer decimals that make them the device's format; fewer have lost a digit."""
+_SURE = 4  # readings in a row with fewer decimals that make them the device's format; fewer have lost a digit
 
 _SPOILED: Literal["spoiled"] = "spoiled"
 
