@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import GOES_ON, to_ascii
 from companion.links.system.events import Listeners
-from companion.protocols.heartbeat import AUTOPILOT_NAMES
+from companion.protocols.guess import AUTOPILOT_NAMES
 
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
 FRESH_S: Final = 3.0

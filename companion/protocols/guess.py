@@ -1,4 +1,7 @@
-"""Recognise a device by its bytes: every decoder of the registry reads them, and the one that accepts most wins."""
+"""Recognise a speaker by its bytes: a sensor, an autopilot, or something else.
+
+Every decoder of the registry reads the bytes, and the one that accepts most wins.
+"""
 
 from __future__ import annotations
 
@@ -105,3 +108,60 @@ def is_mavlink(data: bytes) -> bool:
         else:
             return True
     return False
+
+
+AUTOPILOT_NAMES: Final = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT of those that the companion can calibrate
+
+_FRAMES: Final = (
+    # Version 2: length 9, two bytes of flags, sequence, system, component, the message's number in three bytes.
+    re.compile(rb"(?=\xfd(\x09...(..)\x00\x00\x00(.{9}))(..))", re.DOTALL),
+    # Version 1: no flags, one byte of number.
+    re.compile(rb"(?=\xfe(\x09.(..)\x00(.{9}))(..))", re.DOTALL),
+)
+_HEARTBEAT_EXTRA: Final = 50  # the message's CRC_EXTRA
+_NO_AUTOPILOT: Final = 8
+_TYPE_AT, _AUTOPILOT_AT = 4, 5
+_GROUND_STATION: Final = 6
+_X25_POLYNOMIAL: Final = 0x8408
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    system_id: int
+    component_id: int
+    kind: int
+    autopilot: int
+
+    @property
+    def is_autopilot(self) -> bool:
+        return self.autopilot != _NO_AUTOPILOT
+
+    def __str__(self) -> str:
+        if self.is_autopilot:
+            who = AUTOPILOT_NAMES.get(self.autopilot, f"autopilot of kind {self.autopilot}")
+        else:
+            who = "ground station" if self.kind == _GROUND_STATION else f"MAVLink component {self.component_id}"
+        return f"{who}, system {self.system_id}"
+
+
+def heartbeats(data: bytes) -> list[Heartbeat]:
+    """List the senders of whole HEARTBEATs, autopilots first, each once.
+
+    One is enough to know the speed: its nine bytes end with one that is never zero, so version 2 never cuts it short.
+    """
+    found = [
+        Heartbeat(match[2][0], match[2][1], match[3][_TYPE_AT], match[3][_AUTOPILOT_AT])
+        for frame in _FRAMES
+        for match in frame.finditer(data)
+        if _x25(match[1] + bytes((_HEARTBEAT_EXTRA,))) == match[4][0] | match[4][1] << 8
+    ]
+    return sorted(dict.fromkeys(found), key=lambda one: not one.is_autopilot)
+
+
+def _x25(data: bytes) -> int:
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ (_X25_POLYNOMIAL if value & 1 else 0)
+    return value

@@ -14,8 +14,7 @@ from companion.links.mavlink.transport import parse_url
 from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, resolve
 from companion.links.system.events import comes
-from companion.protocols.guess import Line
-from companion.protocols.heartbeat import Heartbeat, heartbeats
+from companion.protocols.guess import Heartbeat, Line, heartbeats
 from companion.protocols.registry import Kind, main_kind
 
 AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 115200))

@@ -19,14 +19,15 @@ from companion.links.system.events import comes
 from companion.protocols.guess import (
     ENOUGH_BYTES,
     Candidate,
+    Heartbeat,
     Line,
+    heartbeats,
     is_mavlink,
     likeliest,
     lines_to_try,
     plain_share,
     strangers,
 )
-from companion.protocols.heartbeat import Heartbeat, heartbeats
 
 SILENT_S: Final = 3.0
 """Wait at the first setting before a port is called silent: a talker is seen at every speed."""

@@ -132,30 +132,7 @@ def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
 class XsensDialogue(WakeDialogue):
     """GoToMeasurement: from the config state back to sending (MT0605P.E, p. 53).
 
-    A device that has just got power says WakeUp and waits half a second. It is answered with the same: WakeUpAck would
-    put it into the config state, and a device that is set not to measure by itself waits for ever.
+    A device that has just got power says WakeUp. It is not answered: WakeUpAck would put it into the config state.
     """
 
     SAYINGS = ((bytes.fromhex("FAFF1000F1"), "measurement started with GoToMeasurement"),)
-    WAKE_UP: ClassVar[bytes] = bytes.fromhex("FAFF3E00C3")
-
-    _tail = b""
-    _woken = False
-
-    def opened(self, t_s: float) -> None:
-        super().opened(t_s)
-        self._tail, self._woken = b"", False
-
-    def heard(self, data: bytes, samples: int, t_s: float) -> None:
-        super().heard(data, samples, t_s)
-        text = self._tail + data
-        self._tail = text[-(len(self.WAKE_UP) - 1) :]
-        # What it said after the WakeUp shows that it has gone on by itself.
-        self._woken = text.endswith(self.WAKE_UP) or (self._woken and not data)
-
-    def due(self, t_s: float) -> bytes:
-        if not self._woken:
-            return super().due(t_s)
-        self._woken, self._quiet_since_s = False, t_s
-        saying, self.words = self.SAYINGS[0]
-        return saying

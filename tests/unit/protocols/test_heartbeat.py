@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v10 import ardupilotmega as first
 from pymavlink.dialects.v20 import ardupilotmega as second
 
-from companion.protocols.heartbeat import Heartbeat, heartbeats
+from companion.protocols.guess import Heartbeat, heartbeats
 
 NOISE = random.Random(5).randbytes(400)
 

@@ -65,20 +65,6 @@ def test_vectornav_is_first_resumed_then_given_its_factory_output_and_never_stor
     assert not any(b"VNWNV" in data for data, _ in VectorNavDialogue.SAYINGS)
 
 
-@pytest.mark.parametrize("cut", range(6))
-def test_a_wake_up_is_answered_at_once_and_once(cut: int) -> None:
-    wake_up = bytes.fromhex("FAFF3E00C3")
-    dialogue = XsensDialogue()
-    dialogue.opened(0.0)
-    dialogue.heard(wake_up[:cut], 0, 0.5)
-    dialogue.heard(wake_up[cut:], 0, 0.51)
-    assert dialogue.due(0.52) == MEASURE
-    assert asked(dialogue, 0.54, 2.4) == []
-    dialogue.heard(wake_up, 0, 3.0)
-    dialogue.heard(bytes.fromhex("FAFF0F00F2"), 0, 3.1)  # it has gone on by itself
-    assert asked(dialogue, 3.1, 5.0) == []
-
-
 @pytest.mark.parametrize(
     ("name", "stop", "acknowledged"),
     [("mip", TO_IDLE, "7565010404F10600"), ("xsens", TO_CONFIG, "FAFF1100F0")],

@@ -8,8 +8,7 @@ import pytest
 
 from companion import cli, config
 from companion.links.serial.listening import Heard
-from companion.protocols.guess import Line
-from companion.protocols.heartbeat import Heartbeat
+from companion.protocols.guess import Heartbeat, Line
 from companion.setup import draft as drafting
 from companion.setup.survey import HeardUdp, Survey
 
