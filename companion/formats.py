@@ -1,7 +1,4 @@
-"""Data as it is let in and shown: JSON files of ours, requests, words from outside.
-
-A file of an older format version is read, one of a newer version refused.
-"""
+"""JSON files of ours, requests, and words from outside: checked on the way in, made printable on the way out."""
 
 from __future__ import annotations
 
@@ -12,11 +9,7 @@ import msgspec
 
 
 def decode(data: bytes, kind: Any, newest: int | None) -> Any:
-    """JSON as that type; `newest` is the latest version of it that is known, None where it has none.
-
-    Raises:
-        msgspec.MsgspecError: it is nothing of the kind, or of a newer companion.
-    """
+    """Parse JSON as a type; raise msgspec.MsgspecError for any other, and for a `format_version` above `newest`."""
     if newest is not None:
         said = msgspec.json.decode(data, type=dict[str, msgspec.Raw]).get("format_version")
         if said is not None and (version := msgspec.json.decode(said, type=int)) > newest:
@@ -36,11 +29,7 @@ Value = str | int | float | bool | None
 
 
 def parse_request(data: bytes) -> dict[str, Any]:
-    """Read an object of texts, numbers, true, false and null.
-
-    Raises:
-        ValueError: it is none, and why, in one line.
-    """
+    """Read an object of texts, numbers, true, false and null; raise ValueError, in one line, for anything else."""
     found = msgspec.json.decode(data, type=dict[str, Value])
     for key, value in found.items():
         if isinstance(value, str) and "\0" in value:

@@ -91,7 +91,6 @@ def strangers(data: bytes) -> str | None:
 
 
 def plain_share(data: bytes) -> float:
-    """Return the share of bytes that a text may hold, 0 to 1; 0 without any bytes."""
     return len(data.translate(None, _NOT_PLAIN)) / len(data) if data else 0.0
 
 

@@ -35,7 +35,10 @@ Kind = Literal["imu", "gradienter", "compass"]
 
 @dataclass(frozen=True, slots=True)
 class ProtocolInfo:
-    """One protocol as a device of one kind: its decoder, and the device's line as it comes from the factory."""
+    """One protocol as a device of one kind: its decoder, and the factory's setting of its line.
+
+    `sigma_deg` (of tilt, or of a level heading) and `tilted_sigma_deg` hold where none is configured.
+    """
 
     name: str
     baud: int
@@ -43,7 +46,6 @@ class ProtocolInfo:
     dialogue: Callable[[], Dialogue] | None = None
     lag_s: float = 0.0  # time constant with which its reading follows the truth: fluid, pendulum, filters
     sigma_deg: float | None = None
-    """Sigma of such a device's tilt (gradienter) or level heading (compass) without a configured one."""
     tilted_sigma_deg: float | None = None
     law: Law | None = None  # meaning of a gradienter's two readings by its documents; None: the user must say
     parity: Parity = "none"
@@ -101,7 +103,7 @@ PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {
 
 
 def main_kind(name: str) -> Kind:
-    """Return what such a device is mainly bought as; raise ConfigError for an unknown protocol."""
+    """Return the main use of a device; raise ConfigError for an unknown protocol."""
     kinds: tuple[Kind, ...] = ("compass", "imu", "gradienter")
     for kind in kinds:
         if name in PROTOCOLS[kind]:
@@ -110,7 +112,7 @@ def main_kind(name: str) -> Kind:
 
 
 def part_for(role: Kind, sample: Sample) -> Sample | None:
-    """The sample as this role takes it; None where it has nothing for it."""
+    """Return the part of a sample that a role uses; None: there is none."""
     match sample:
         case ImuSample():
             return sample if role == "imu" else None

@@ -64,7 +64,6 @@ class StreamHealth:
         self.opened()
 
     def opened(self) -> None:
-        """Begin anew: the port was opened (again)."""
         self._tail = b""
         self.last_byte_s: float | None = None
         self.unchanged_since_s: float | None = None
@@ -76,7 +75,6 @@ class StreamHealth:
         self._guess, self._guessed_s = "", -math.inf
 
     def excuse(self) -> None:
-        """Forget the damage so far: its cause is known."""
         self._marks.clear()
 
     def took(self, data: bytes, samples: Sequence[Sample], t_s: float) -> None:
@@ -108,7 +106,6 @@ class StreamHealth:
         self._reading, self._same, self.unchanged_since_s = reading, 0, t_s
 
     def trouble(self, now_s: float) -> Trouble | None:
-        """Return the present fault of an open port at `now_s`."""
         lately = self._lately(now_s)
         if self.last_sample_s is None or now_s - self.last_sample_s >= SILENT_AFTER_S:
             return self._without_samples(now_s, lately)
@@ -147,7 +144,6 @@ class StreamHealth:
         return Trouble("stuck", words, implausible=True)
 
     def _lately(self, now_s: float) -> _Counts:
-        """Count the frames of the last `SPAN_S`."""
         marks, decoder = self._marks, self._decoder
         if not marks or now_s - marks[-1][0] >= SPAN_S / 4:
             marks.append((now_s, (decoder.accepted, Counter(decoder.rejected))))

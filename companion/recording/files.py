@@ -70,7 +70,6 @@ def open_new(path: Path) -> IO[bytes]:
 
 
 def is_available() -> bool:
-    """Return whether the libraries of recording are installed, without loading them."""
     from importlib.util import find_spec
 
     return find_spec("mcap") is not None and find_spec("zstandard") is not None
@@ -215,7 +214,6 @@ class Ring:
         return self._current is not None and self._current.bytes_written >= self.most_bytes // PARTS
 
     def write(self, batch: Sequence[Message], beginning: Beginning) -> None:
-        """Add messages to the present file; after `close` to the next one."""
         try:
             if self._current is None:
                 self._next()
@@ -249,7 +247,6 @@ class Ring:
         )
 
     def _files(self) -> list[tuple[int, Path, int]]:
-        """Number, path and size of every file, oldest first."""
         found = []
         for entry in os.scandir(self.folder):
             match = _NAME.fullmatch(entry.name)

@@ -64,10 +64,7 @@ class RawOutput(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """A window of the still stretch was taken.
-
-    What is known besides its ends may go back to before the recording began.
-    """
+    """A window was measured. All but its ends may be known from before the recording began."""
 
     start_s: float
     end_s: float
@@ -77,7 +74,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):
-    """A calibration was worked out from the latest window; everything else that it was made from."""
+    """A calibration was solved from the latest window: its other inputs."""
 
     where: Whereabouts
     what: str
@@ -98,7 +95,6 @@ MOST_BYTES: Final = 1024 * 1024  # the most bytes of one of these messages; ours
 
 
 def encoding(topic: str) -> str:
-    """Return the encoding of the messages on a topic, as MCAP calls it."""
     if topic.startswith(SERIAL) or topic in (MAVLINK, TICK):
         return "bytes"
     return "json" if topic == RECORD else "msgpack"
@@ -157,7 +153,6 @@ class Tape:
         self.is_on, self.lost, self._bytes, self._waiting = False, 0, 0, []
 
     def drain(self, now_s: float) -> tuple[float, list[Message], list[Message]]:
-        """Return all messages that wait, after their beginning and the states in force then."""
         batch = self._since_s, self._states_before, self._waiting
         self._since_s, self._states_before = now_s, list(self._states.values())
         self._waiting, self._bytes = [], 0
@@ -203,7 +198,6 @@ class KeyFilter:
         self._left = 0  # bytes of such a payload that are still to come
 
     def __call__(self, data: bytes) -> bytes:
-        """Return the same bytes without keys."""
         known = self._before + data
         self._before = known[1 - _HEADER :]
         if not self._left and _ID not in known:

@@ -32,26 +32,30 @@ BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One parameter: the value before, the one we set, and the one that is set on the way between them, if any."""
+    """One parameter: its old value, its new one, and the far value between them (`Change.via`), if any.
+
+    `after` is None while the firmware's own gyro calibration, started by us, sets it: any value is ours then. `also`
+    are values that our writes may leave there while several are set one after the other.
+    """
 
     parameter: str
     before: float
     after: float | None
-    """None: not known in advance, and whatever is found is of our doing (the firmware's own gyro calibration that we
-    have started)."""
     via: float | None = None
     also: tuple[float, ...] = ()
-    """Other values that may stand there by our doing, while several are set one after the other."""
 
 
 Moment = Annotated[str, msgspec.Meta(pattern=r"^[-+:.0-9T]{0,40}\Z")]
 
 
 class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Kind of a write ("calibration", "auto calibration", or one of `BY_HAND`) and its begin; empty: not kept.
+
+    Times are UTC, ISO 8601, by the host's clock; `at` of a calibration is `started_at` of its record.
+    """
+
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
-    """Name: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
     at: Moment = ""
-    """UTC, ISO 8601, by the host's clock: when that began; for calibrations `started_at` of the record."""
     since: Moment = ""  # begin of the first of several writes in one step; empty: it is the only one
 
     @property
@@ -60,8 +64,6 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Changes of one write on one vehicle."""
-
     system_id: int
     changes: tuple[Changed, ...]
     origin: Origin = Origin()
@@ -91,7 +93,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names}
 
     def after(self, older: ChangeSet) -> ChangeSet:
-        """This write and the one before it as one step: back to the values from before both."""
+        """Join this write and the one before it to one step, which goes back to the values before both."""
         were = {changed.parameter: changed for changed in older.changes}
         joined = [_joined(were.pop(changed.parameter, None), changed) for changed in self.changes]
         origin = self.origin
@@ -111,7 +113,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _joined(older: Changed | None, newer: Changed) -> Changed:
-    """Back to the value from before both, unless somebody else has set another one in between."""
+    """Join two changes of one parameter, unless somebody else has set another value between them."""
     if older is None or older.after != newer.before:
         return newer
     via = newer.via
@@ -130,7 +132,7 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
     @property
     def all(self) -> tuple[ChangeSet, ...]:
-        """The steps, whichever version has kept them."""
+        """Return the steps, of files of earlier versions too."""
         return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
 
     def and_then(self, latest: ChangeSet) -> Undoable:
@@ -141,7 +143,7 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
 
     def without(self, latest: ChangeSet) -> Undoable:
-        """When this write, or all of its step, has been put back; the same where it is not the latest of them."""
+        """Remove a write that was restored, or its whole step; nothing where it is not the latest."""
         steps = self.all
         if not steps or not (latest == steps[0] or (latest.origin.at and latest.origin.at == steps[0].origin.at)):
             return self
@@ -150,8 +152,6 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 class ChangeLog:
-    """The change files of one storage folder."""
-
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._allowed = {name: one for each in CALIBRATION.values() for name, one in each.items()}

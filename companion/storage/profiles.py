@@ -1,4 +1,7 @@
-"""Noise profiles learned from recordings: `profiles/NAME.json` in the storage directory."""
+"""Noise profiles learned from recordings: `profiles/NAME.json` in the storage directory.
+
+Functions raise StorageError, in one line, for what cannot be read or written.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +83,6 @@ class ProfileStore:
         return named_in(self._folder, _FILE)
 
     def read(self, name: str) -> SavedProfile:
-        """Read one profile; raises StorageError in one line."""
         path = self.path(name)
         found = read_profile(path)
         if found.name != name:
@@ -88,7 +90,6 @@ class ProfileStore:
         return found
 
     def write(self, profile: SavedProfile) -> Path:
-        """Save a profile, in the place of one of that name; return its file. Raises StorageError."""
         check_name(profile.name)
         path = self.path(profile.name)
         # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.
@@ -98,7 +99,7 @@ class ProfileStore:
 
 
 def read_profile(path: Path) -> SavedProfile:
-    """Read a profile from any file; raises StorageError in one line: unreadable, damaged, or of a newer version."""
+    """Read a profile from any file; raises for a damaged one, and for one of a newer version."""
     try:
         found: SavedProfile = formats.decode(unsealed(read_regular(path)), SavedProfile, FORMAT_VERSION)
         for model in (found.gyro, found.accel):

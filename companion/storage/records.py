@@ -29,7 +29,10 @@ T = TypeVar("T")
 
 
 class NumberedFiles(Generic[T]):
-    """Files `000001.json`, ... in a folder, in the order of their making: the wall clock may be wrong in the field."""
+    """Files `000001.json`, ... in a folder, numbered because the wall clock may be wrong in the field.
+
+    Methods raise StorageError; nothing is half written.
+    """
 
     name: ClassVar[str]
     kind: ClassVar[Any]
@@ -41,14 +44,13 @@ class NumberedFiles(Generic[T]):
         self.folder = directory / self.name
 
     def numbers(self) -> list[int]:
-        """List all numbers, ascending, of unreadable files too; raises StorageError."""
+        """List the numbers of all files, unreadable ones too, ascending."""
         return numbers_in(self.folder, _NAME)
 
     def file(self, number: int) -> StateFile[T]:
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
-        """Add a file; return its number. Raises StorageError; nothing is half written."""
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 1
         self.file(number).write(value)
@@ -60,7 +62,7 @@ class NumberedFiles(Generic[T]):
         return number
 
     def latest(self) -> Iterator[tuple[int, T]]:
-        """Yield numbers and contents, the newest first, without unreadable files; raises StorageError."""
+        """Yield numbers and contents of the readable files, the newest first."""
         for number in reversed(self.numbers()):
             try:
                 found = self.file(number).read()
@@ -83,7 +85,7 @@ class RecordStore(NumberedFiles[Record]):
         return list(self.newest(limit).values())
 
     def mark_undone(self, step: ChangeSet, undone_at: str) -> list[str]:
-        """Note in the records of a step that it was undone; return their `started_at`. Raises StorageError."""
+        """Note in the records of a step that it was undone; return their `started_at`."""
         found: dict[int, Record] = {}
         for number, each in self.latest():
             if each.undone_at or each.state != "done" or each.system_id != step.system_id:
@@ -171,17 +173,16 @@ class BiasStore:
         self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=BIASES_VERSION)
 
     def read(self) -> dict[str, KnownImu]:
-        """Read the IMUs; a file that cannot be used is set aside, since nothing depends on it."""
+        """Read the IMUs; an unusable file is set aside and counts as empty."""
         found = self._file.load()
         return {} if found is None else found.imus
 
     def all(self) -> dict[str, KnownImu]:
-        """Read the IMUs, and set nothing aside; raises StorageError."""
+        """Read the IMUs; raises StorageError for an unusable file."""
         found = self._file.read()
         return {} if found is None else found.imus
 
     def write(self, imus: dict[str, KnownImu]) -> None:
-        """Write the latest IMUs; after a StorageError what was there before still is."""
         latest = sorted(imus, key=lambda name: max((point.unix_s for point in imus[name].points), default=0.0))
         self._file.write(_File(imus={name: imus[name] for name in latest[-KEEP_IMUS:]}))
 

@@ -62,7 +62,7 @@ def remove_durably(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have what was made, renamed or removed in it on the disk; raises OSError."""
+    """Write the entries of a folder to the disk; raises OSError."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -120,7 +120,7 @@ def _require_regular(found: os.stat_result) -> None:
 
 
 def sealed(data: bytes) -> bytes:
-    """A JSON object with its checksum as the last key, and a new line."""
+    """Append the checksum to a JSON object as its last key, and a new line."""
     body = data.rstrip()[:-1].rstrip()
     gap, end = (b"\n  ", b"\n") if b"\n" in body else (b"", b"")
     return body + b"," + gap + b'"sha256":"' + hashlib.sha256(body).hexdigest().encode() + b'"' + end + b"}\n"
@@ -138,7 +138,7 @@ def unsealed(data: bytes) -> bytes:
 
 
 class StateFile(Generic[T]):
-    """One such file; `check` raises msgspec.ValidationError where what was found, or is to be kept, cannot be."""
+    """One state file; `check` raises msgspec.ValidationError for content that cannot be, read or to be written."""
 
     def __init__(
         self,
@@ -153,7 +153,7 @@ class StateFile(Generic[T]):
         self.unusable: str | None = None  # error of the last `load`, in one line; None: there was none
 
     def read(self) -> T | None:
-        """Read the file; None: there is none. Raises StorageError, where and why in one line."""
+        """Read the file; None: there is none. Raises StorageError in one line."""
         try:
             return self._of(read_regular(self.path))
         except (FileNotFoundError, NotADirectoryError):
@@ -181,7 +181,7 @@ class StateFile(Generic[T]):
             return None
 
     def write(self, value: T) -> None:
-        """Replace the content; after a StorageError what was there before still is."""
+        """Replace the content; a StorageError leaves the old one."""
         try:
             data = sealed(msgspec.json.encode(value))
             # What could not be read again would cost what was there before, too.
@@ -195,7 +195,7 @@ class StateFile(Generic[T]):
 
 
 def set_aside(path: Path) -> str:
-    """Rename what cannot be used, so that it is neither met again nor lost; what became of it, in words."""
+    """Rename an unusable file, so that it is neither read again nor lost; return the result in words."""
     names = [f"{path.name}{ASIDE}", *(f"{path.name}{ASIDE}-{number}" for number in range(2, MOST_ASIDE + 1))]
     name = next((name for name in names if not os.path.lexists(path.with_name(name))), names[-1])
     with contextlib.suppress(OSError):
@@ -209,7 +209,7 @@ class _Entries(msgspec.Struct, Generic[T], frozen=True):
 
 
 class BoundedList(Generic[T]):
-    """The latest `keep` entries, oldest first; one that cannot be used is set aside, since nothing hangs on it."""
+    """List of the latest `keep` entries in a file, oldest first. Methods but `read` raise StorageError."""
 
     def __init__(self, path: Path, kind: type[T], keep: int) -> None:
         # Before there were checksums, the list was all there was.
@@ -217,11 +217,11 @@ class BoundedList(Generic[T]):
         self._keep = keep
 
     def read(self) -> list[T]:
-        """The latest entries, for the daemon; a file that cannot be used counts as empty."""
+        """Return the latest entries; an unusable file is set aside and counts as empty."""
         return _listed(self._file.load())[-self._keep :]
 
     def all(self) -> list[T]:
-        """Return all entries, and set nothing aside; raises StorageError."""
+        """Return all entries; raises for an unusable file."""
         return _listed(self._file.read())
 
     def append(self, entry: T) -> None:

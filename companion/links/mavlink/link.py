@@ -64,12 +64,12 @@ class MavlinkLink:
         return self._codec.srcSystem
 
     def join(self, autopilot: Sender) -> None:
-        """Belong to this autopilot's vehicle from here on: we send under its system id."""
+        """Send under the system id of this autopilot from here on."""
         self.autopilot = autopilot
         self._codec.srcSystem = autopilot[0]
 
     def is_for_us(self, message: Any) -> bool:
-        """Check a message's target: ourselves, or 0, everybody (older firmware does not say whom it answers)."""
+        """Check a message's target: this component, or 0 for all (older firmware does not say whom it answers)."""
         return message.target_system in (0, self.system_id) and message.target_component in (0, self.component_id)
 
     @property
@@ -84,20 +84,20 @@ class MavlinkLink:
         self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
-        """Give the function that sends (False: its buffer is full), or None, and the transport's part of `settled`."""
+        """Set or remove a transport's `send` (False: its buffer is full) and its `settled`."""
         self._transmit, self._settled = transmit, settled
         self._attached += 1
         self._forget_received()
         self.on_bytes.tell("in", None, None)
 
     def settled(self) -> bool:
-        """Receive all that has come over the wire; False: more and more comes, or something still waits to leave."""
+        """Receive everything that waits; False: more keeps coming, or something still waits to be sent."""
         return self._settled()
 
     def send(self, message: mavlink.MAVLink_message, allowed: Callable[[], bool] = lambda: True, /) -> bool:
-        """Send a message now; False, and counted, when no transport is attached or its buffer is full.
+        """Send a message now; False: no transport is attached, or its buffer is full.
 
-        `allowed` is asked as the last thing before the bytes leave.
+        `allowed` is asked last, directly before the bytes leave.
         """
         data = message.pack(self._codec)
         if self.signing is not None:
@@ -106,8 +106,7 @@ class MavlinkLink:
             self.dropped += 1
             return False
         left = self._transmit(data) is not False
-        if self.on_bytes:
-            self.on_bytes.tell("out", data, None)
+        self.on_bytes.tell("out", data, None)
         self._codec.seq = (self._codec.seq + 1) % 256
         self.dropped += not left
         self.sent += left
@@ -117,9 +116,8 @@ class MavlinkLink:
         return self._handlers.setdefault(kind.msgname, Listeners()).add(handler)  # type: ignore[arg-type]
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
-        if self.on_bytes:
-            self.on_bytes.tell("in", data, t_s)
+        """Handle bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        self.on_bytes.tell("in", data, t_s)
         attached = self._attached
         for name, _, message in self._frames(data):
             self._dispatch(name, message, t_s)
@@ -136,8 +134,7 @@ class MavlinkLink:
 
         A radio's own messages are not admitted by anybody: they come without a signature.
         """
-        if self.on_bytes:
-            self.on_bytes.tell("in", datagram, t_s)
+        self.on_bytes.tell("in", datagram, t_s)
         frames = list(self._frames(datagram))
         if self.half_received:
             self.received["bad"] += 1
@@ -186,7 +183,7 @@ class MavlinkLink:
         return self.signing is None or self.signing.admits(message.get_msgbuf())
 
     def signed_on(self, message: Message) -> int | None:
-        """The sender's link id in a message that is signed with our key; None where it is not, or nobody judges."""
+        """Return the sender's link id in a message signed with our key; None for others, or without signing."""
         return None if self.signing is None else self.signing.link_id_of(message.get_msgbuf())
 
     def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:

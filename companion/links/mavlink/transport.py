@@ -102,7 +102,6 @@ class _Udp(asyncio.DatagramProtocol):
         room in the kernel to send it later."""
 
     async def run(self) -> str:
-        """Serve until the socket fails; returns why."""
         while not self._failed.done():
             self.link.turn()
             await asyncio.wait([self._failed], timeout=_TURN_S)

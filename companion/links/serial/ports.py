@@ -48,7 +48,6 @@ class SerialPort:
 
 
 def list_ports(root: Path = ROOT) -> list[SerialPort]:
-    """List the serial ports with hardware behind them, by device name."""
     links = _links_by_device(root)
     holders = _holders_by_device(root)
     consoles = _consoles(root)
@@ -196,8 +195,6 @@ _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 @dataclass(frozen=True, slots=True)
 class PortFault:
-    """One fault of a port in words, and the command that mends it; `good`: a warning."""
-
     words: str
     remedy: str
     good: bool = False

@@ -58,10 +58,10 @@ class Reconnection:
         self._name, self._worth_s, self._on_state = name, worth_s, on_state
         self._warned = False
         self._up_s = math.inf
-        self._told: tuple[bool, str] | None = None
+        self._notified: tuple[bool, str] | None = None
 
     async def keep(self, once: Callable[[], Awaitable[str]]) -> NoReturn:
-        """Connect again and again. `once` calls `up`, and returns why it ended or raises LinkError."""
+        """Run `once` again and again; it calls `up`, and returns why it ended or raises LinkError."""
         loop = asyncio.get_running_loop()
         while True:
             self._up_s = math.inf
@@ -81,20 +81,20 @@ class Reconnection:
         logger.info("%s: %s%s", self._name, words, " again" if self._warned else "")
         self._up_s = asyncio.get_running_loop().time()
         self._warned = False
-        self._say(True, words)  # noqa: FBT003
+        self._notify(words, connected=True)
 
     def down(self, reason: str) -> None:
         self.last_error = reason
         logger.log(logging.DEBUG if self._warned else logging.WARNING, "%s: %s", self._name, reason)
         self._warned = True
-        self._say(False, reason)  # noqa: FBT003
+        self._notify(reason, connected=False)
 
     def end(self) -> None:
-        self._say(False, "stopped")  # noqa: FBT003
+        self._notify("stopped", connected=False)
 
-    def _say(self, connected: bool, words: str) -> None:  # noqa: FBT001
-        if self._on_state is not None and (connected, words) != self._told:
-            self._told = (connected, words)
+    def _notify(self, words: str, *, connected: bool) -> None:
+        if self._on_state is not None and (connected, words) != self._notified:
+            self._notified = (connected, words)
             self._on_state(connected, words)
 
 
@@ -102,7 +102,7 @@ CONNECT_DEADLINE_S: Final = 2.0
 
 
 def words_of(error: OSError) -> str:
-    """The system's own words: asyncio puts "Connect call failed" and an address in their place."""
+    """Return the system's words, which asyncio replaces by "Connect call failed" and an address."""
     return os.strerror(error.errno) if error.errno else str(error)
 
 
@@ -151,7 +151,7 @@ BURST_BYTES: Final = 65536.0
 
 
 class Budget:
-    """A bucket that fills with so many bytes a second, and from which every read takes."""
+    """A bucket of bytes that fills steadily, and that every read empties by its size."""
 
     def __init__(self, bytes_per_s: float = BYTES_PER_S, burst_bytes: float = BURST_BYTES) -> None:
         self._bytes_per_s, self._burst_bytes = bytes_per_s, burst_bytes
@@ -163,7 +163,7 @@ class Budget:
         return min(self._left + gained, self._burst_bytes)
 
     def spend(self, count: int, now_s: float) -> bool:
-        """Take so many; False when there were not so many, which leaves a bucket that is empty and no more."""
+        """Remove `count`; False where the bucket held less: it is empty then."""
         self._left, self._t_s = self.left(now_s) - count, now_s
         if self._left >= 0.0:
             return True

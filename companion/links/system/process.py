@@ -148,7 +148,6 @@ class ServiceManager:
             self._socket = None
 
     def notify(self, line: str) -> bool:
-        """Send a line such as READY=1, WATCHDOG=1 or STOPPING=1; return whether it was sent."""
         if self._socket is None:
             return False
         # A name that begins with "@" is in no folder, and begins with a zero to the kernel.

@@ -28,7 +28,7 @@ ECHO: Final = "echo of a command"  # a command of ours, or of another master, on
 
 
 class RejectedError(Exception):
-    """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Never leaves this room."""
+    """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Never leaves the decoders."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -38,16 +38,15 @@ class RejectedError(Exception):
 class Decoder(ABC):
     """Finds frames in the bytes of one device; a subclass checks and reads each.
 
-    `seconds_per_byte`: line time of one byte, 0 where unknown (sockets, USB).
+    `seconds_per_byte` is the line time of one byte, 0 where unknown (sockets, USB). `ImuSample.t_device_s` starts again
+    at 0 after `device_clock_wraps_s`, `ImuSample.sequence` after `sequence_modulus`; None where there is none, or it
+    never wraps.
     """
 
     START: ClassVar[re.Pattern[bytes]]
     device_clock_wraps_s: ClassVar[float | None] = None
-    """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
-    clock_from_start: ClassVar[bool] = False
-    """True: `ImuSample.t_device_s` counts from the device's start, by its documents."""
+    clock_from_start: ClassVar[bool] = False  # `ImuSample.t_device_s` counts from the device's start
     sequence_modulus: ClassVar[int | None] = None
-    """`ImuSample.sequence` counts modulo this; None where there is none, or it never wraps."""
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         self.seconds_per_byte = seconds_per_byte
@@ -65,14 +64,13 @@ class Decoder(ABC):
         """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
-        """Decode bytes read at `t_s` on the host's clock; return their samples, timed and counted."""
         samples = self.feed(data, t_s)
         if self.seconds_per_byte:
             self._check_line(len(data), t_s)
         return self.times.place(samples, t_s, self.frame_bytes * self.seconds_per_byte) if samples else samples
 
     def _check_line(self, received: int, t_s: float) -> None:
-        """Find out whether bytes come faster than the line could carry them: then its line time means nothing."""
+        """Set the line time to 0 once bytes come faster than the line could carry them."""
         if self._read_s is not None:
             self._ahead_s += received * self.seconds_per_byte - (t_s - self._read_s)
             self._ahead_s = max(self._ahead_s, -_STALL_S)
@@ -139,11 +137,9 @@ class Decoder(ABC):
 
     @abstractmethod
     def _size(self, buffer: bytes, at: int) -> int:
-        """Return the length of the frame at `at`, or `NO_FRAME`.
+        """Return the length of the frame at `at`, `NO_FRAME`, or `WAIT`.
 
-        Raises:
-            IndexError: more bytes are needed to tell.
-            RejectedError: what begins there is to be counted as rejected; only its first byte is passed over.
+        Raise IndexError to wait too, RejectedError to count it and to pass over its first byte only.
         """
 
     def _check(self, frame: bytes) -> None:  # noqa: B027 - lines and sentences are checked as they are read
@@ -151,7 +147,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
-        """Read a whole frame; raise RejectedError where it gives no sample and is to be counted so."""
+        """Read a whole frame; raise RejectedError to count it as giving no sample."""
 
     def _time_of(self, end: int) -> float:
         chunks = self._chunks
@@ -162,7 +158,6 @@ class Decoder(ABC):
 
 
 def xor_checksum(body: bytes) -> int:
-    """The checksum of NMEA 0183 and of its imitators: all bytes between "$" and "*" exclusive-ored."""
     return functools.reduce(operator.xor, body, 0)
 
 
@@ -249,11 +244,7 @@ class LineDecoder(Decoder):
 
     @abstractmethod
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
-        r"""Read one line, without its "\n"; None where it is whole and right but (yet) gives no sample.
-
-        Raises:
-            RejectedError: the line is to be counted as rejected.
-        """
+        r"""Read one line, without its "\n"; None: right, but no sample (yet). Raise RejectedError to count it."""
 
 
 class SentenceDecoder(Decoder):

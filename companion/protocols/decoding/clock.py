@@ -20,12 +20,12 @@ CREEP: Final = 100e-6
 """Rate at which the minimum may rise: two crystals of 50 ppm. A ceramic resonator is followed in steps of `STEP_S`."""
 
 STEP_S: Final = 0.005
-"""If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
+"""When all samples of a `SPAN_S` came later than this, the offset itself has changed."""
 SPAN_S: Final = 1.0
 SPAN_SAMPLES: Final = 20  # the fewest samples in a span: of a few all may have had to wait for the adapter
 
 LATE_S: Final = 1.0
-"""A sample that seems later than this is dropped: as old as that nobody waits for it, or its clock is wrong."""
+"""A sample that seems later than this is dropped: too old to be of use, or its clock is wrong."""
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
@@ -60,10 +60,10 @@ class DeviceClock:
         self._offset_s = math.nan
 
     def host_s(self, raw_s: float, arrival_s: float) -> float | None:
-        """Return the host's time of a finite device time, at most `arrival_s`; None where that cannot be told.
+        """Return the host's time of a finite device time, at most `arrival_s`; None for a sample that is too late.
 
-        None lasts as long as samples come `LATE_S` or more after their time: at most `SPAN_S` when it is the clock
-        that has changed, and while there is a backlog otherwise.
+        That lasts while samples come `LATE_S` or more after their time: at most `SPAN_S` when the clock has changed,
+        else until a backlog is read.
         """
         if math.isnan(self._offset_s):
             return self._start(raw_s, arrival_s)
@@ -109,7 +109,7 @@ class DeviceClock:
 
 
 class SampleTimes:
-    """Gives the samples of one device their times, and unwraps its counter, which counts modulo `sequence_modulus`."""
+    """Gives the samples of one device their times, and unwraps its counter."""
 
     def __init__(self, clock_wraps_s: float | None = None, sequence_modulus: int | None = None) -> None:
         self.clock = DeviceClock(clock_wraps_s)
@@ -148,14 +148,14 @@ class SampleTimes:
         return placed
 
     def _in_order(self, t_s: float, read_s: float) -> float:
-        """A device does not sample backwards; what seems so is the line time of bytes that came faster than that."""
+        """Keep times ascending: bytes that came faster than their line time would go back."""
         if t_s < self._newest_s <= read_s:
             return self._newest_s
         self._newest_s = t_s
         return t_s
 
     def _counted(self, raw: int, *, anew: bool) -> int:
-        """The counter, unwrapped; one that went back counts on by one, so that nothing seems lost."""
+        """Unwrap the counter; one that went back counts on by one, so that nothing seems lost."""
         last, self._raw_sequence = self._raw_sequence, raw
         if last is None:
             self._sequence = raw

@@ -22,11 +22,11 @@ class Dialogue(ABC):
 
     @abstractmethod
     def opened(self, t_s: float) -> None:
-        """The port was opened (again) at `t_s`: nothing is known of the device."""
+        """Begin anew: the port was opened (again)."""
 
     @abstractmethod
     def heard(self, data: bytes, samples: int, t_s: float) -> None:
-        """Bytes came, and completed so many samples; called after they were decoded."""
+        """Note bytes and the number of samples that they completed; called after decoding."""
 
     @abstractmethod
     def due(self, t_s: float) -> bytes:

@@ -204,7 +204,6 @@ class Stim300Decoder(Decoder):
         return ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, counter)
 
     def _judge_range(self, rate_deg_s: float, magnitude: float, counter: int) -> None:
-        """Take one reading as evidence of the range, from its magnitude in counts."""
         at_rest = next((bits for bits in _BITS if 0.9 < magnitude / (1 << bits) < 1.1), 0)
         if not at_rest or rate_deg_s > REST_DEG_S or at_rest != self._rest_bits:
             self._rest_bits, self._rest_ticks = at_rest, 0

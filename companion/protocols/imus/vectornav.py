@@ -60,11 +60,7 @@ _SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
 
 @functools.lru_cache(maxsize=16)
 def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
-    """Parse the masks of a header: the frame before its CRC, and the places of what is used among its values.
-
-    Raises:
-        RejectedError: a field is unknown, or a group has none.
-    """
+    """Return the layout of a frame before its CRC, and the places of the used values; raise RejectedError."""
     places: dict[str, int] = {}
     code, count = f"<{len(header)}x", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
