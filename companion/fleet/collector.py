@@ -25,7 +25,7 @@ from companion.config.sections import Mqtt
 from companion.errors import CompanionError, ConfigError, LinkError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
 from companion.fleet.store import BatchResult, Store
-from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.connection import Reconnection
 from companion.mqtt.broker import explain, is_of_protocol, read_password, tls_context
 from companion.mqtt.client import FIRST_WAIT_S, LONGEST_WAIT_S, MQTT_3_1_1, MQTT_5, WORTH_S, Incoming, make_client
 
@@ -133,7 +133,7 @@ class Collector:
         self.settings, self.store = settings, store
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
         self._protocol: int = MQTT_5
-        self._reconnection = Reconnection("fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
+        self._reconnection = Reconnection("fleet", worth_s=WORTH_S, first_s=FIRST_WAIT_S, cap_s=LONGEST_WAIT_S)
 
     @property
     def where(self) -> str:

@@ -26,7 +26,7 @@ from companion.config.rules import bind_problem
 from companion.errors import ConfigError
 from companion.fleet import page
 from companion.fleet.schema import engine_of, why
-from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.connection import Reconnection
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address
 from companion.web.listener import listening
@@ -82,7 +82,7 @@ class Server:
         self._app = Starlette(
             routes=[Route("/{path:path}", self._page)], middleware=[Middleware(_Door, password=password)]
         )
-        self._reconnection = Reconnection("page", Backoff(first_s=1.0, cap_s=30.0), worth_s=10.0)
+        self._reconnection = Reconnection("page", worth_s=10.0, first_s=1.0, cap_s=30.0)
 
     @property
     def url(self) -> str:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from companion.config.sections import Mqtt
-from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.connection import Reconnection
 from companion.links.system.events import comes
 from companion.mqtt.broker import causes, explain, is_of_protocol, is_open_to_all, read_password, tls_context
 
@@ -194,7 +194,7 @@ class MqttLink:
         self.connections = 0
         self._will, self._subscriptions, self._on_message = will, list(subscriptions), on_message
         self._spoken_to: aiomqtt.Client | None = None
-        self._reconnection = Reconnection("mqtt", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
+        self._reconnection = Reconnection("mqtt", worth_s=WORTH_S, first_s=FIRST_WAIT_S, cap_s=LONGEST_WAIT_S)
         self._protocol: int = MQTT_5
         self._connected_s: float | None = None
         self._since = datetime.datetime.now(tz=datetime.UTC)

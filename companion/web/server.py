@@ -26,7 +26,7 @@ from companion import __version__
 from companion.commands import Interface, asked_by
 from companion.errors import CompanionError, StorageError
 from companion.formats import Object, parse_request
-from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.connection import Reconnection
 from companion.summary import rows
 from companion.web.access import TOKEN_HEADER, Access, is_loopback, kept_token, new_token, page_url, split_address
 from companion.web.listener import MAX_BODY_BYTES, Connection, listening
@@ -74,9 +74,7 @@ class Page:
         """The oldest first."""
         self._looked_at = asyncio.Event()
         self._delayed = self._wrong_tokens = 0
-        self._reconnection = Reconnection(
-            "page", Backoff(first_s=1.0, cap_s=30.0), worth_s=WORTH_S, on_state=self._on_state
-        )
+        self._reconnection = Reconnection("page", worth_s=WORTH_S, first_s=1.0, cap_s=30.0, on_state=self._on_state)
         self.app = Starlette(
             routes=[
                 Route("/", self._page),

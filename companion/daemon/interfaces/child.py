@@ -18,7 +18,7 @@ import msgspec
 
 from companion.errors import LinkError
 from companion.formats import Object
-from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.connection import Reconnection
 from companion.links.system.process import OUT_OF_MEMORY, REPORT_EVERY_S, ChildSettings
 
 logger = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class Child:
     def __init__(self, name: str, module: str, settings: ChildSettings) -> None:
         self._name, self._module, self._settings = name, module, settings
         self._report: Object | None = None
-        self._restart = Reconnection(name, Backoff(first_s=0.5, cap_s=4.0), worth_s=WORTH_S)
+        self._restart = Reconnection(name, worth_s=WORTH_S, first_s=0.5, cap_s=4.0)
         self.process_id: int | None = None
 
     def status(self) -> Object:

@@ -14,7 +14,7 @@ from typing import Any
 from companion.errors import LinkError
 from companion.links.mavlink.link import MavlinkLink, Sender
 from companion.links.serial.bytestream import ByteLink, PortSettings
-from companion.links.system.connection import Backoff, OnState, Reconnection
+from companion.links.system.connection import OnState, Reconnection
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
@@ -63,7 +63,7 @@ def parse_url(url: str) -> tuple[str, str, int]:
 async def _run_udp(
     link: MavlinkLink, url: str, address: tuple[str, int], *, listen: bool, on_state: OnState | None
 ) -> None:
-    reconnection = Reconnection("mavlink", Backoff(), worth_s=_TURN_S, on_state=on_state)
+    reconnection = Reconnection("mavlink", worth_s=_TURN_S, on_state=on_state)
 
     def factory() -> _Udp:
         return _Listener(link) if listen else _Speaker(link)

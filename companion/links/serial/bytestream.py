@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from companion.config.sections import Parity
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
-from companion.links.system.connection import Backoff, Budget, OnState, Reconnection, connect_tcp, words_of
+from companion.links.system.connection import Budget, OnState, Reconnection, connect_tcp, words_of
 
 READ_BYTES = 4096  # size of a tty's buffer: one read empties the port, so one time stamp holds for it all
 QUICK_READS = 20
@@ -91,7 +91,7 @@ class ByteLink:
         self.reconnects = 0
         self.turns = 0
         self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
-        self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
+        self._reconnection = Reconnection(name, worth_s=WORTH_S, cap_s=LONGEST_PAUSE_S, on_state=on_state)
         self._descriptor: int | None = None
         self._reads = 0  # reads that brought bytes since `_reads_since`, a time and the bytes received by then
         self._reads_since = (0.0, 0)
@@ -129,7 +129,7 @@ class ByteLink:
             self._turn()
             await asyncio.wait([lost], timeout=BEAT_S)
         if self.bytes_received > before:
-            self._reconnection.backoff.reset()
+            self._reconnection.reset()
         return lost.result()
 
     def write(self, data: bytes) -> bool:

@@ -29,33 +29,21 @@ logger = logging.getLogger(__name__)
 OnState = Callable[[bool, str], object]
 
 
-class Backoff:
-    """Delays 0.2, 0.4, 0.8 ... s up to a cap; `reset` after a useful attempt. No jitter: there is no herd."""
-
-    def __init__(self, first_s: float = 0.2, cap_s: float = 2.0) -> None:
-        self._first_s, self._cap_s = first_s, cap_s
-        self._next_s = first_s
-
-    def next_s(self) -> float:
-        delay_s = self._next_s
-        self._next_s = min(delay_s * 2.0, self._cap_s)
-        return delay_s
-
-    def reset(self) -> None:
-        self._next_s = self._first_s
-
-
 class Reconnection:
-    """One connection that is opened again and again; a loss is warned of once, until it is back.
+    """One connection that is opened again after every loss; a loss is warned of once, until it is back.
 
-    A connection that lasted `worth_s` resets the pauses.
+    The pauses double from `first_s` to `cap_s`; a connection that lasted `worth_s`, or `reset`, begins again at the
+    first. No jitter: there is no herd.
     """
 
-    def __init__(self, name: str, backoff: Backoff, *, worth_s: float, on_state: OnState | None = None) -> None:
-        self.backoff = backoff
+    def __init__(
+        self, name: str, *, worth_s: float, first_s: float = 0.2, cap_s: float = 2.0, on_state: OnState | None = None
+    ) -> None:
         self.last_error = ""
         self.retry_s: float | None = None
         self._name, self._worth_s, self._on_state = name, worth_s, on_state
+        self._first_s, self._cap_s = first_s, cap_s
+        self._pause_s = first_s
         self._warned = False
         self._up_s = math.inf
         self._notified: tuple[bool, str] | None = None
@@ -70,12 +58,15 @@ class Reconnection:
             except LinkError as error:
                 reason = str(error)
             if loop.time() - self._up_s >= self._worth_s:
-                self.backoff.reset()
+                self.reset()
             self.down(reason)
-            delay_s = self.backoff.next_s()
+            delay_s, self._pause_s = self._pause_s, min(self._pause_s * 2.0, self._cap_s)
             self.retry_s = loop.time() + delay_s
             await asyncio.sleep(delay_s)
             self.retry_s = None
+
+    def reset(self) -> None:
+        self._pause_s = self._first_s
 
     def up(self, words: str) -> None:
         logger.info("%s: %s%s", self._name, words, " again" if self._warned else "")
