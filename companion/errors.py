@@ -15,7 +15,7 @@ class ConfigError(CompanionError):
 
 
 class LinkError(CompanionError):
-    """A port, socket or stream could not be opened or was lost."""
+    pass
 
 
 class DaemonUnreachableError(CompanionError):
@@ -31,7 +31,7 @@ class NobodyHeardError(CompanionError):
 
 
 class StorageError(CompanionError):
-    """A record could not be written or read."""
+    pass
 
 
 class CalibrationRefusedError(CompanionError):
@@ -47,7 +47,7 @@ class RequestRefusedError(CalibrationRefusedError):
 
 
 class AutopilotError(CompanionError):
-    """The autopilot did not do what was asked."""
+    pass
 
 
 class NotDisarmedError(AutopilotError):
@@ -55,7 +55,7 @@ class NotDisarmedError(AutopilotError):
 
 
 class ParameterTimeoutError(AutopilotError):
-    """The autopilot did not answer a parameter request within all retries."""
+    pass
 
 
 class ParameterRefusedError(AutopilotError):
@@ -63,8 +63,8 @@ class ParameterRefusedError(AutopilotError):
 
 
 class ParameterMismatchError(ParameterRefusedError):
-    """The autopilot answered a write with another value than was set."""
+    pass
 
 
 class AutopilotRebootedError(AutopilotError):
-    """The autopilot restarted in the middle of an exchange."""
+    pass

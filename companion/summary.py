@@ -44,7 +44,6 @@ def _row(good: bool, name: str, words: str) -> StatusRow:  # noqa: FBT001 - the 
 
 
 def _counts(device: Object) -> str:
-    """Say what has happened to a device's samples so far; empty while all is well."""
     words = {
         "bad frames": sum((device.get("rejected") or {}).values()),
         "lost": device.get("lost"),

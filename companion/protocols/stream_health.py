@@ -46,8 +46,6 @@ _MOST_DAMAGE_NAMED: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """A fault: a key to count it under, and one line for people."""
-
     key: str
     words: str
     implausible: bool = False
@@ -78,7 +76,6 @@ class StreamHealth:
         self._marks.clear()
 
     def took(self, data: bytes, samples: Sequence[Sample], t_s: float) -> None:
-        """Note bytes that were read at `t_s`, and the samples that they completed."""
         self.last_byte_s = t_s
         if not samples:
             self._tail = (self._tail + data)[-TAIL_BYTES:]

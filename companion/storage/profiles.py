@@ -58,7 +58,6 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check_name(name: str) -> None:
-    """Raise StorageError where a profile may not be saved under this name: the catalogue's, or no name for a file."""
     if _plain(name) in CATALOGUE:
         raise StorageError(f"profile {name!r}: that name is the catalogue's; allowed: another one")
     if not _NAME.fullmatch(name):

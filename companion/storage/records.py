@@ -44,7 +44,6 @@ class NumberedFiles(Generic[T]):
         self.folder = directory / self.name
 
     def numbers(self) -> list[int]:
-        """List the numbers of all files, unreadable ones too, ascending."""
         return numbers_in(self.folder, _NAME)
 
     def file(self, number: int) -> StateFile[T]:
@@ -202,7 +201,6 @@ class SigningTime(msgspec.Struct, frozen=True):
 
 
 def this_boot() -> str:
-    """Return the boot id of the running kernel; empty where it is unknown."""
     # The service's unit hides the file, and hands the id over instead.
     handed = os.environ.get("COMPANION_BOOT_ID", "")
     if handed:

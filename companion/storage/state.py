@@ -62,7 +62,6 @@ def remove_durably(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Write the entries of a folder to the disk; raises OSError."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -120,7 +119,6 @@ def _require_regular(found: os.stat_result) -> None:
 
 
 def sealed(data: bytes) -> bytes:
-    """Append the checksum to a JSON object as its last key, and a new line."""
     body = data.rstrip()[:-1].rstrip()
     gap, end = (b"\n  ", b"\n") if b"\n" in body else (b"", b"")
     return body + b"," + gap + b'"sha256":"' + hashlib.sha256(body).hexdigest().encode() + b'"' + end + b"}\n"

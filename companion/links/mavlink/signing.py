@@ -115,7 +115,6 @@ class SigningClock:
         return max(0, self.now() - wall) / TICKS_PER_S if wall else 0.0
 
     def heard(self, ticks: int) -> None:
-        """Adopt the time of a sender that has the key and is ahead."""
         if ticks > self.now():
             self._base, self._base_s, self._is_set = ticks, self._uptime_s(), True
 

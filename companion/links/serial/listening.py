@@ -58,8 +58,6 @@ async def listen_to_all(
     first: Callable[[str], Sequence[Line]] = lambda _: (),
     tell: Callable[[str, Heard | str], None] | None = None,
 ) -> dict[str, Heard | str]:
-    """Listen to all ports at once; return who speaks, or why that is not known, and `tell` each at once."""
-
     async def one(port: str) -> Heard | str:
         found: Heard | str
         try:

@@ -93,7 +93,7 @@ CONNECT_DEADLINE_S: Final = 2.0
 
 
 def words_of(error: OSError) -> str:
-    """Return the system's words, which asyncio replaces by "Connect call failed" and an address."""
+    # Not asyncio's text, which is "Connect call failed" and an address.
     return os.strerror(error.errno) if error.errno else str(error)
 
 

@@ -69,7 +69,6 @@ class MipDecoder(Decoder):
 
 
 def fletcher(data: bytes) -> bytes:
-    """The two bytes at the end of a packet: the sum of all before, and the sum of all the running sums."""
     sums = list(accumulate(data))
     return bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
 
