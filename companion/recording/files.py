@@ -12,7 +12,7 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -45,11 +45,7 @@ class Beginning:
     states: Sequence[Message]  # states in force at `t_s`
 
 
-Opener = Callable[[Path], IO[bytes]]
-FreeBytes = Callable[[Path], int]
-
-
-def _free_bytes(folder: Path) -> int:
+def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
@@ -76,15 +72,14 @@ def is_available() -> bool:
 
 
 class RecordingFile:
-    def __init__(self, path: Path, opener: Opener = open_new, free_bytes: FreeBytes = _free_bytes) -> None:
+    def __init__(self, path: Path) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
 
         self.path = path
         self.messages = 0
-        self._free_bytes = free_bytes
         self._file: IO[bytes] | None = None
         try:
-            self._file = opener(path)
+            self._file = open_new(path)
         except FileExistsError:
             raise StorageError(f"{path}: exists already; nothing is overwritten") from None
         except FileNotFoundError:
@@ -110,7 +105,7 @@ class RecordingFile:
         if self._file is None:
             return
         try:
-            if self._free_bytes(self.path.parent) < RESERVE_BYTES:
+            if free_bytes(self.path.parent) < RESERVE_BYTES:
                 raise OSError(errno.ENOSPC, f"less than {RESERVE_BYTES >> 20} MB free on the disk")
             if self._begun is None:
                 self._begin(beginning, Start(continues=continues))
@@ -196,12 +191,9 @@ def create_on_request(path: Path) -> RecordingFile:
 class Ring:
     """Files of limited size in all, numbered, as the wall clock may be wrong in the field; the oldest go first."""
 
-    def __init__(
-        self, folder: Path, most_bytes: int, opener: Opener = open_new, free_bytes: FreeBytes = _free_bytes
-    ) -> None:
+    def __init__(self, folder: Path, most_bytes: int) -> None:
         self.folder, self.most_bytes = folder, most_bytes
         self.bytes_in_all = 0
-        self._opener, self._free_bytes = opener, free_bytes
         self._current: RecordingFile | None = None
         self._continues = False  # True: the next file begins where the one before ended
 
@@ -242,9 +234,7 @@ class Ring:
         self.folder.mkdir(FOLDER_MODE, exist_ok=True)
         self._make_room()
         numbers = [number for number, _, _ in self._files()]
-        self._current = RecordingFile(
-            self.folder / f"{max(numbers, default=0) + 1:06d}.mcap", self._opener, self._free_bytes
-        )
+        self._current = RecordingFile(self.folder / f"{max(numbers, default=0) + 1:06d}.mcap")
 
     def _files(self) -> list[tuple[int, Path, int]]:
         found = []
@@ -262,7 +252,7 @@ class Ring:
         # A file that is yet to be written needs its share too.
         limit = self.most_bytes - (self.most_bytes // PARTS if present is None else 0)
         for _, path, size in files:
-            if (in_all <= limit and self._free_bytes(self.folder) >= RESERVE_BYTES) or path == present:
+            if (in_all <= limit and free_bytes(self.folder) >= RESERVE_BYTES) or path == present:
                 break
             path.unlink(missing_ok=True)
             in_all -= size

@@ -75,7 +75,7 @@ def _digest(key: bytes, packet: bytes | bytearray) -> bytes:
 
 
 class SigningClock:
-    """Time for signatures: never the same twice, never back, whatever the system's clock does.
+    """Time for signatures, in ticks: never the same twice, never back, whatever the system's clock does.
 
     The system's clock sets it once a boot. A later jump of that clock by more than a minute is refused: one wrong
     clock would stay in the stored time and in every receiver, and true senders would look old for good. A board

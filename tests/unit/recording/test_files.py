@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from companion.errors import StorageError
 from companion.estimation.solution.site import Whereabouts
 from companion.lab.logs.recording import Head, Recording
-from companion.recording import messages
+from companion.recording import files, messages
 from companion.recording.files import RESERVE_BYTES, Beginning, RecordingFile, Ring
 from companion.recording.messages import PLACE, START, Message, Tape, decode, encode
 
@@ -107,21 +107,23 @@ def full(path: Path) -> IO[bytes]:
     return Path("/dev/full").open("wb")
 
 
-def test_a_full_disk_is_one_line_and_what_was_written_is_a_recording(tmp_path: Path) -> None:
-    file = RecordingFile(tmp_path / "a.mcap", full)
+def test_a_full_disk_is_one_line_and_what_was_written_is_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "open_new", full)
+    file = RecordingFile(tmp_path / "a.mcap")
     with pytest.raises(StorageError, match=r"a\.mcap: cannot be written: No space left on device"):
         file.write(raw(100, 1000), beginning())
     file.write(raw(1, 10), beginning())  # nothing more happens
     file.close()
 
 
-def test_the_disk_is_never_filled_to_the_brim_and_the_ring_gives_way_first(tmp_path: Path) -> None:
+def test_the_disk_is_never_filled_to_the_brim_and_the_ring_gives_way_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     free = 10 * RESERVE_BYTES
-
-    def left(folder: Path) -> int:
-        return free
-
-    ring = Ring(tmp_path, 8 * MB, free_bytes=left)
+    monkeypatch.setattr(files, "free_bytes", lambda folder: free)
+    ring = Ring(tmp_path, 8 * MB)
     for second in range(8):
         ring.write(raw(10, 5000, second), beginning())
         ring.close()
