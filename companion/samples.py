@@ -1,8 +1,8 @@
 """The words for what sensors say: one frozen structure a kind, units in the field names.
 
-`t_s` is the host's monotonic clock (the event loop's `time()`), in seconds, at which the quantity was sampled as
-well as the protocol can tell: by the device's own clock where it has one, else the time of the read minus the line time
-of the frame and of the bytes that came after it (`protocols.clock`).
+`t_s` is when the quantity was sampled, by the host's monotonic clock (the event loop's `time()`), in seconds. It comes
+from the device's own clock. Without one it is the time of the read, less the line time of the frame and of the bytes
+after it (`protocols.decoding.clock`).
 Vectors are in the sensor's own axes until a `mounting` has turned them into the vehicle's FRD.
 """
 

@@ -2,8 +2,8 @@
 
 Specification: mavlink.io, Message Signing. A signature is 13 bytes behind the checksum: link id, 48 bits of time in
 units of 10 us since 2015, and the first 48 bits of SHA-256 over key, packet, link id and time. Verification is not
-pymavlink's: pymavlink 2.4.50 adopts the time of a packet before it checks the signature (one forged packet from the
-far future would shut the true sender out), keeps a place for every claimed sender, and logs each.
+pymavlink's: pymavlink 2.4.50 adopts the time of a packet before it checks the signature, so one forged packet from the
+far future would shut the true sender out. It also keeps a place for every claimed sender, and logs each.
 
 A key file holds 32 raw bytes, 64 hexadecimal digits, or a passphrase. The key of a passphrase is SHA-256 of its UTF-8,
 as in MAVProxy 1.8.75 (`passphrase_to_key`), Mission Planner (`MAVAuthKeys.AddKey`) and QGroundControl until early 2026
