@@ -38,6 +38,8 @@ class Item(NamedTuple):
 
 
 class Mark(NamedTuple):
+    """State up to which a source has been read."""
+
     stamp: str  # stamp of the source's file, to notice a change quickly
     value: str
 

@@ -159,7 +159,7 @@ KEEP_IMUS: Final = 8
 
 class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
     identity: dict[str, str]
-    points: tuple[history.Point, ...] = ()
+    points: tuple[history.Point, ...] = ()  # oldest first
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True):

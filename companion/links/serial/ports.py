@@ -197,7 +197,7 @@ _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 class PortFault:
     words: str
     remedy: str
-    good: bool = False
+    good: bool = False  # True: a warning
 
     def __str__(self) -> str:
         return f"{self.words}: {self.remedy}"
