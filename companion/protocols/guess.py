@@ -32,7 +32,6 @@ class Line(NamedTuple):
     parity: Parity
 
     def __str__(self) -> str:
-        """Format it as people write it: 9600 8E1."""
         return f"{self.baud} 8{self.parity[0].upper()}1"
 
 

@@ -60,7 +60,6 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
 
 
 def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
-    """List the processes that have a port open; `device` may be a link."""
     return tuple(_holders_by_device(root).get(resolve(root, device), ()))
 
 

@@ -72,8 +72,6 @@ class OneLineFormatter(logging.Formatter):
 
 
 class JournalFormatter(OneLineFormatter):
-    """Lines as journald wants them; it stamps the time itself."""
-
     def format(self, record: logging.LogRecord) -> str:
         prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
         return "\n".join(prefix + line for line in super().format(record).splitlines() or [""])
@@ -116,7 +114,6 @@ class ServiceManager:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ, process_id: int | None = None) -> Self:
-        """Make the one that NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID name; log a wrong one."""
         address = environment.get("NOTIFY_SOCKET") or None
         if address is not None and address[0] not in "/@":
             logger.warning("NOTIFY_SOCKET: found %r; allowed: a path or @NAME; nobody is told", address)
