@@ -242,7 +242,7 @@ async def _collected(scene: Scene) -> AsyncIterator[None]:
 def _small_disk(size_mb: int) -> Iterator[Path | None]:
     """Mount a file system of that size, to be filled; None: this user may not mount one."""
     with tempfile.TemporaryDirectory(prefix="companion-small-") as folder:
-        mount = ["mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder]
+        mount = ["mount", "-n", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder]
         if subprocess.run(mount, check=False, capture_output=True).returncode != 0:
             yield None
             return

@@ -13,7 +13,7 @@ import pytest
 
 OWN_MOUNTS: Final = ("unshare", "--mount") if os.geteuid() == 0 else ("unshare", "--map-root-user", "--mount")
 """Start of a command that runs in such a namespace."""
-OWN_SHARED_MEMORY: Final = (*OWN_MOUNTS, "sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh")
+OWN_SHARED_MEMORY: Final = (*OWN_MOUNTS, "sh", "-c", 'mount -n -t tmpfs tmpfs /dev/shm && exec "$@"', "sh")
 """Start of a command that runs with an empty, writable /dev/shm."""
 _AGAIN: Final = "COMPANION_TEST_RUNS_AGAIN"
 """Environment variable of a test that already runs in a namespace."""
@@ -27,7 +27,7 @@ def has_shared_memory() -> bool:
 @functools.cache
 def why_no_mounts() -> str | None:
     """Return why nothing can be mounted in a namespace here, or None."""
-    command = [*OWN_MOUNTS, "mount", "-t", "tmpfs", "tmpfs", "/tmp"]
+    command = [*OWN_MOUNTS, "mount", "-n", "-t", "tmpfs", "tmpfs", "/tmp"]
     tried = subprocess.run(command, capture_output=True, text=True, check=False)
     return f"no namespaces for a mount: {tried.stderr.strip()}" if tried.returncode else None
 

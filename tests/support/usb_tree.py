@@ -18,12 +18,12 @@ SOC: Final = "sys/devices/platform/soc"
 # In a mount namespace of its own: the tree as /sys, the rules, and a /dev in which links may be made.
 _TEST: Final = """
 set -e
-mount --make-rprivate /
-mount -t tmpfs tmpfs /run
+mount -n --make-rprivate /
+mount -n -t tmpfs tmpfs /run
 mkdir -p /run/udev/rules.d
 cp "$2"/* /run/udev/rules.d/
-mount --bind "$1/sys" /sys
-mount -t tmpfs tmpfs /dev
+mount -n --bind "$1/sys" /sys
+mount -n -t tmpfs tmpfs /dev
 SYSTEMD_DEVICE_VERIFY_SYSFS=0 exec "$3" test --action=add "$4" 2>&1
 """
 
