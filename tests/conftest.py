@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 import inspect
 import json
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable, Generator
@@ -52,10 +50,6 @@ LIMIT_AGAIN_S: Final = 60.0
 """Interval at which a test beyond its limit is interrupted again: an exception may end in a task that nobody awaits."""
 OUTSIDE: Final = pytest.StashKey[Outside]()
 QUICK_ROOMS: Final = ("unit", "property")
-WAITS: Final = re.compile(
-    r"\basyncio\.run\(|\bsubprocess\.|\bcreate_subprocess|\blive_aircraft\(|\btime\.sleep\(|\bopenpty\(|\bPtyDevice\("
-)
-"""What makes a test one of the real clock: a loop on it, a process, or a line of the operating system."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -63,96 +57,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--write-durations", action="store_true", help=f"note in {DURATIONS.name} how long tests took")
 
 
-@functools.cache
-def _blocks(module: str) -> dict[str, str]:
-    """The text of each function and class at the top of a module of the tests."""
-    text = Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8")
-    parts = re.split(r"^(?:async )?(?:def|class) (\w+)", text, flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
-
-
-@functools.cache
-def _block_waits(module: str, name: str) -> bool:
-    return WAITS.search(_blocks(module).get(name, "")) is not None
-
-
-@functools.cache
-def _reached(module: str, name: str) -> frozenset[tuple[str, str]]:
-    """What of the tests a function or class of the tests names."""
-    known, reached = vars(sys.modules[module]), set()
-    for word in set(re.findall(r"[A-Za-z_]\w+", _blocks(module).get(name, ""))) & known.keys():
-        home = getattr(known[word], "__module__", None) or ""
-        if home.startswith("tests.") and (found := getattr(known[word], "__name__", "")) in _blocks(home):
-            reached.add((home, found))
-    return frozenset(reached)
-
-
-@functools.cache
-def waits(function: Callable[..., Any]) -> bool:
-    """Whether a function of the tests, or whatever of the tests it reaches, waits for the real clock."""
-    seen, ahead = set(), [(function.__module__, function.__name__)]
-    while ahead:
-        if (here := ahead.pop()) in seen:
-            continue
-        seen.add(here)
-        if _block_waits(*here):
-            return True
-        ahead += _reached(*here)
-    return False
-
-
-@functools.cache
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
-
-
-@functools.cache
-def _names_wait(path: Path) -> bool:
-    return "real_clock" in _text(path) or WAITS.search(_text(path)) is not None
-
-
-@functools.cache
-def _imports(path: Path) -> frozenset[Path]:
-    """Modules of the tests that one of them imports."""
-    found = set()
-    for home, names in re.findall(r"^\s*from (tests[\w.]*) import (\([^)]*\)|.*)", _text(path), flags=re.MULTILINE):
-        module = TESTS.parent.joinpath(*home.split("."))
-        found |= {module.with_suffix(".py"), *(module / f"{name}.py" for name in re.findall(r"\w+", names))}
-    return frozenset(each for each in found if each.exists())
-
-
-@functools.cache
-def may_wait(path: Path) -> bool:
-    """Whether a file, or whatever of the tests it imports, has anything to do with the real clock; it is not run."""
-    seen, ahead = set(), [path]
-    while ahead:
-        if (here := ahead.pop()) in seen:
-            continue
-        seen.add(here)
-        if _names_wait(here):
-            return True
-        ahead += _imports(here)
-    return False
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Skip files without any test of the real clock, where only those are wanted: every worker imports all others."""
+    """Leave out files without a test of the real clock where only those are wanted: importing them takes seconds."""
     wanted = config.getoption("markexpr")
     if not wanted.startswith("real_clock") or not collection_path.name.startswith("test_"):
         return None
-    if "not sitl" in wanted and "\npytestmark = pytest.mark.sitl\n" in _text(collection_path):
+    text = collection_path.read_text(encoding="utf-8")
+    if "not sitl" in wanted and "\npytestmark = pytest.mark.sitl\n" in text:
         return True
-    return None if may_wait(collection_path) else True
-
-
-def _functions(item: pytest.Item) -> list[Callable[..., Any]]:
-    """The test, and the fixtures that it uses."""
-    assert isinstance(item, pytest.Function)
-    test = item.function
-    # Hypothesis wraps what it is given.
-    test = getattr(getattr(test, "hypothesis", None), "inner_test", test)
-    fixtures = [each[-1].func for each in item._fixtureinfo.name2fixturedefs.values()]
-    return [test, *(each for each in fixtures if each.__module__.startswith("tests."))]
+    return None if "real_clock" in text else True
 
 
 def durations() -> dict[str, float]:
@@ -162,10 +75,6 @@ def durations() -> dict[str, float]:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        if item.get_closest_marker("real_clock") is None and any(map(waits, _functions(item))):
-            item.add_marker("real_clock")
-        if item.get_closest_marker("real_clock") is not None and not may_wait(item.path):
-            raise pytest.UsageError(f"{item.nodeid} waits for the real clock, and its file does not show it: import it")
         if LONG or item.get_closest_marker("sitl") is not None:
             item.add_marker(pytest.mark.timeout(LONG_LIMIT_S))
     if LONG:
@@ -209,15 +118,20 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def _no_process(event: str, _arguments: object) -> None:
-    if _began_s and event in ("subprocess.Popen", "os.fork", "os.posix_spawn"):
-        msg = f"{event} in a test of `make quick`: mark it real_clock, or name it in WAITS of tests/conftest.py"
+class _Running:
+    """The test that runs now."""
+
+    on_virtual_time = False
+
+
+def _refuse_process(event: str, _arguments: object) -> None:
+    if _Running.on_virtual_time and event in ("subprocess.Popen", "os.fork", "os.posix_spawn"):
+        msg = f"{event} in a test that is not marked real_clock"
         raise RuntimeError(msg)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("quick"):
-        sys.addaudithook(_no_process)
+    sys.addaudithook(_refuse_process)
     if not hasattr(config, "workerinput"):
         config.stash[OUTSIDE] = Outside()
 
@@ -251,9 +165,12 @@ _began_s: dict[str, float] = {}
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> Generator[None, None, None]:
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     _began_s[item.nodeid] = _processor_s()
-    return (yield)
+    _Running.on_virtual_time = not any(item.get_closest_marker(mark) for mark in ("real_clock", "sitl"))
+    done = yield
+    _Running.on_virtual_time = False
+    return done
 
 
 @pytest.hookimpl(wrapper=True)

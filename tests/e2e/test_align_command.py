@@ -8,7 +8,11 @@ import signal
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.e2e.test_commands import DONE, FAILED, companion, flight_line
+
+pytestmark = pytest.mark.real_clock
 
 
 async def begun(config: str, *more: str) -> asyncio.subprocess.Process:

@@ -8,11 +8,15 @@ import os
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import pytest
+
 from companion.config import parse
 from companion.daemon.process.check import CheckLine, run_check
 from sim.pty_device import Setting
 from tests.e2e.test_commands import companion
 from tests.support.chatter import Chatter, compass_frame, tilt_frame
+
+pytestmark = pytest.mark.real_clock
 
 CONFIG = """
 [mavlink]

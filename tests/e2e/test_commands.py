@@ -24,6 +24,8 @@ from sim.scenario import Scenario, demo
 from sim.serve import configuration
 from sim.station import open_udp
 
+pytestmark = pytest.mark.real_clock
+
 DONE, FAILED, USAGE, NO_DAEMON = 0, 1, 2, 3
 
 

@@ -222,6 +222,7 @@ def within(found: Any, truth: Any, sigma: Any, times: float = 4.0) -> None:
     assert off.max() < times, f"off by {off} sigma"
 
 
+@pytest.mark.real_clock
 @pytest.mark.parametrize("first", range(0, extent(whole=len(RUNS), a_slice=len(plain_runs())), AT_ONCE))
 def test_families_on_ptys_calibrate_right(tmp_path_factory: pytest.TempPathFactory, first: int) -> None:
     async def main(runs: list[Run]) -> list[Outcome]:

@@ -21,6 +21,8 @@ from tests.support.fleet import check
 from tests.support.mqtt_daemon import until_connected
 from tests.support.rig import Rig
 
+pytestmark = pytest.mark.real_clock
+
 UID = b"virtual 0000".ljust(18, b"\0").hex()
 
 

@@ -69,6 +69,7 @@ async def heard_until(one: aiomqtt.Client, last: str) -> list[tuple[str, str]]:
     return found
 
 
+@pytest.mark.real_clock
 @mosquitto_only
 @pytest.mark.parametrize(("aircraft", "users"), FLEETS)
 def test_each_says_and_hears_what_is_its_own_and_nothing_else(tmp_path: Path, aircraft: list[str], users: str) -> None:

@@ -28,7 +28,10 @@ from tests.support.collecting import (
 )
 from tests.support.postgres import INITDB, Postgres, postgres
 
-pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto: shared subscriptions need one")
+pytestmark = [
+    pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto: shared subscriptions need one"),
+    pytest.mark.real_clock,
+]
 Kind = Literal["sqlite", "postgresql"]
 KINDS: list[Kind] = ["sqlite", "postgresql"]
 

@@ -20,6 +20,8 @@ from sim.fleet.demo import AIRCRAFT
 from tests.support.broker import MOSQUITTO, free_port
 from tests.support.collecting import NOW, basic, get, served
 
+pytestmark = pytest.mark.real_clock
+
 PASSWORD = "Grus grus grus"  # noqa: S105
 
 

@@ -35,6 +35,7 @@ def server() -> Iterator[Postgres]:
         yield one
 
 
+@pytest.mark.real_clock
 @pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
 @pytest.mark.parametrize(("fault", "kind"), extent(whole=ALL, a_slice=SLICE))
 def test_nothing_is_lost_and_nothing_is_there_twice(

@@ -17,6 +17,8 @@ from companion.mqtt.client import Incoming
 from sim.fleet import demo
 from tests.support.postgres import INITDB, postgres
 
+pytestmark = pytest.mark.real_clock
+
 DASHBOARD = json.loads((Path(__file__).parents[2] / "docs/fleet/grafana.json").read_text(encoding="utf-8"))
 PANELS: list[dict[str, Any]] = DASHBOARD["panels"]
 VARIABLES: list[dict[str, Any]] = DASHBOARD["templating"]["list"]

@@ -22,6 +22,8 @@ from tests.support.collecting import NOW, rows_of
 from tests.support.fleet import check
 from tests.support.postgres import INITDB, postgres
 
+pytestmark = pytest.mark.real_clock
+
 DAY = datetime.timedelta(days=1)
 RAD_S = math.pi / 180.0 / 3600.0
 """In a deg/h."""

@@ -17,6 +17,8 @@ import pytest
 from sim.motions import Handling
 from tests.support.ground_line import Said, finish, ground, ground_line
 
+pytestmark = pytest.mark.real_clock
+
 DONE, FAILED, USAGE, NOBODY = 0, 1, 2, 3
 GYRO = "INS_GYROFFS_X"
 

@@ -20,9 +20,12 @@ DOCS = Path(__file__).parents[2] / "docs/ground_stations.md"
 MODULES = "link,cmdlong,param"
 """The default ones that matter here; with them it needs none of the packages that draw maps."""
 
-pytestmark = pytest.mark.skipif(
-    not MAVPROXY.exists(), reason="MAVProxy is not installed: pip install --no-deps MAVProxy (120 MB)"
-)
+pytestmark = [
+    pytest.mark.skipif(
+        not MAVPROXY.exists(), reason="MAVProxy is not installed: pip install --no-deps MAVProxy (120 MB)"
+    ),
+    pytest.mark.real_clock,
+]
 
 
 class MavProxy:

@@ -17,7 +17,11 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.e2e.test_commands import DONE, FlightLine, _end, _until_disarmed, companion, flight_line
+
+pytestmark = pytest.mark.real_clock
 
 COLUMNS, ROWS = 80, 24
 

@@ -18,6 +18,8 @@ from tests.support.mqtt_daemon import (
 )
 from tests.support.rig import Rig
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.fixture(autouse=True)
 def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:

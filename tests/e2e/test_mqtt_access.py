@@ -8,10 +8,13 @@ import subprocess
 from pathlib import Path
 
 import aiomqtt
+import pytest
 
 from tests.support.broker import PASSWORD, USER, Broker
 from tests.support.documents import ROOT
 from tests.support.mqtt_daemon import BASE, alone, mosquitto_only, until_connected
+
+pytestmark = pytest.mark.real_clock
 
 
 def access_list() -> str:

@@ -29,6 +29,8 @@ from tests.support.mqtt_daemon import (
     until_problem,
 )
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.fixture(autouse=True)
 def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,10 @@ from tests.support.browser import DESKTOP, PHONE, Tab, chromium, find
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-pytestmark = pytest.mark.skipif(find() is None, reason="chromium is not installed: apt-get install chromium")
+pytestmark = [
+    pytest.mark.skipif(find() is None, reason="chromium is not installed: apt-get install chromium"),
+    pytest.mark.real_clock,
+]
 
 WORD = "document.querySelector('#word span').textContent"
 SAID = "(document.querySelector('#said').hidden ? '' : document.querySelector('#said').textContent)"

@@ -9,8 +9,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.e2e.test_commands import DONE, FAILED, NO_DAEMON, companion, flight_line, until_status
+
+pytestmark = pytest.mark.real_clock
 
 LONGER_THAN_A_WINDOW_S = 8.0
 

@@ -20,6 +20,8 @@ from companion.links.system.connection import BURST_BYTES, BYTES_PER_S
 from sim.pty_device import Setting
 from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, listening, tilt_frame
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:

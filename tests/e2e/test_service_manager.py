@@ -9,11 +9,15 @@ import signal
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
+import pytest
+
 from sim.ardupilot.parameters import offset_names
 from sim.companion_process import CompanionProcess
 from sim.scenario import Scenario
 from tests.support.live_aircraft import QUICK, live_aircraft
 from tests.support.notify_socket import NotifySocket
+
+pytestmark = pytest.mark.real_clock
 
 WATCHDOG_S = 2.0
 # One task waits for ever; the limits are short so that the test is.

@@ -26,6 +26,8 @@ from sim.station import open_udp
 from tests.support.chatter import Chatter
 from tests.support.terminal import CTRL_C, CTRL_D, Terminal
 
+pytestmark = pytest.mark.real_clock
+
 Firmware = Literal["ardupilot", "px4"]
 LINES = {"gradienter": Setting(9600, "none"), "compass": Setting(19200, "none"), "imu": Setting(115200, "none")}
 

@@ -13,6 +13,8 @@ from tests.support.browser import PHONE, chromium, find
 from tests.support.first_run import answer
 from tests.support.terminal import Terminal
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.mark.skipif(find() is None, reason="chromium is not installed: apt-get install chromium")
 def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ NOBODY = 65534
 WATCHDOG_S = 3
 
 WHY_NOT = why_not()
-pytestmark = pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
+pytestmark = [pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT)), pytest.mark.real_clock]
 
 
 @contextlib.asynccontextmanager

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
 from tests.support.armed_writes import run
+
+pytestmark = pytest.mark.real_clock
 
 
 def test_a_starved_process_writes_nothing_while_armed() -> None:

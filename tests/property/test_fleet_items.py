@@ -99,6 +99,7 @@ while True:
 """
 
 
+@pytest.mark.real_clock
 def test_what_was_said_to_be_kept_is_there_after_a_kill(tmp_path: Path) -> None:
     """By a signal that nobody can catch, in the middle of whatever it does."""
     kept = 0

@@ -25,6 +25,8 @@ from sim.sitl.residuals import SETTLE_S, ground_station, mean_reading
 from sim.sitl.vehicle import SitlVehicle
 from tests.sitl.craft import BINARIES, missing
 
+pytestmark = pytest.mark.real_clock
+
 LEVEL_MG, SCALE_PERCENT, LEVEL_DEG = 0.5, 0.03, 0.08
 """Of a part that nobody knows: one sigma of its stands is 0.4 mg, though it is hundredths in fact."""
 NAMES = {

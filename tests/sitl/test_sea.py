@@ -14,6 +14,8 @@ from sim.sitl.daemon import companion_daemon
 from sim.sitl.residuals import DECK, Row, ground_station, residual
 from tests.sitl.craft import BINARIES, binary_vehicle, missing
 
+pytestmark = pytest.mark.real_clock
+
 WAITS_S = 75.0
 """Ten seconds until the readings come; a wave is a wave after forty of them."""
 CALIBRATED_WITHIN_S = 300.0

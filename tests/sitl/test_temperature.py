@@ -31,6 +31,8 @@ from sim.sitl.residuals import UNITS, ground_station, residual
 from tests.sitl.craft import BINARIES, missing, world
 from tests.support.extent import extent
 
+pytestmark = pytest.mark.real_clock
+
 MIDDLE_DEGC = 35.0
 CURVE = np.array([[30.0, -20.0, 12.0], [0.5, 0.8, -0.6], [0.02, -0.01, 0.03]])
 """deg/h a kelvin, square kelvin, cubic kelvin."""

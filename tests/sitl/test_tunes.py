@@ -15,6 +15,8 @@ from sim.firmware.buzzer import notes_of
 from sim.sitl.px4 import Px4Sitl
 from tests.sitl.craft import Autopilot, Craft, DoubleCraft, SitlCraft
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.mark.parametrize("tune", list(Tune), ids=lambda tune: tune.name)
 def test_a_tune_is_taken_without_a_complaint(autopilot: Autopilot, tune: Tune) -> None:

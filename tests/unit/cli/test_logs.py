@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
+
 from companion.links.system.process import LimitedHandler
 
 
@@ -59,6 +61,7 @@ except OSError:
 """
 
 
+@pytest.mark.real_clock
 def test_the_log_is_written_when_no_descriptor_is_free() -> None:
     """Run in a process of its own: another test may have loaded what is missing here."""
     ended = subprocess.run(

@@ -13,6 +13,8 @@ from companion.links.serial import listening
 from companion.links.serial.ports import SerialPort
 from companion.protocols.guess import Candidate, Line
 
+pytestmark = pytest.mark.real_clock
+
 PORT = SerialPort(
     device="/dev/ttyUSB0",
     stable_name="/dev/serial/by-id/usb-A",

@@ -14,6 +14,8 @@ from companion.daemon.process.service import Service
 from companion.errors import CompanionError
 from tests.support.mqtt_daemon import ALONE
 
+pytestmark = pytest.mark.real_clock
+
 SECONDS = "a number of seconds above 0"
 WRONG = [
     *(

@@ -20,6 +20,8 @@ from companion.formats import Object
 from companion.links.system import connection
 from companion.links.system.connection import ask
 
+pytestmark = pytest.mark.real_clock
+
 
 async def _echo(request: Object) -> AsyncIterator[Object]:
     if request.get("command") == "refuse":

@@ -12,6 +12,8 @@ from companion.daemon.process.check import system_findings
 from companion.links.serial.ports import port_faults, same_ports
 from tests.support.usb_tree import UsbTree
 
+pytestmark = pytest.mark.real_clock
+
 CONFIG = """
 [mavlink]
 url = "{autopilot}"

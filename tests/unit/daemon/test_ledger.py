@@ -15,6 +15,8 @@ from companion.errors import AutopilotError, StorageError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.state import StateFile
 
+pytestmark = pytest.mark.real_clock
+
 NAMES = ("INS_GYROFFS_X", "INS_GYROFFS_Y")
 OLD = ChangeSet(1, (Changed(NAMES[0], before=0.001, after=0.002),))
 WIDER = ChangeSet(1, (*OLD.changes, Changed(NAMES[1], before=0.003, after=None)))

@@ -242,6 +242,7 @@ async def until(condition: Callable[[], bool], within_s: float = 8.0) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.real_clock
 def test_while_another_program_has_the_port_open_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensors, "HELD_AGAIN_S", 0.05)
 

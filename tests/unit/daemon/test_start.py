@@ -20,6 +20,8 @@ from tests.support.first_heartbeat import modules_at_first_heartbeat
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
+pytestmark = pytest.mark.real_clock
+
 NOT_YET = (
     "_ssl", "aiomqtt", "anyio", "companion.mqtt", "companion.web", "h11", "starlette", "uvicorn",
     "companion.daemon.heading.attitude_service",

@@ -147,6 +147,7 @@ def test_the_files_are_found_in_a_checkout_and_in_a_wheel(tmp_path: Path, monkey
 # --- what systemd says to it
 
 
+@pytest.mark.real_clock
 @needs_systemd_analyze
 def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     list(install(target(tmp_path, executable="/bin/true")))
@@ -157,6 +158,7 @@ def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     assert (verified.returncode, verified.stdout, verified.stderr) == (0, "", "")
 
 
+@pytest.mark.real_clock
 @needs_systemd_analyze
 def test_the_exposure_of_the_unit(tmp_path: Path) -> None:
     list(install(target(tmp_path, executable="/bin/true")))

@@ -9,6 +9,8 @@ import pytest
 from companion.installation import install as installing
 from tests.support.usb_tree import UsbTree, needs_udevadm
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.fixture
 def tree(tmp_path: Path) -> UsbTree:

@@ -27,6 +27,8 @@ from companion.links.serial import port as serial_port
 from companion.links.serial.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial.port import SerialOpener, open_serial
 
+pytestmark = pytest.mark.real_clock
+
 NOBODY = 65534
 IS_ROOT = os.geteuid() == 0
 FAST = 4_000_000

@@ -397,6 +397,7 @@ class TestTcp:
         asyncio.run(main())
 
 
+@pytest.mark.real_clock
 @pytest.mark.parametrize(
     "url", ["", "udp:127.0.0.1:1", "udpin:127.0.0.1", "udpin:127.0.0.1:65536", "tcp:host:x", "serial:/dev/ttyX"]
 )

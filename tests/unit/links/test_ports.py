@@ -191,6 +191,7 @@ def test_this_machine_can_be_read() -> None:
         assert port.description
 
 
+@pytest.mark.real_clock
 def test_who_holds_a_port_of_this_machine() -> None:
     master, slave = os.openpty()
     try:

@@ -19,7 +19,10 @@ from companion.lua import ARMING_SCRIPT
 from tests.support.component import ScriptedGate
 
 LUA = shutil.which("lua5.3")
-pytestmark = pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)")
+pytestmark = [
+    pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)"),
+    pytest.mark.real_clock,
+]
 HARNESS = Path(__file__).parents[2] / "support" / "fake_ardupilot.lua"
 SILENT = "Companion silent: arming blocked"
 

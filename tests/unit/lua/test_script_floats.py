@@ -13,7 +13,10 @@ from companion.samples import ImuSample
 from tests.unit.lua.test_arming_script import LUA, SILENT, Script, received, script, sent
 
 __all__ = ["script"]
-pytestmark = pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)")
+pytestmark = [
+    pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)"),
+    pytest.mark.real_clock,
+]
 
 
 def floats(said: str) -> list[mavlink.MAVLink_debug_float_array_message]:

@@ -5,6 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.real_clock
+
 
 def test_the_process_loads_neither_numpy_nor_the_mavlink_dialect_with_a_fleet_either() -> None:
     code = "import sys, companion.mqtt.process, companion.mqtt.fleet; print(*sys.modules)"

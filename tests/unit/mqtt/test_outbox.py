@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
 from companion.mqtt.client import MAX_ANSWERS, Outbox, Parcel
+
+pytestmark = pytest.mark.real_clock
 
 
 async def drain(box: Outbox) -> list[tuple[str, bytes]]:

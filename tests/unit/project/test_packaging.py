@@ -21,6 +21,8 @@ from dockerfile_parse import DockerfileParser
 
 import companion
 
+pytestmark = pytest.mark.real_clock
+
 PROJECT = Path(__file__).resolve().parents[3]
 DEB = PROJECT / "packaging/deb"
 BLUEOS = PROJECT / "packaging/blueos"

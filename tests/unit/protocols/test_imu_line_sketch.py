@@ -13,6 +13,8 @@ import pytest
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.samples import ImuSample
 
+pytestmark = pytest.mark.real_clock
+
 SKETCH = Path(__file__).parents[3] / "docs" / "imu_line" / "imu_line.ino"
 COMPILER = shutil.which("g++") or shutil.which("clang++")
 

@@ -9,9 +9,13 @@ import os
 import termios
 from pathlib import Path
 
+import pytest
+
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import HMR3300, Gradienter
 from sim.pty_device import PtyDevice
+
+pytestmark = pytest.mark.real_clock
 
 
 class Port:

@@ -73,6 +73,7 @@ def test_the_printed_configuration_fits_every_family(tmp_path: Path, imu: str, g
         assert device.aircraft is scenario.aircraft
 
 
+@pytest.mark.real_clock
 def test_serving_everything_makes_the_ports_and_takes_them_away(tmp_path: Path) -> None:
     async def scene() -> None:
         station = Station()
@@ -94,6 +95,7 @@ def test_serving_everything_makes_the_ports_and_takes_them_away(tmp_path: Path) 
     asyncio.run(scene())
 
 
+@pytest.mark.real_clock
 def test_the_command_line_runs_says_how_to_connect_and_ends_cleanly(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sim", "devices", "--dir", str(tmp_path / "ports"), "--pose", "1", "2", "3"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
@@ -122,6 +124,7 @@ def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "no symlink" in capsys.readouterr().err
 
 
+@pytest.mark.real_clock
 def test_an_autopilot_that_was_given_a_passphrase_speaks_and_listens_to_who_has_it() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))

@@ -20,6 +20,8 @@ from sim.sitl.json_backend import JsonBackend, ServoPacket, decode_servos
 from sim.sitl.process import FirmwareProcess
 from sim.sitl.samples import JUMP_S, SampleBlocks
 
+pytestmark = pytest.mark.real_clock
+
 TILTED = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 PEER = ("127.0.0.1", 40000)
 

@@ -17,6 +17,8 @@ from sim.sitl.cli import parser, scenario_of, vehicle_of
 from sim.sitl.daemon import daemon_configuration
 from sim.sitl.process import unlocked
 
+pytestmark = pytest.mark.real_clock
+
 # A firmware in a few lines: finds the port in its arguments as the real one does, and asks for physics.
 FAKE_ARDUPILOT = f"""\
 #!{sys.executable}

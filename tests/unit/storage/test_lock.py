@@ -11,6 +11,8 @@ import pytest
 from companion.errors import StorageError
 from companion.storage.state import only_daemon
 
+pytestmark = pytest.mark.real_clock
+
 HOLDER = """
 import sys, time
 from pathlib import Path

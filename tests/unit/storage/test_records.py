@@ -96,6 +96,7 @@ while True:
 """
 
 
+@pytest.mark.real_clock
 def test_kill_9_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "state"
     for rounds in (1, 3, 7, 12):

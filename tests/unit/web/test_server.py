@@ -24,6 +24,8 @@ from companion.errors import StorageError
 from companion.web import access, listener, server
 from tests.support.page import RECORD, Answer, Object, Viewer, Visit, page, parsed, until
 
+pytestmark = pytest.mark.real_clock
+
 
 @pytest.fixture(autouse=True)
 def no_fault_in_it(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
