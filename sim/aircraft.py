@@ -22,7 +22,7 @@ _EARTH_M_PER_DEG = 111_320.0
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """How the aircraft stands: degrees, heading from true north."""
+    """Pose of the aircraft, degrees; heading from true north."""
 
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
@@ -31,7 +31,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Site:
-    """Where it stands. The height is above the ellipsoid, and taken as above sea level too: no geoid is modelled."""
+    """Place of the aircraft; the height above the ellipsoid serves as the height above sea level too."""
 
     latitude_deg: float = 40.0
     longitude_deg: float = 116.0
@@ -39,7 +39,7 @@ class Site:
     declination_deg: float = 0.0
     """East of true north +: magnetic heading = true heading - declination."""
     inclination_deg: float = 58.1
-    """Of the magnetic field, down +; 450 mG down over 280 mG across unless a model says better (`scenario.site_at`)."""
+    """Inclination of the magnetic field, down +; `scenario.site_at` takes it from a model."""
     field_gauss: float = 0.53
 
     @functools.cached_property
@@ -53,11 +53,10 @@ class Site:
 
     @property
     def gravity_m_s2(self) -> float:
-        """Local normal gravity."""
         return normal_gravity_m_s2(self.latitude_deg, self.height_m)
 
     def north_east_m(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """Where a place some hundred metres away is from here."""
+        """North and east, in metres, of a place some hundred metres away."""
         east_deg = (longitude_deg - self.longitude_deg) * math.cos(math.radians(self.latitude_deg))
         return (latitude_deg - self.latitude_deg) * _EARTH_M_PER_DEG, east_deg * _EARTH_M_PER_DEG
 
@@ -69,14 +68,14 @@ class Site:
 
 @dataclass(frozen=True)
 class Iron:
-    """What disturbs the magnetic field at the compass."""
+    """Disturbances of the magnetic field at the compass."""
 
     body_gauss: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Hard iron: magnets that are a part of the aircraft, in its axes (forward, right, down)."""
     dipole_a_m2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Moment of a magnet on the ground, north, east, down: a car is some 100 to 300 A m^2."""
     dipole_at_m: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    """Where that lies, seen from the compass, likewise."""
+    """Position of the magnet relative to the compass, north, east, down."""
 
     @functools.cached_property
     def ground_ned_gauss(self) -> Array:
@@ -93,7 +92,7 @@ DEFAULT_SITE = Site()
 
 
 class Truth(NamedTuple):
-    """What a perfect sensor in body axes reads at the times asked for."""
+    """Ideal readings in body axes at n times."""
 
     rate_rad_s: Array
     """Angular rate against inertial space, Earth rate included (n, 3)."""
@@ -102,14 +101,14 @@ class Truth(NamedTuple):
 
 
 class VirtualAircraft:
-    """The truth.
+    """The true pose, place, motion and temperature.
 
     Args:
-        pose: how it stands when no motion acts.
-        site: where.
-        motions: what happens, in aircraft time; more can be added later with `add`.
+        pose: pose while no motion acts.
+        site: place.
+        motions: motions in aircraft time; `add` appends more.
         temperature_degc: a number, or a function of aircraft time.
-        unix_s: date at aircraft time 0, for the messages that tell the date.
+        unix_s: date at aircraft time 0, for messages that carry the date.
     """
 
     def __init__(
@@ -127,7 +126,7 @@ class VirtualAircraft:
         self._gravity_ned = np.array([0.0, 0.0, site.gravity_m_s2])
         self._earth_rate_ned = earth_rate_ned_rad_s(site.latitude_deg)
         self.iron = Iron()
-        """May be changed at any time: a car parks, a tool is laid down."""
+        """Magnetic disturbances; may be changed at any time."""
         self._epoch_s: float | None = None
         self._still: tuple[float, float, Array, Truth] | None = None
         self._stands_until_s = math.inf
@@ -142,32 +141,28 @@ class VirtualAircraft:
             self._epoch_s = loop_s
 
     def time_at(self, loop_s: float) -> float:
-        """Aircraft time of an instant of the loop's clock; begins the aircraft's time if nothing has yet."""
+        """Return the aircraft time of an instant of the loop's clock; start the aircraft's time if it has not begun."""
         self.begin(loop_s)
         assert self._epoch_s is not None
         return loop_s - self._epoch_s
 
     def loop_time_of(self, t_s: float) -> float:
-        """The loop's clock at an aircraft time; the inverse of `time_at`."""
         if self._epoch_s is None:
             raise ValueError("the aircraft's time has not begun: nothing serves it on a loop yet")
         return self._epoch_s + t_s
 
     def add(self, motion: Motion) -> None:
-        """Let something happen; `motion.start_s` is aircraft time and should not lie in the past."""
+        """Add a motion; its `start_s` is aircraft time and should not lie in the past."""
         self._motions.append(motion)
         self._still = self._posed = self._moved = None
 
     def still_at(self, t_s: float) -> bool:
-        """Whether no motion acts at that time."""
         return t_s < self._stands_until_s and all(not motion.start_s <= t_s < motion.end_s for motion in self._motions)
 
     def temperature_degc(self, t_s: float) -> float:
-        """Temperature of the aircraft and everything on it."""
         return self._temperature(t_s) if callable(self._temperature) else self._temperature
 
     def temperatures_degc(self, t_s: Array) -> Array:
-        """The same at times (n)."""
         if not callable(self._temperature):
             return np.full(len(t_s), self._temperature)
         return np.array([self._temperature(t) for t in t_s.tolist()])
@@ -178,11 +173,11 @@ class VirtualAircraft:
         return roll, pitch, heading
 
     def angles_over(self, t_s: Array) -> Array:
-        """The same (n, 3) at times (n), ascending."""
+        """True roll, pitch, heading (n, 3) at ascending times (n)."""
         return self._euler(t_s)[0]
 
     def pose_at(self, t_s: float) -> Pose:
-        """The true pose, heading in [0, 360)."""
+        """True pose, heading in [0, 360)."""
         roll, pitch, heading = self.angles_rad(t_s)
         return Pose(math.degrees(pitch), math.degrees(roll), math.degrees(heading) % 360.0)
 
@@ -191,7 +186,6 @@ class VirtualAircraft:
         return bodies_from_ned(self.angles_over(t_s))
 
     def body_from_ned(self, t_s: float) -> Array:
-        """The attitude matrix (3, 3)."""
         still = self._still_at(t_s)
         if still is not None:
             return still[2]
@@ -200,13 +194,13 @@ class VirtualAircraft:
         return self._posed[1]
 
     def field_gauss(self, t_s: float) -> Array:
-        """The magnetic field at the compass in body axes (3,), with all that disturbs it."""
+        """Magnetic field at the compass (3,), body axes, disturbances included."""
         ned = self.site.field_ned_gauss + self.iron.ground_ned_gauss
         field: Array = self.body_from_ned(t_s) @ ned + np.array(self.iron.body_gauss)
         return field
 
     def declination_rad(self, t_s: float) -> float:
-        """How far east of true north a perfect compass sees north: the place's declination and what iron adds."""
+        """Declination of a perfect compass here: of the place, plus the effect of iron."""
         north, east, _ = self.body_from_ned(t_s).T @ self.field_gauss(t_s)
         return math.atan2(east, north)
 
@@ -215,7 +209,7 @@ class VirtualAircraft:
         return angles_of(mounting.T @ self.body_from_ned(t_s))
 
     def truth(self, t_s: Array) -> Truth:
-        """Rates and specific forces in body axes at times (n). Do not change them: they may be asked for again."""
+        """Return rates and specific forces in body axes at times (n). Do not change the arrays: they are cached."""
         count = len(t_s)
         if count:
             still = self._still_at(float(t_s[0]))
@@ -227,7 +221,7 @@ class VirtualAircraft:
         return self._moved[1]
 
     def truth_at(self, t_s: float) -> Truth:
-        """The same at one time; arrays of shape (3,). Do not change them: they are shared while the aircraft stands."""
+        """Return rates and specific forces (3,) at one time. Do not change the arrays: they are cached."""
         still = self._still_at(t_s)
         if still is not None:
             return still[3]

@@ -21,7 +21,6 @@ _G = 9.80665
 
 
 def mip_packet(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
-    """A MIP packet of (descriptor, data) fields."""
     payload = b"".join(bytes((2 + len(data), descriptor)) + data for descriptor, data in fields)
     packet = bytes((0x75, 0x65, descriptor_set, len(payload))) + payload
     one = two = 0
@@ -32,17 +31,17 @@ def mip_packet(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
 
 
 class _Commanded(ImuDevice):
-    """A device that answers to messages of a known form."""
+    """A device that answers messages of a known form."""
 
     def __init__(self, imu: ImuModel, **line: Any) -> None:
         super().__init__(imu, **line)
         self._pending = b""
 
     ANSWERS: ClassVar[dict[bytes, tuple[bytes, bool | None]]]
-    """To each whole message: the answer, and whether it streams from then on (None: as before)."""
+    """Per message: the answer, and whether the device streams afterwards (None: unchanged)."""
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Obey each whole known message; what is unknown is passed over."""
+        """Obey each whole known message; skip unknown ones."""
         answer = b""
         self._pending += data
         while True:
@@ -72,7 +71,6 @@ class MipImu(_Commanded):
     """Ping, to idle, resume; 0xF1 acknowledges."""
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One packet a sample."""
         return [
             mip_packet(
                 0x80,
@@ -85,7 +83,6 @@ class MipImu(_Commanded):
 
 
 def xbus_message(identifier: int, data: bytes = b"") -> bytes:
-    """An Xbus message from or to a stand-alone device."""
     length = bytes((len(data),)) if len(data) < 255 else b"\xff" + struct.pack(">H", len(data))
     body = bytes((0xFF, identifier)) + length + data
     return b"\xfa" + body + bytes((-sum(body) % 256,))
@@ -104,11 +101,9 @@ class XsensImu(_Commanded):
     """GoToMeasurement, GoToConfig, WakeUpAck."""
 
     def banner(self) -> bytes:
-        """WakeUp."""
         return xbus_message(0x3E)
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One message a sample."""
         messages = []
         for number, (time, device_s, reading) in enumerate(self._readings(times_s, first), first):
             gx, gy, gz, ax, ay, az = reading
@@ -139,7 +134,7 @@ _TABLE = _crc_table()
 
 
 def stim_datagram(body: bytes) -> bytes:
-    """A datagram with its CRC: over the body and as many zeros as fill its last word."""
+    """Return a datagram with its CRC over the body and the zeros that fill its last word."""
     crc = 0xFFFFFFFF
     for byte in body + bytes(-len(body) % 4):
         crc = (crc << 8 & 0xFFFFFFFF) ^ _TABLE[crc >> 24 ^ byte]
@@ -176,7 +171,7 @@ class Stim300(ImuDevice):
         self._random = np.random.default_rng([seed, 7])
 
     def banner(self) -> bytes:
-        """Part number, serial number, configuration."""
+        """Send part number, serial number and configuration."""
         code = self.RANGE_CODE
         settings = bytearray(22)
         settings[0] = 0xBC
@@ -187,11 +182,10 @@ class Stim300(ImuDevice):
         return b"".join(stim_datagram(each) for each in (part, serial, bytes(settings)))
 
     def frames_until(self, t_s: float) -> list[Frame]:
-        """The frames, which tell of a moment somewhat before they are sent."""
+        """Return the frames, which describe a moment shortly before they are sent."""
         return [frame._replace(sampled_s=frame.sampled_s - self.LATENCY_S) for frame in super().frames_until(t_s)]
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One datagram a sample."""
         sampled_s = times_s - self.LATENCY_S
         g = (self.aircraft.truth(sampled_s).force_m_s2 @ self.imu.mounting) / _G
         inclinations = g + self.inclination_noise_g * self._random.standard_normal(g.shape)
@@ -212,7 +206,7 @@ class Stim300(ImuDevice):
 
 
 def _cluster(values: Sequence[float] | Array, bits: int) -> bytes:
-    """Three values as 24-bit numbers with so many bits after the point, and a status without complaint."""
+    """Encode three values as 24-bit numbers with `bits` after the point, and a status without fault."""
     counts = [max(-(2**23), min(2**23 - 1, round(float(value) * 2**bits))) for value in values]
     return b"".join(struct.pack(">i", count)[1:] for count in counts) + b"\0"
 
@@ -222,7 +216,7 @@ WIT_Z_UP = (180.0, 0.0, 0.0)
 
 
 def wit_packet(kind: int, values: Sequence[float], last: int = 0) -> bytes:
-    """Three numbers cut to 16 bits, a fourth, and the sum."""
+    """Encode three numbers cut to 16 bits, a fourth, and the sum."""
     cut = [max(-32768, min(32767, round(value))) for value in values]
     body = bytes([0x55, kind]) + struct.pack("<4h", *cut, last)
     return body + bytes([sum(body) % 256])
@@ -246,7 +240,6 @@ class WitMotionImu(ImuDevice):
     baud = 115200
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """Return four frames a sample."""
         return [self._epoch(time, reading) for time, _, reading in self._readings(times_s, first)]
 
     def _epoch(self, t_s: float, reading: Sequence[float]) -> bytes:

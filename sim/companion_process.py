@@ -21,7 +21,7 @@ Record = dict[str, Any]
 
 
 async def status_of(config: Path) -> Record | None:
-    """The status of the daemon with this configuration, from its control socket; None while it does not answer."""
+    """Return the status from the control socket of the daemon with this configuration; None without an answer."""
     with contextlib.suppress(OSError):
         reader, writer = await asyncio.open_unix_connection(_socket_of(config), limit=LINE_LIMIT)
         with contextlib.closing(writer):
@@ -38,14 +38,14 @@ def _socket_of(config: Path) -> Path:
 
 
 class CompanionProcess:
-    """`companion run` with the `companion.toml` of a folder; its log becomes `daemon.log` there.
+    """Run `companion run` with the `companion.toml` of a folder; its log becomes `daemon.log` there.
 
-    An async context manager: starts on entering, and is stopped in order on leaving.
+    An async context manager: starts on entering, stops in order on leaving.
 
     Args:
-        folder: of the configuration and the log.
+        folder: folder of the configuration and the log.
         environment: variables beside our own.
-        entry: what Python is given to run, in place of `-m companion`.
+        entry: Python's arguments in place of `-m companion`.
     """
 
     def __init__(
@@ -59,7 +59,6 @@ class CompanionProcess:
         return [sys.executable, *self._entry, "-c", str(self.folder / "companion.toml"), *words]
 
     def log(self) -> str:
-        """What it has logged."""
         return (self.folder / "daemon.log").read_text(encoding="utf-8", errors="replace")
 
     async def __aenter__(self) -> Self:
@@ -76,22 +75,20 @@ class CompanionProcess:
         await self._process.wait()
 
     def kill(self) -> None:
-        """SIGKILL, as a crash."""
         self.signal(signal.SIGKILL)
 
     def signal(self, number: int) -> None:
-        """Send it a signal."""
         assert self._process is not None
         self._process.send_signal(number)
 
     async def ended(self, within_s: float) -> int:
-        """Wait for its end; the exit code, negative if a signal killed it."""
+        """Wait for the end of the process; return its exit code, negative if a signal killed it."""
         assert self._process is not None
         async with asyncio.timeout(within_s):
             return await self._process.wait()
 
     async def status(self) -> Record | None:
-        """Its status; None while it does not answer."""
+        """Return the daemon's status; None without an answer."""
         return await status_of(self.folder / "companion.toml")
 
     async def ready(self, within_s: float = READY_WITHIN_S) -> None:
@@ -109,7 +106,7 @@ class CompanionProcess:
         raise TimeoutError(f"the daemon is not ready after {within_s:g} s:\n{self.log()}")
 
     async def ask(self, *words: str) -> Record:
-        """Run a command with --json; what it prints."""
+        """Run a command with --json and return its output."""
         process = await asyncio.create_subprocess_exec(
             *self.command(*words, "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
         )
@@ -120,7 +117,7 @@ class CompanionProcess:
         return answer
 
     async def calibrate(self, within_s: float, *, progress: int | None = None) -> Record:
-        """`companion calibrate --wait --json`, its progress on our stderr, or where `progress` says; the record."""
+        """Run `companion calibrate --wait --json`; return the record. Progress goes to stderr or `progress`."""
         words = ("calibrate", "--wait", "--timeout", str(within_s), "--json")
         process = await asyncio.create_subprocess_exec(
             *self.command(*words), stdout=asyncio.subprocess.PIPE, stderr=progress

@@ -1,4 +1,4 @@
-"""Compasses besides the HMR3300: what else speaks NMEA 0183, OceanServer's OS5000, RION's HCM370B, PNI's TRAX."""
+"""Compasses besides the HMR3300: other NMEA 0183 devices, OceanServer's OS5000, RION's HCM370B, PNI's TRAX."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COMMAND_LIMIT: Final = 64
 
 
 class FluidCompass(Magnetic, Gradienter):
-    """A compass with the tilt of a gradienter: lag, offset and noise are given in the same way."""
+    """A compass with the tilt of a fluid gradienter: lag, offset and noise are parameters of `Gradienter`."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class NmeaCompass(FluidCompass):
         return f"PTNTHPR,{_circle(magnetic)},N,{pitch:.1f},N,{roll:.1f},N"
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Answer each right question with its sentence; pass over everything else."""
+        """Answer each valid question with its sentence; skip everything else."""
         answer = b""
         self._pending += data
         while b"\n" in self._pending:
@@ -82,7 +82,6 @@ class NmeaCompass(FluidCompass):
         return answer
 
     def frames_until(self, t_s: float) -> list[Frame]:
-        """Return nothing while no sentence is enabled."""
         self.streaming = bool(self.sentences)
         return super().frames_until(t_s)
 
@@ -106,7 +105,7 @@ class Os5000(FluidCompass):
         return nmea(f"C{_circle(self.magnetic_deg(t_s))}P{pitch:.1f}R{roll:.1f}T{temperature:.1f}")
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Obey `<esc>R<number><space>`; pass over the other settings."""
+        """Obey `<esc>R<number><space>`; skip the other settings."""
         self._pending += data
         while match := re.search(rb"\x1b([A-Z*])(-?\d{1,6}) ", self._pending):
             self._pending = self._pending[match.end() :]
@@ -117,7 +116,6 @@ class Os5000(FluidCompass):
 
 
 def _circle(angle_deg: float) -> str:
-    """One decimal, in [0, 360)."""
     return f"{round(angle_deg * 10.0) % 3600 / 10.0:.1f}"
 
 
@@ -131,7 +129,7 @@ def rion_packet(command: int, data: bytes = b"") -> bytes:
 
 
 def rion_decimal(angle_deg: float, digits: int, decimals: int) -> bytes:
-    """Two digits a byte, of which the first one is the sign."""
+    """Encode two digits a byte; the first digit is the sign."""
     text = f"{round(abs(angle_deg) * 10**decimals):0{digits - 1}d}"
     return bytes.fromhex(("1" if angle_deg < 0.0 and int(text) else "0") + text)
 
@@ -145,7 +143,7 @@ class RionCommands:
         self._pending = b""
 
     def take(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Return the whole commands in what has come so far."""
+        """Return the whole commands received so far."""
         commands = []
         self._pending += data
         while len(self._pending) >= 2:
@@ -186,14 +184,12 @@ class RionCompass(Compass):
         return said
 
     def reading(self, t_s: float) -> bytes:
-        """Return the answer to 04."""
         pitch, roll = self.tilt_deg(t_s)
         hundredths = round(self.magnetic_deg(t_s) * 100.0) % 36000
         angles = (pitch, roll, hundredths / 100.0)
         return rion_packet(0x84, b"".join(rion_decimal(angle, 6, 2) for angle in angles))
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Answer whole commands."""
         answer = b""
         for command, argument in self._commands.take(data):
             if command == 0x04:
@@ -225,24 +221,22 @@ class PniCompass(Compass):
     default_rate_hz = 10.0
     STREAM = 21
     FACTORY_COMPONENTS: Final = (5, 79)
-    """Heading and its status. What a device really comes with is not documented."""
+    """Heading and its status. The factory setting of the device is not documented."""
 
     def __init__(self, aircraft: VirtualAircraft, *, continuous: bool = False, **more: Any) -> None:
         super().__init__(aircraft, **more)
         self.streaming = self.continuous = continuous
         self.saves = 0
-        """Number of writes to its non-volatile memory."""
         self.components: tuple[int, ...] = self.FACTORY_COMPONENTS
         self._saved: tuple[int, ...] = self.FACTORY_COMPONENTS
 
     def power_on(self, t_s: float) -> bytes:
-        """Forget what was not saved."""
+        """Forget settings that were not saved."""
         said = super().power_on(t_s)
         self.streaming, self.components, self._pending = self.continuous, self._saved, b""
         return said
 
     def reading(self, t_s: float) -> bytes:
-        """Return the answer to kGetData."""
         known = self._values(t_s)
         data = bytes([len(self.components)])
         for component in self.components:

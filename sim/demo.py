@@ -37,8 +37,9 @@ RESIDUAL_ACCEL_MG: Final = 0.3
 SIGMAS: Final = 3.0
 OBSERVE_S: Final = 15.0
 SEED: Final = 70
-"""A day on which the bias of the flight controller's gyro wanders little. On one day in five it wanders by more than
-the 10 deg/h that are asked below, between the calibration and the look afterwards, and no calibration can know that."""
+"""A seed whose gyro bias wanders little. On one day in five the flight controller's bias wanders by more than the
+10 deg/h asked below between the calibration and the check, which no calibration can know.
+"""
 CALIBRATE_WITHIN_S: Final = 150.0
 WORDS: Final = {
     "fc": "the flight controller's first IMU",
@@ -48,7 +49,6 @@ WORDS: Final = {
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the demonstration; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sim demo", description="A virtual aircraft is calibrated.")
     parser.add_argument(
         "--seed", type=int, default=SEED, help=f"the same seed gives the same wandering biases (default {SEED})"
@@ -98,7 +98,7 @@ async def _run(folder: Path, seed: int) -> int:
 
 
 async def _serve(scenario: Scenario, folder: Path, udp: int, stack: contextlib.AsyncExitStack) -> GroundStation:
-    """Bring the aircraft to life: its autopilot sends to a UDP port of this machine, and to the ground station."""
+    """Start the autopilot: it sends to a UDP port of this machine, and to the ground station."""
     station, up = GroundStation("ardupilot"), asyncio.Event()
     air = await open_udp(station, listen=(LOOPBACK, 0))
     stack.callback(air.close)
@@ -109,13 +109,12 @@ async def _serve(scenario: Scenario, folder: Path, udp: int, stack: contextlib.A
 
 
 def _models(scenario: Scenario) -> dict[str, ImuModel]:
-    """The simulated IMUs by the names that `companion setup` gives them."""
     first, second = scenario.flight_controller_imus
     return {"fc": first, "fc2": second, "own": scenario.serial_imu}
 
 
 async def _set_up(companion: CompanionProcess, scenario: Scenario, udp: int) -> None:
-    """Let `companion setup` write the configuration, told which parts the IMUs are."""
+    """Let `companion setup` write the configuration; it is told which parts the IMUs are."""
     parts = [word for name, model in _models(scenario).items() for word in ("--part", f"{name}={model.spec.name}")]
     print(f"\nSetting up (half a minute at most): companion setup --yes {' '.join(parts)}", flush=True)
     ports = [str(companion.folder / name) for name in scenario.ports]
@@ -134,7 +133,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 def _report(scenario: Scenario, record: Record, begin_s: float, end_s: float, residual: Array, stored: Array) -> bool:
-    """Print truth beside result; whether all is within limits."""
+    """Print truth and result; return whether all is within limits."""
     pose = record["pose"]
     print(
         f"\npose found: pitch {pose['theta_deg']:.3f}, roll {pose['gamma_deg']:.3f},"

@@ -1,4 +1,4 @@
-"""Serial devices of the virtual aircraft: what they measure, and the bytes they say it with.
+"""Serial devices of the virtual aircraft: their quantities and their bytes.
 
 A device knows no port and no loop: `frames_until(t_s)` gives every frame that is complete by an aircraft time, so that
 a test can have minutes of traffic at once; `sim.pty_device` serves the same frames on a pty in real time.
@@ -24,16 +24,16 @@ from sim.imu_model import ImuModel
 
 Law = Literal["axis", "slope", "euler"]
 _COMMAND_LIMIT = 64
-"""Bytes of an unfinished command that are kept; what is longer is forgotten."""
+"""Longest unfinished command, bytes; a longer one is dropped."""
 
 
 class Frame(NamedTuple):
     """One transmission of a device; times in aircraft seconds."""
 
     sampled_s: float
-    """When the quantity was sampled."""
+    """Time at which the quantity was sampled."""
     complete_s: float
-    """When the last bit has left the device."""
+    """Time at which the last bit has left the device."""
     data: bytes
 
 
@@ -43,11 +43,11 @@ def nmea(body: str) -> bytes:
 
 
 class SerialDevice(ABC):
-    """Something that sends a frame every 1/rate seconds.
+    """A device that sends a frame every 1/rate seconds.
 
     Args:
-        rate_hz: frames per second; None: the device's own.
-        clock_ppm: how much faster its clock runs than the aircraft's.
+        rate_hz: frames per second; None: the device's own rate.
+        clock_ppm: excess speed of its clock over the aircraft's.
     """
 
     protocol: str
@@ -66,26 +66,25 @@ class SerialDevice(ABC):
         self._next = 0
 
     def power_on(self, t_s: float) -> bytes:
-        """Start at this time; returns what the device says first (often nothing)."""
+        """Start at this time; return the device's first output (often nothing)."""
         self._start_s, self._next = t_s, 0
         self.streaming = True
         return self.banner()
 
     def banner(self) -> bytes:
-        """What is said once at power-on."""
+        """Output at power-on."""
         return b""
 
     @property
     def next_sample_s(self) -> float:
-        """When the next quantity will be sampled."""
         return self._start_s + self._next * self._period_s
 
     def line_time_s(self, size: int) -> float:
-        """How long the wire needs for so many bytes."""
+        """Transmission time of so many bytes."""
         return size * self.bits_per_byte / self.baud
 
     def frames_until(self, t_s: float) -> list[Frame]:
-        """All frames sampled up to and including this time that have not been taken yet."""
+        """Return all frames sampled up to and including this time that were not returned before."""
         count = math.floor((t_s - self._start_s) / self._period_s + 1e-6) + 1 - self._next
         if count <= 0:
             return []
@@ -101,15 +100,15 @@ class SerialDevice(ABC):
 
     @abstractmethod
     def encode(self, times_s: Array, first: int) -> Sequence[bytes]:
-        """The frames of samples at these times; `first` is the number of the first since power-on."""
+        """Encode the frames of samples at these times; `first` is the number of the first since power-on."""
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Bytes sent to the device; returns its answer. Whatever is not understood is ignored."""
+        """Handle bytes sent to the device and return its answer. Unknown commands are ignored."""
         return b""
 
 
 COUNTS_PER_GAUSS = 4000.0
-"""Of the virtual HMR3300's magnetometer lines; the real one's data sheet gives their counts no unit."""
+"""Scale of the virtual HMR3300's magnetometer lines; the data sheet gives their counts no unit."""
 
 
 class Magnetic:
@@ -134,18 +133,18 @@ class Magnetic:
 
 
 class Compass(Magnetic, SerialDevice):
-    """A compass whose tilt comes from accelerometers, and so suffers from every acceleration.
+    """A compass that takes its tilt from accelerometers, so that every acceleration disturbs it.
 
     Args:
         aircraft: the truth.
-        seed: of the noise.
+        seed: seed of the noise.
         heading_error_deg, heading_noise_deg: constant error, and one sigma of the noise of a reading.
-        mounting_deg: roll, pitch, yaw of the device's axes seen from the vehicle's.
+        mounting_deg: roll, pitch, yaw of the device's axes relative to the vehicle's.
         line: arguments of `SerialDevice`.
     """
 
     STREAM: ClassVar[int]
-    """Number of the device's own stream of random numbers."""
+    """Number of the device's stream of random numbers."""
 
     def __init__(
         self,
@@ -164,7 +163,7 @@ class Compass(Magnetic, SerialDevice):
         self._pending = b""
 
     def tilt_deg(self, t_s: float) -> tuple[float, float]:
-        """Return pitch nose up and roll right side down, as accelerometers show them."""
+        """Return pitch (nose up) and roll (right side down) from the accelerometers."""
         x, y, z = (self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2).tolist()
         return math.degrees(math.atan2(x, math.hypot(y, z))), math.degrees(math.atan2(-y, -z))
 
@@ -173,7 +172,6 @@ class Compass(Magnetic, SerialDevice):
         """Return one reading as the device sends it."""
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """Return one reading a sample."""
         return [self.reading(float(time)) for time in times_s]
 
 
@@ -194,11 +192,10 @@ class HMR3300(Compass):
         self.magnetometer_mode = False
 
     def banner(self) -> bytes:
-        """Model and firmware; the exact words of the real one are not documented."""
+        """Send model and firmware; the real device's exact words are not documented."""
         return b"HMR3300 V1.00\r\n"
 
     def reading(self, t_s: float) -> bytes:
-        """Return one line."""
         if self.magnetometer_mode:
             field = self.field_gauss(t_s) + self.field_noise_gauss * self._random.standard_normal(3)
             counts = field * COUNTS_PER_GAUSS
@@ -208,7 +205,7 @@ class HMR3300(Compass):
         return f"{tenths / 10.0:.1f}, {_tidy(pitch, 1)}, {_tidy(roll, 1)}\r\n".encode()
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Commands end with CR or LF; unknown ones are answered `#I`."""
+        """Handle commands ending with CR or LF; unknown ones are answered `#I`."""
         answer = b""
         self._pending += data
         while True:
@@ -228,7 +225,7 @@ class HMR3300(Compass):
 
 
 def _tidy(value: float, digits: int) -> str:
-    """A decimal without a minus before zero."""
+    """Format a decimal without a minus before zero."""
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0.0 else text
 
@@ -268,7 +265,7 @@ class Gradienter(SerialDevice):
         self._fluid: tuple[float, Array] | None = None
 
     def tilt_deg(self, t_s: Array) -> Array:
-        """What the law makes of the apparent gravity at times (n): x and y (n, 2), before lag, offset and noise."""
+        """Apply the law to the apparent gravity at times (n): x and y (n, 2), before lag, offset and noise."""
         gravity = -(self.aircraft.truth(t_s).force_m_s2 @ self._mounting)
         forward, right, down = (gravity / np.linalg.norm(gravity, axis=1, keepdims=True)).T
         if self.law == "axis":
@@ -281,7 +278,6 @@ class Gradienter(SerialDevice):
         return degrees
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """Two lines a sample."""
         return [self._lines(float(time)) for time in times_s]
 
     def _lines(self, t_s: float) -> bytes:
@@ -289,7 +285,7 @@ class Gradienter(SerialDevice):
         return self._line("X", x) + self._line("Y", y)
 
     def reading_deg(self, t_s: float) -> tuple[float, float]:
-        """What it makes of the tilt at a time, with lag, offset and noise: x, y."""
+        """Reading x, y with lag, offset and noise."""
         noise = self.noise_deg * self._random.standard_normal(2)
         x, y = self._settle(t_s) + np.asarray(self.offset_deg) + noise
         return float(x), float(y)
@@ -301,7 +297,7 @@ class Gradienter(SerialDevice):
         return f"{axis}={value + 0.0 if abs(value) >= 0.0005 else 0.0:+07.3f}\r\n".encode()
 
     def _settle(self, t_s: float) -> Array:
-        """The fluid's reading: exact for a tilt that is constant between steps of 10 ms."""
+        """Integrate the fluid's lag: exact for a tilt that is constant between steps of 10 ms."""
         if self._fluid is None:
             self._fluid = (t_s, self.tilt_deg(np.array([t_s]))[0])
         since_s, reading = self._fluid
@@ -318,7 +314,7 @@ class Gradienter(SerialDevice):
         return reading
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Single characters of the MEAS family: `s` stop, `S` start, `R` one reading while stopped, `V` version."""
+        """Handle single characters (MEAS): `s` stop, `S` start, `R` one reading while stopped, `V` version."""
         answer = b""
         for character in data[:_COMMAND_LIMIT]:
             if character == ord("s"):
@@ -334,7 +330,7 @@ class Gradienter(SerialDevice):
 
 
 class ImuDevice(SerialDevice):
-    """What the serial IMUs have in common: 200 readings a second of one model."""
+    """A serial IMU: 200 readings a second of one model."""
 
     default_rate_hz = 200.0
 
@@ -343,7 +339,7 @@ class ImuDevice(SerialDevice):
         self.imu = imu
 
     def _readings(self, times_s: Array, first: int) -> Iterator[tuple[float, float, list[float]]]:
-        """Aircraft time, device time since power-on, and six numbers, sample by sample."""
+        """Yield aircraft time, device time since power-on, and six numbers of each sample."""
         readings = self.imu.read(times_s, self._period_s).tolist()
         for number, (time, reading) in enumerate(zip(times_s.tolist(), readings, strict=True), first):
             yield time, number / self.rate_hz, reading
@@ -360,7 +356,6 @@ class VectorNavBinary(ImuDevice):
     baud = 115200
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One packet a sample."""
         return [
             vectornav_packet(device_s, reading, self.imu.temperature_degc(time))
             for time, device_s, reading in self._readings(times_s, first)
@@ -368,7 +363,6 @@ class VectorNavBinary(ImuDevice):
 
 
 def vectornav_packet(startup_s: float, reading: Sequence[float], temperature_degc: float) -> bytes:
-    """The packet of `VectorNavBinary` for three rates and three specific forces."""
     body = struct.pack("<BHHQ7f", 0x05, 0x0121, 0x0010, round(startup_s * 1e9), *reading, temperature_degc)
     return b"\xfa" + body + struct.pack(">H", binascii.crc_hqx(body, 0))
 
@@ -383,7 +377,6 @@ class ImuLine(ImuDevice):
     baud = 230400
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One line a sample."""
         lines = []
         for number, (time, device_s, reading) in enumerate(self._readings(times_s, first), first):
             rate = ",".join(f"{value:.7f}" for value in reading[:3])

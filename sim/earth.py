@@ -1,4 +1,4 @@
-"""The Earth as the simulator knows it: written from the definitions, so that it can judge the companion's own.
+"""The simulator's model of the Earth, written from the definitions so that it can judge the companion's own.
 
 Nothing here is shared with `companion.physics`; the two meet only in tests.
 """
@@ -48,7 +48,7 @@ def earth_rate_ned_rad_s(latitude_deg: float) -> Array:
 
 
 def axis_rotation(axis: int, angle_rad: float) -> Array:
-    """The matrix that turns a vector by an angle about a coordinate axis (0, 1, 2), right-handed."""
+    """Rotation matrix about a coordinate axis (0, 1, 2), right-handed."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -72,7 +72,7 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
 
 
 def bodies_from_ned(angles_rad: Array) -> Array:
-    """The same of many roll, pitch, yaw (n, 3): (n, 3, 3)."""
+    """Matrices (n, 3, 3) for roll, pitch, yaw (n, 3)."""
     sr, sp, sy = np.sin(angles_rad).T
     cr, cp, cy = np.cos(angles_rad).T
     rows = [
@@ -84,6 +84,6 @@ def bodies_from_ned(angles_rad: Array) -> Array:
 
 
 def angles_of(body_from_ned_matrix: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in rad of a matrix made by `body_from_ned`."""
+    """Return roll, pitch, yaw in rad of a matrix made by `body_from_ned`."""
     c = body_from_ned_matrix
     return math.atan2(c[1, 2], c[2, 2]), -math.asin(max(-1.0, min(1.0, c[0, 2]))), math.atan2(c[0, 1], c[0, 0])

@@ -1,4 +1,4 @@
-"""An aircraft that moves: attitude and velocity as smooth functions of time, and what perfect sensors read on it.
+"""A moving aircraft: attitude and velocity as smooth functions of time, and the readings of perfect sensors.
 
 A route gives Euler angles and velocity in NED; rates and accelerations are their derivatives by central differences of
 the fourth order, exact to 1e-9 for anything an aircraft does. Before its start the aircraft stands as a
@@ -23,7 +23,7 @@ _STEP_S: Final = 2e-3
 
 
 def smooth(u: Array) -> Array:
-    """From 0 to 1 over u in [0, 1], with three continuous derivatives."""
+    """Step from 0 to 1 over u in [0, 1], with three continuous derivatives."""
     u = np.minimum(np.maximum(u, 0.0), 1.0)
     squared = u * u
     result: Array = squared * squared * (35.0 - u * (84.0 - u * (70.0 - 20.0 * u)))
@@ -31,7 +31,7 @@ def smooth(u: Array) -> Array:
 
 
 def smooth_integral(u: Array) -> Array:
-    """The integral of `smooth` from 0; it goes on with slope 1 after u = 1."""
+    """Integral of `smooth` from 0; its slope is 1 after u = 1."""
     v = np.minimum(np.maximum(u, 0.0), 1.0)
     squared = v * v
     inside = squared * squared * v * (7.0 - v * (14.0 - v * (10.0 - 2.5 * v)))
@@ -41,7 +41,7 @@ def smooth_integral(u: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route(ABC):
-    """A way to move from `start_s` on (aircraft time); before it the angles are those of the start, the speed is 0."""
+    """A flight from `start_s` on (aircraft time); before it the angles are those of the start, the speed is 0."""
 
     start_s: float = 0.0
 
@@ -68,19 +68,17 @@ class BankedCircles(Route):
     launch_s: float = 5.0
 
     def _turn(self, t_s: Array) -> tuple[Array, Array]:
-        """Turn rate and angle turned."""
         rate = STANDARD_GRAVITY_M_S2 * math.tan(math.radians(self.bank_deg)) / self.airspeed_m_s
         u = (t_s - self.start_s - self.launch_s - self.straight_s) / self.entry_s
         return rate * smooth(u), rate * self.entry_s * smooth_integral(u)
 
     def angles_rad(self, t_s: Array) -> Array:
-        """The bank that the turn needs; no pitch."""
+        """Bank that the turn needs; no pitch."""
         rate, turned = self._turn(t_s)
         bank = np.arctan(rate * self.airspeed_m_s / STANDARD_GRAVITY_M_S2)
         return np.column_stack([bank, np.zeros_like(bank), turned])
 
     def velocity_m_s(self, t_s: Array) -> Array:
-        """Along the heading."""
         speed = self.airspeed_m_s * smooth((t_s - self.start_s) / self.launch_s)
         _, turned = self._turn(t_s)
         return np.column_stack([speed * np.cos(turned), speed * np.sin(turned), np.zeros_like(speed)])
@@ -97,7 +95,7 @@ class Shuttle(Route):
     begin_s: float = 3.0
 
     def velocity_m_s(self, t_s: Array) -> Array:
-        """Along one line over the ground, its acceleration a sine."""
+        """Velocity along one line over the ground; the acceleration is a sine."""
         peak = STANDARD_GRAVITY_M_S2 * math.tan(math.radians(self.lean_deg))
         omega = 2.0 * math.pi / self.period_s
         since = t_s - self.start_s
@@ -105,7 +103,7 @@ class Shuttle(Route):
         return np.column_stack([speed * math.cos(0.4), speed * math.sin(0.4), np.zeros_like(speed)])
 
     def angles_rad(self, t_s: Array) -> Array:
-        """Leaning such that the thrust, along -z of the body, makes the acceleration."""
+        """Lean such that the thrust, along -z of the body, gives the acceleration."""
         acceleration = _derivative(self.velocity_m_s, t_s)
         swing = 2.0 * math.pi / self.swing_period_s
         heading = math.radians(self.swing_deg) * smooth((t_s - self.start_s) / 5.0)
@@ -146,18 +144,15 @@ class MovingAircraft(VirtualAircraft):
         self.route = route
         self._stands_until_s = route.start_s - 2.0 * _STEP_S
         self._box = bodies_from_ned(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
-        """Vehicle to box."""
         self._coriolis = 2.0 * np.cross(self._earth_rate_ned, np.eye(3))
-        """(3, 3), what each component of a velocity, north, east and down, is accelerated by."""
+        """Acceleration (3, 3) per component of the velocity, north, east, down."""
 
     def matrices(self, t_s: Array) -> Array:
-        """NED to box at times (n): (n, 3, 3)."""
         angles = self.route.angles_rad(t_s) + np.array([0.0, 0.0, math.radians(self.pose.heading_deg)])
         vehicle: Array = self._box @ bodies_from_ned(angles)
         return vehicle
 
     def angles_over(self, t_s: Array) -> Array:
-        """True roll, pitch, heading of the box (n, 3), heading in [-pi, pi]."""
         c = self.matrices(t_s).transpose(1, 2, 0)
         pitch = -np.arcsin(np.clip(c[0, 2], -1.0, 1.0))
         return np.column_stack([np.arctan2(c[1, 2], c[2, 2]), pitch, np.arctan2(c[0, 1], c[0, 0])])

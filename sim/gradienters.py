@@ -1,6 +1,6 @@
 """Gradienters with commands of their own: Jewell's tiltmeters, BEI's, RION's and WitMotion's inclinometers.
 
-`stored` counts what would have been written to the EEPROM, which nobody who only reads a device may do.
+`stored` counts writes to the EEPROM, which a reader of the device must never cause.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sim.earth import Array, mounting_matrix
 
 _COMMAND_LIMIT: Final = 64
 _STORING: Final = ("SO-", "XYC", "XY-SET", "XY-MEMS")
-"""Beginnings of a Jewell's commands whose effect outlasts its power."""
+"""First letters of the Jewell commands whose effect outlasts its power."""
 
 
 class Jewell(Gradienter):
@@ -42,7 +42,7 @@ class Jewell(Gradienter):
         self._pending = b""
 
     def power_on(self, t_s: float) -> bytes:
-        """Silent unless it is set to go on by itself."""
+        """Stay silent unless the device is set to start by itself."""
         said = super().power_on(t_s)
         self.streaming = self.continuous
         return said
@@ -59,7 +59,7 @@ class Jewell(Gradienter):
         return f"{max(-self.range_deg, min(self.range_deg, value_deg)):07.3f}"
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Commands `*ttssCMD` with CR LF, case-sensitive; of the settings only the output format has an effect."""
+        """Handle `*ttssCMD` with CR LF, case-sensitive; of the settings only the output format has an effect."""
         answer = b""
         self._pending += data
         while b"\n" in self._pending:
@@ -99,13 +99,13 @@ class BeiInclinometer(Gradienter):
         self._typed = ""
 
     def power_on(self, t_s: float) -> bytes:
-        """In the user level, in the stored mode; polled, it begins with information about itself."""
+        """Start in the user level and the stored mode; in polled mode, send the device information first."""
         super().power_on(t_s)
         self.setup, self.streaming = False, not self.polled
         return b"AGS030-2-S1\r\nSN:0001-001\r\nHV:01.0\r\nSV:01.0\r\n" if self.polled else b""
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Single letters; `f` and `*` are answered at once, what is not known by nothing."""
+        """Handle single letters; `f` and `*` are answered at once, unknown ones not at all."""
         answer = b""
         for letter in data.decode(errors="replace")[:_COMMAND_LIMIT]:
             if letter in "fF":
@@ -125,9 +125,9 @@ class BeiInclinometer(Gradienter):
 
 
 class RionInclinometer(Gradienter):
-    """RION HCA726: the elevation of each axis to a tenth of a millidegree, by MEMS and so without a fluid.
+    """RION HCA726: elevation of each axis to a tenth of a millidegree, by MEMS, without a fluid.
 
-    Only answers. Three bytes after the angles are unknown; they are zero here.
+    It only answers. Three bytes after the angles are undocumented; they are zero here.
     """
 
     protocol = "rion"
@@ -139,7 +139,6 @@ class RionInclinometer(Gradienter):
         self._commands = RionCommands()
 
     def power_on(self, t_s: float) -> bytes:
-        """Start without a word."""
         said = super().power_on(t_s)
         self.streaming = False
         return said
@@ -149,7 +148,6 @@ class RionInclinometer(Gradienter):
         return rion_packet(0x84, rion_decimal(x, 8, 4) + rion_decimal(y, 8, 4) + bytes(3))
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Answer whole commands."""
         return b"".join(self._lines(t_s) for command, _ in self._commands.take(data) if command == 0x04)
 
 
@@ -174,7 +172,6 @@ class WitMotionInclinometer(SerialDevice):
         self._random = np.random.default_rng([seed, 23])
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """Return one frame a sample."""
         return [self._frame(float(time)) for time in times_s]
 
     def _frame(self, t_s: float) -> bytes:

@@ -1,8 +1,8 @@
-"""Somebody who takes hold of the aircraft: turns it on its spot, tilts it, puts it back.
+"""A person who handles the aircraft: turns it on its spot, tilts it, restores it.
 
-A spot is a plane. However the aircraft is turned on it, its down axis stays the plane's normal, but for what the hands
-leave (`placement`). Typed lines make it so while a simulation runs (`python -m sim all --hands`), and so does what
-companion and autopilots ask for (`follow`).
+A spot is a plane. However the aircraft is turned on it, its down axis stays the plane's normal, except for the error of
+placing it by hand. Typed lines drive it while a simulation runs (`python -m sim all --hands`), or the requests of
+companion and autopilots (`follow`).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from sim.motions import Handling, Turn
 
 TAKES_S: Final = 6.0
 AHEAD_S: Final = 0.1
-"""A real firmware's readings are made that far ahead."""
+"""Lead of a real firmware's readings over the simulator's clock."""
 HELP: Final = (
     "turn DEG | tilt PITCH ROLL | hold PITCH ROLL | spot PITCH ROLL | back | bump PITCH ROLL | grip SECONDS"
     " | wait SECONDS"
 )
 PLACEMENT_DEG, PROPPED_DEG = 0.02, 4.0
-"""What careful hands leave on marks, and what somebody who props it up does."""
+"""Placing error on marks by careful hands, and propping error, one sigma."""
 _EXAMPLES: Final = (
     "turn 180: clockwise on its spot; tilt 20 0: nose up; hold 0 180: on its back, whatever the spot; spot 3 0:"
     " onto another one, which slopes; back: onto its spot; bump 0.3 0: the spot tips; grip 20: a hand stays on it;"
@@ -52,11 +52,11 @@ class Hands:
     """Moves one aircraft.
 
     Args:
-        aircraft: as it stands now, so does it stand on its spot.
-        placement_deg: one sigma of how the down axis misses the spot's normal each time, each axis.
-        propped_deg: one sigma of how pitch and roll miss what was wanted, propped up by hand.
-        seed: of both.
-        takes_s: how long each movement lasts.
+        aircraft: the aircraft, standing on its spot.
+        placement_deg: one sigma of the angle between down axis and the spot's normal at each placing, each axis.
+        propped_deg: one sigma of pitch and roll errors when propped up by hand.
+        seed: seed of both.
+        takes_s: duration of each movement.
     """
 
     def __init__(
@@ -78,37 +78,37 @@ class Hands:
         self._number = 0
 
     def turn(self, t_s: float, degrees: float) -> float:
-        """Turn it on its spot from aircraft time `t_s` on; returns when it stands again."""
+        """Turn it on its spot from aircraft time `t_s`; return the time at which it stands again."""
         self._turned_deg += degrees
         return self.back(t_s, degrees)
 
     def back(self, t_s: float, turn_deg: float = 0.0) -> float:
-        """Put it onto its spot as it is turned, by about so much."""
+        """Place it on its spot, turned by about `turn_deg`."""
         attitude = axis_rotation(2, -math.radians(self._turned_deg)) @ self._spot
         miss = np.radians(self._placement_deg) * self._random.standard_normal(2)
         attitude = axis_rotation(0, miss[0]) @ axis_rotation(1, miss[1]) @ attitude
         return self._go(t_s, attitude, turn_deg)
 
     def tilt(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
-        """Prop it up: nose up, right side down, from how it stands on its spot."""
+        """Prop it up relative to its pose on the spot: nose up, right side down."""
         attitude = axis_rotation(2, -math.radians(self._turned_deg)) @ self._spot
         attitude = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg)) @ attitude
         return self._go(t_s, attitude)
 
     def hold(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
-        """Prop it up anywhere, in any orientation: nose up, right side down, from the horizon."""
+        """Prop it up in any orientation relative to the horizon: nose up, right side down."""
         pitch_off, roll_off = self._propped_deg * self._random.standard_normal(2)
         return self._go(t_s, self._held(pitch_deg + pitch_off, roll_deg + roll_off))
 
     def grip(self, t_s: float, seconds: float) -> float:
-        """Keep a hand on it: it trembles by some tenths of a degree, and ends as it began."""
+        """Hold it: it trembles by some tenths of a degree, and ends as it began."""
         self._number += 1
         tremor = Handling(start_s=t_s, duration_s=seconds, angle_deg=0.4, acceleration=0.1, seed=self._number)
         self._aircraft.add(tremor)
         return tremor.end_s
 
     def follow(self, words: str, t_s: float) -> bool:
-        """Do what `companion align` asks for; whether these words ask for anything."""
+        """Obey a request of `companion align`; return whether the words were one."""
         if (missing := _MISSING.search(words)) is not None:
             up = np.mean([_up(*SIDES[name]) for name in missing.groups() if name is not None], axis=0)
             up /= np.linalg.norm(up)
@@ -122,16 +122,15 @@ class Hands:
         return True
 
     def spot(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
-        """Put it onto another spot, on which it stands like this at first."""
+        """Place it on another spot with this initial pose."""
         self._spot, self._turned_deg = self._held(pitch_deg, roll_deg), 0.0
         return self.back(t_s)
 
     def _held(self, pitch_deg: float, roll_deg: float) -> Array:
-        """As it heads now."""
         return body_from_ned(*(math.radians(a) for a in (roll_deg, pitch_deg, self._now.heading_deg)))
 
     def bump(self, _t_s: float, pitch_deg: float, roll_deg: float) -> None:
-        """Tip the spot itself, nose up and right side down as the aircraft was at first; seen at the next placing."""
+        """Tip the spot itself, in the aircraft's first heading; it shows at the next placing."""
         tipped = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg))
         self._spot = tipped @ self._spot
 
@@ -154,7 +153,7 @@ class Hands:
         return t_s + self._takes_s
 
     def obey(self, line: str, t_s: float) -> str:
-        """Do what one typed line says; returns what came of it."""
+        """Obey one typed line; return the answer."""
         word, *rest = line.split() or [""]
         moves: dict[str, tuple[int, Callable[..., object]]] = {
             "turn": (1, self.turn),
@@ -185,12 +184,11 @@ class Hands:
 
 
 def _up(pitch_deg: float, roll_deg: float) -> Array:
-    """Up in the aircraft's axes, forward, right, down."""
     return -body_from_ned(math.radians(roll_deg), math.radians(pitch_deg), 0.0)[:, 2]
 
 
 async def take_lines(hands: Hands, aircraft: VirtualAircraft, say: Callable[[str], None]) -> None:
-    """Obey standard input, a terminal or a script of stands, line by line until it ends."""
+    """Obey standard input, a terminal or a script, line by line until it ends."""
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)

@@ -1,8 +1,8 @@
-"""A MEMS IMU with everything that makes its bias a moving target, and the true bias always at hand.
+"""A MEMS IMU with a wandering bias, and the true bias at hand.
 
-Noise words and figures are those of method 2.2: white noise N (unit * sqrt(s), two-sided PSD N^2),
-flicker B (PSD B^2 / (2 pi f), Allan floor 0.664 B), rate random walk K. The slow part (flicker and walk) is one path
-in time, the same for every reader and every sampling rate; only white noise and rounding belong to a reading.
+Noise terms and figures are those of method 2.2: white noise N (unit * sqrt(s), two-sided PSD N^2), flicker B (PSD
+B^2 / (2 pi f), Allan floor 0.664 B), rate random walk K. The slow part (flicker and walk) is one path in time, the same
+for every reader and every sampling rate; only white noise and rounding belong to a reading.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SLOW_STEP_S = 0.1
 """Grid of the slow path. Faster flicker lies far below the white noise of every part listed here."""
 _BLOCK = 512
 _KEPT_BLOCKS = 400
-"""About 5.7 hours of slow path are kept; older times can no longer be asked for."""
+"""About 5.7 hours of slow path are kept; older times raise."""
 _TAU_RATIO = 3.0
 _TAUS_S = 0.3 * _TAU_RATIO ** np.arange(11.0)
 """Time constants of the Gauss-Markov processes whose sum is the flicker: 0.3 s to 5 hours."""
@@ -46,9 +46,9 @@ class AxisNoise:
     walk: float = 0.0
     """K, unit / sqrt(s)."""
     per_kelvin: float = 0.0
-    """Bias per kelvin away from the reference temperature; one sigma of it where a piece is drawn."""
+    """Bias per kelvin away from the reference temperature; one sigma where a piece is drawn."""
     scatter: float = 0.0
-    """One sigma of the bias of a power-up about that of another, at one temperature."""
+    """One sigma of the bias from power-up to power-up, at one temperature."""
     step: float = 0.0
     """Quantisation of the output; 0 for floats."""
     limit: float = math.inf
@@ -57,15 +57,13 @@ class AxisNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuSpec:
-    """A named part."""
-
     name: str
     gyro: AxisNoise
     accel: AxisNoise
     reference_degc: float = 25.0
 
     def piece(self, random: np.random.Generator, usual: Array) -> Piece:
-        """One piece of it, with these usual biases (6,) and a curve of its own."""
+        """Draw one piece with these usual biases (6,) and its own curve."""
         scatter = np.repeat([self.gyro.scatter, self.accel.scatter], 3)
         return Piece.drawn(random, usual, scatter, np.repeat([self.gyro.per_kelvin, self.accel.per_kelvin], 3))
 
@@ -141,7 +139,7 @@ class Bias(NamedTuple):
 
 
 class _SlowPath:
-    """Flicker plus rate random walk of six axes on a fixed time grid, zero at time 0, made as it is needed.
+    """Flicker plus rate random walk of six axes on a fixed time grid, zero at time 0, extended on demand.
 
     The flicker is a sum of stationary first-order Gauss-Markov processes with time constants in the ratio r, each of
     variance B^2 ln(r) / pi: their spectra add up to B^2 / (2 pi f) between the slowest and the fastest.
@@ -163,7 +161,7 @@ class _SlowPath:
         self.silent = not (flicker.any() or walk.any())
 
     def at(self, t_s: Array) -> Array:
-        """Values (n, 6) by linear interpolation of the grid; before time 0 they are those of time 0."""
+        """Interpolate the grid linearly (n, 6); before time 0 the values are those of time 0."""
         position = np.maximum(t_s, 0.0) / SLOW_STEP_S
         index = position.astype(np.int64)
         share = (position - index)[:, None]
@@ -172,7 +170,6 @@ class _SlowPath:
         return (1.0 - share) * grid[index - first] + share * grid[index - first + 1]
 
     def at_one(self, t_s: float) -> Array:
-        """The value (6) at one time."""
         position = max(t_s, 0.0) / SLOW_STEP_S
         index = int(position)
         share = position - index
@@ -184,7 +181,6 @@ class _SlowPath:
         return result
 
     def _grid(self, first: int, last: int) -> Array:
-        """Grid values first..last inclusive."""
         while last // _BLOCK >= self._made:
             self._make_block()
         parts = []
@@ -203,12 +199,11 @@ class _SlowPath:
             ) from None
 
     def forget_before(self, t_s: float) -> None:
-        """Let go of all values before a time that nobody will ask for any more."""
         for block in [each for each in self._blocks if (each + 1) * _BLOCK * SLOW_STEP_S <= t_s]:
             del self._blocks[block]
 
     def _make_block(self) -> None:
-        """Values of one block, and the first of the next one so that interpolation stays inside a block."""
+        """Make one block and the first value of the next, so that interpolation stays inside a block."""
         out = np.empty((_BLOCK + 1, 6))
         out[0] = self._last
         kicks = self._random.standard_normal((_BLOCK, len(_TAUS_S), 6)) * self._kick
@@ -227,18 +222,18 @@ class _SlowPath:
 class ImuModel:
     """One IMU on the aircraft. Vectors are in the IMU's own axes unless a name says otherwise.
 
-    Reading = M (truth in sensor axes) + bias(t) + white noise, rounded to the step, cut at the limit; with
-    bias(t) = turn-on bias + flicker + walk + curve(T - T_ref) and M = scale and misalignment.
+    Reading = M (truth in sensor axes) + bias(t) + white noise, rounded to the step, cut at the limit; with bias(t) =
+    turn-on bias + flicker + walk + curve(T - T_ref) and M = scale and misalignment.
 
     Args:
-        spec: a part of `PARTS`, by name or as a structure of your own.
+        spec: a part of `PARTS`, by name, or a specification.
         gyro_bias_rad_s, accel_bias_m_s2: bias at aircraft time 0 and reference temperature.
         gyro_scale, accel_scale: relative scale errors of the three axes.
         gyro_misalignment_rad, accel_misalignment_rad: small rotation of the triad.
-        gyro_shear, accel_shear: how far x and y, x and z, y and z are from square.
-        mounting_deg: roll, pitch, yaw of the sensor's axes seen from the vehicle's (a MAVLink rotation's angles).
-        thermometer_off_k: what its own thermometer shows too much.
-        curve: of this piece, over the temperature; without one each axis moves as the part says a piece may.
+        gyro_shear, accel_shear: deviation from square of x and y, x and z, y and z.
+        mounting_deg: roll, pitch, yaw of the sensor's axes relative to the vehicle's (a MAVLink rotation's angles).
+        thermometer_off_k: error of its own thermometer.
+        curve: the piece's curve over temperature; without one each axis moves as the specification allows.
     """
 
     def __init__(
@@ -265,7 +260,7 @@ class ImuModel:
         """Sensor to vehicle FRD."""
         self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
         self.thermometer: Callable[[float], float] = lambda degc: degc + thermometer_off_k
-        """What it makes of the temperature; bad ones may be put in its place."""
+        """Reading of its thermometer at a true temperature; replaceable by a bad one."""
         gyro, accel = self.spec.gyro, self.spec.accel
         self.curve = curve or Curve((np.repeat([gyro.per_kelvin, accel.per_kelvin], 3),))
         self.white: Array = np.repeat([gyro.white, accel.white], 3)
@@ -282,47 +277,45 @@ class ImuModel:
         self._accel_matrix = _response(accel_scale, accel_misalignment_rad, accel_shear) @ self.mounting.T
 
     def in_steps(self, gyro_rad_s: float, accel_m_s2: float) -> ImuModel:
-        """The same sensor behind another converter, which takes its place: the two draw from the same noise."""
+        """Return the sensor behind another converter, which replaces this one: both draw from the same noise."""
         other, spec = copy.copy(self), self.spec
         gyro, accel = replace(spec.gyro, step=gyro_rad_s), replace(spec.accel, step=accel_m_s2)
         other.spec = replace(spec, gyro=gyro, accel=accel)
         return other
 
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
-        """Another power-up: the bias begins elsewhere, behind every converter."""
+        """Power up again with other biases, behind every converter."""
         self._turn_on[:] = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2])
 
     def forget_before(self, t_s: float) -> None:
-        """Let go of the bias before a time: an hour of it is 1.7 MB."""
+        """Drop the bias before a time: an hour of it is 1.7 MB."""
         self._slow.forget_before(t_s)
 
     def temperature_degc(self, t_s: float) -> float:
-        """What its own thermometer says."""
         return self.thermometer(self.aircraft.temperature_degc(t_s))
 
     def true_bias(self, t_s: float) -> Bias:
-        """The additive bias now: turn-on, flicker, walk and temperature."""
+        """Additive bias now: turn-on, flicker, walk and temperature."""
         both = self._bias_at(t_s)
         return Bias(both[:3], both[3:])
 
     def mean_bias(self, start_s: float, end_s: float) -> Bias:
-        """The mean of `true_bias` over a window, on a grid of 0.1 s."""
+        """Mean of `true_bias` over a window, on a grid of 0.1 s."""
         times = np.arange(start_s, end_s, SLOW_STEP_S) if end_s > start_s else np.array([start_s])
         both = self._bias(times).mean(axis=0)
         return Bias(both[:3], both[3:])
 
     def true_bias_in_vehicle(self, t_s: float) -> Bias:
-        """The same turned into the vehicle's FRD."""
         gyro, accel = self.true_bias(t_s)
         return Bias(self.mounting @ gyro, self.mounting @ accel)
 
     def in_accel_axes(self, force_m_s2: Array) -> Array:
-        """What the accelerometers make of a specific force (3,) in the vehicle's axes, without bias and noise."""
+        """Return the accelerometers' reading of a specific force (3,) in the vehicle's axes, without bias and noise."""
         result: Array = self._accel_matrix @ force_m_s2
         return result
 
     def expected(self, t_s: float) -> Array:
-        """The reading without noise, rounding and limit: three rates, three specific forces."""
+        """Reading without noise, rounding and limit: three rates, three specific forces."""
         truth = self.aircraft.truth_at(t_s)
         if truth is not self._seen:  # a standing aircraft gives the same object again and again
             ideal = np.concatenate((self._gyro_matrix @ truth.rate_rad_s, self._accel_matrix @ truth.force_m_s2))
@@ -330,7 +323,7 @@ class ImuModel:
         return self._ideal + self._bias_at(t_s)
 
     def expected_block(self, t_s: Array) -> Array:
-        """The same at times (n), ascending: (n, 6)."""
+        """Readings (n, 6) without noise, rounding and limit at ascending times (n)."""
         rate, force = self.aircraft.truth(t_s)
         out = self._bias(t_s)
         out[:, :3] += rate @ self._gyro_matrix.T
@@ -374,7 +367,7 @@ class ImuModel:
 
 
 def _thin(t_s: Array) -> Array:
-    """Times about 0.1 s apart that span a block: often enough to ask for a temperature."""
+    """Return times about 0.1 s apart that span a block: often enough to ask for a temperature."""
     if len(t_s) < 3:
         return t_s
     return np.linspace(t_s[0], t_s[-1], max(2, int((t_s[-1] - t_s[0]) / SLOW_STEP_S) + 2))

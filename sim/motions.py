@@ -1,4 +1,4 @@
-"""What may happen to a standing aircraft: turned, handled, shaken, and swayed on a boat in waves.
+"""Motions of a standing aircraft: turned, handled, shaken, and swayed on a boat in waves.
 
 A motion adds to the Euler angles of the still pose, and to the acceleration. Each one gives its angles and their exact
 derivatives, so the true body rate needs no numerical differentiation. Times are seconds of the aircraft's own clock.
@@ -29,14 +29,14 @@ def smooth_step(u: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion(ABC):
-    """Something that happens from `start_s` for `duration_s`."""
+    """A motion from `start_s` for `duration_s`."""
 
     start_s: float
     duration_s: float
 
     @property
     def end_s(self) -> float:
-        """When it is over; what it leaves behind then stays."""
+        """End of the motion; the angles it leaves stay."""
         return self.start_s + self.duration_s
 
     @abstractmethod
@@ -49,27 +49,26 @@ class Motion(ABC):
         return None
 
     def level_acceleration_m_s2(self, t_s: Array) -> Array | None:
-        """The same along the heading, to the right of it, and down: of what goes up and down as a whole."""
+        """Added acceleration (n, 3) along the heading, to the right of it, and down, of the aircraft as a whole."""
         del t_s
         return None
 
     @functools.cached_property
     def leaves_rad(self) -> Array:
-        """What stays of the angles afterwards (3)."""
+        """Angles that remain afterwards (3)."""
         result: Array = self.euler_rad(np.array([self.end_s]))[0][0]
         return result
 
 
 @dataclass(frozen=True, kw_only=True)
 class Turn(Motion):
-    """A smooth change of pose that stays: somebody sets the aircraft down differently."""
+    """A smooth change of pose that stays, as when a person sets the aircraft down differently."""
 
     roll_deg: float = 0.0
     pitch_deg: float = 0.0
     heading_deg: float = 0.0
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Added angles and rates."""
         step, slope = smooth_step((t_s - self.start_s) / self.duration_s)
         change = np.radians([self.roll_deg, self.pitch_deg, self.heading_deg])
         return step[:, None] * change, slope[:, None] * change / self.duration_s
@@ -77,13 +76,13 @@ class Turn(Motion):
 
 @dataclass(frozen=True, kw_only=True)
 class SlowTurn(Motion):
-    """A steady turn of the heading, the motion that a spread of the readings does not show."""
+    """A steady turn of the heading, which the spread of the readings does not show."""
 
     rate_deg_s: float = 1.0
     ramp_s: float = 1.0
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Added angles and rates: the rate rises smoothly over `ramp_s`, stays, and falls likewise."""
+        """Added angles and rates: the rate rises smoothly over `ramp_s`, stays, and falls in the same way."""
         ramp = min(self.ramp_s, self.duration_s / 2.0)
         since, until = t_s - self.start_s, self.end_s - t_s
         near = np.minimum(since, until)  # to the beginning or to the end: it ends as it has begun
@@ -98,11 +97,11 @@ class SlowTurn(Motion):
 
 @dataclass(frozen=True, kw_only=True)
 class Handling(Motion):
-    """Somebody holds the aircraft: irregular turning and shaking that ends where it began."""
+    """A person holds the aircraft: irregular turning and shaking that ends where it began."""
 
     angle_deg: float = 4.0
     acceleration: float = 0.7
-    """m/s^2, about the largest."""
+    """Largest acceleration, about, m/s^2."""
     seed: int = 0
 
     @functools.cached_property
@@ -112,12 +111,11 @@ class Handling(Motion):
         return 2.0 * math.pi * generator.uniform(0.3, 1.7, (3, 4)), generator.uniform(0.0, 2.0 * math.pi, (3, 4))
 
     def _window(self, t_s: Array) -> tuple[Array, Array]:
-        """A bump that is zero, with its slope, at both ends, and its derivative in 1/s."""
+        """Window that is zero, with its slope, at both ends, and its derivative in 1/s."""
         u = np.clip((t_s - self.start_s) / self.duration_s, 0.0, 1.0)
         return np.sin(math.pi * u) ** 2, math.pi / self.duration_s * np.sin(2.0 * math.pi * u)
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Added angles and rates."""
         frequencies, phases = self._waves
         window, window_slope = self._window(t_s)
         arguments = frequencies[None] * (t_s - self.start_s)[:, None, None] + phases[None]
@@ -127,7 +125,6 @@ class Handling(Motion):
         return window[:, None] * wave, window_slope[:, None] * wave + window[:, None] * slope
 
     def acceleration_m_s2(self, t_s: Array) -> Array:
-        """Shaking of the hand in body axes."""
         frequencies, phases = self._waves
         window, _ = self._window(t_s)
         arguments = 2.3 * frequencies[None] * (t_s - self.start_s)[:, None, None] - phases[None]
@@ -164,19 +161,18 @@ class Vibration(Motion):
 
     @functools.cached_property
     def leaves_rad(self) -> Array:
-        """Nothing."""
         return np.zeros(3)
 
 
 COMPONENTS: Final = 16
-"""Of one wave about one axis."""
+"""Components of one wave about one axis."""
 DAY_S: Final = 86400.0
 SURGE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Wave:
-    """One narrow band; of a pure sine with the same energy, `sway_deg` is the amplitude."""
+    """One narrow band; `sway_deg` is the amplitude of a pure sine with the same energy."""
 
     frequency_hz: float
     sway_deg: float
@@ -198,22 +194,22 @@ class Sea(Motion):
     surge: float = SURGE
     """Sideways acceleration over g times the slope; 1: a raft, on which no tilt is felt."""
     surge_lead_rad: float = 0.5
-    """By how much that is ahead of the slope."""
+    """Lead of the sideways acceleration over the slope."""
     heave: float = 0.3
-    """Vertical acceleration likewise, a quarter of a wave behind, as water goes round in circles."""
+    """Vertical acceleration over g times the slope, a quarter of a wave behind, as water moves in circles."""
     rise_s: float = 5.0
-    """How long it takes to come up and to die away."""
+    """Time in which the waves build up, and die away."""
     seed: int = 0
 
     def _height(self, t_s: Array) -> tuple[Array, Array]:
-        """How far it has come up, 0 to 1, and the derivative in 1/s."""
+        """Height of the build-up, 0 to 1, and its derivative in 1/s."""
         rise_s = min(self.rise_s, self.duration_s / 2.0)
         up, up_slope = smooth_step((t_s - self.start_s) / rise_s)
         down, down_slope = smooth_step((self.end_s - t_s) / rise_s)
         return up * down, (up_slope * down - up * down_slope) / rise_s
 
     def _sums(self, t_s: Array) -> tuple[Array, Array, Array]:
-        """Roll and pitch (n, 2), what they are a quarter of a wave later, and their derivatives."""
+        """Roll and pitch (n, 2), the same a quarter of a wave later, and their derivatives."""
         frequencies, amplitudes, phases = _components(self.waves, self.seed)
         angles, later, slopes = np.empty((3, len(t_s), 2))
         for axis in range(2):
@@ -225,7 +221,6 @@ class Sea(Motion):
         return angles, later, slopes
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Added angles and rates."""
         angles, _, slopes = self._sums(t_s)
         height, rising = self._height(t_s)
         turned, rates = np.zeros((2, len(t_s), 3))
@@ -245,7 +240,6 @@ class Sea(Motion):
 
     @functools.cached_property
     def leaves_rad(self) -> Array:
-        """Nothing."""
         return np.zeros(3)
 
 
@@ -265,7 +259,7 @@ MOTIONS: Final = ("still", "turn", "sea", "engine")
 
 
 def motions_of(name: str, *, seed: int = 0, turn_deg_s: float = TURN_DEG_S) -> tuple[Motion, ...]:
-    """What happens all day long, by its name: `MOTIONS`."""
+    """Return the motions of a name in `MOTIONS`, for a whole day."""
     turn = SlowTurn(start_s=0.0, duration_s=DAY_S, rate_deg_s=turn_deg_s)
     engine = Vibration(start_s=0.0, duration_s=DAY_S)
     known: dict[str, tuple[Motion, ...]] = {

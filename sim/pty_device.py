@@ -1,8 +1,8 @@
-"""A serial device on a pseudo-terminal: a path that can be opened, listened to, unplugged and plugged in again.
+"""A serial device on a pseudo-terminal: a path that can be opened, read, unplugged and plugged in again.
 
-`heard` is what a receiver makes of a line that it reads at another speed or parity than it was sent. The line idles
-high. A frame is a low start bit, eight data bits with the least significant first, a parity bit if any, and a high stop
-bit. The receiver samples each bit in its middle, as a UART does, from the falling edge that begins a frame.
+`heard` models a receiver that reads a line at another speed or parity than it was sent. The line idles high. A frame is
+a low start bit, eight data bits with the least significant first, a parity bit if any, and a high stop bit. The
+receiver samples each bit in its middle, as a UART does, from the falling edge that begins a frame.
 """
 
 from __future__ import annotations
@@ -38,14 +38,13 @@ class Received(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """How one end of the line is set: 8 data bits and one stop bit always."""
+    """Setting of one end of the line: 8 data bits and one stop bit always."""
 
     baud: int
     parity: Parity = "none"
 
 
 def parity_bit(byte: int, parity: Parity) -> int:
-    """Return the bit that makes the number of ones even, or odd."""
     ones = byte.bit_count() % 2
     return ones if parity == "even" else 1 - ones
 
@@ -111,18 +110,20 @@ _SHORTEST_SLEEP_S = 0.001
 class PtyDevice:
     """Serves a device's frames on the event loop, in its clock's time, under a symlink with a stable name.
 
-    Like a UART it does not wait for anyone: what nobody reads is lost, and a reader that is too slow loses bytes in the
-    middle of frames. Only the path is shared with the reader, so it works with any program.
+    Like a UART it waits for nobody: unread bytes are lost, and a slow reader loses bytes in the middle of frames. Only
+    the path is shared with the reader, so it works with any program.
 
     Use: `async with PtyDevice(HMR3300(aircraft), directory / "compass") as device: ...`
     """
 
     def __init__(self, device: SerialDevice, path: Path, *, line: Setting | None = None) -> None:
         self.device, self.path, self.line = device, path, line
-        """`line`: how the device's own UART is set; a reader at another speed or parity reads what a UART makes of it.
-        None: bytes pass as they are, whatever the reader believes."""
+        """`line`: setting of the device's UART; a reader at another speed or parity reads what a UART makes of it.
+
+        None: bytes pass unchanged, whatever the reader's setting.
+        """
         self.muted = False
-        """True: the device is there and says nothing."""
+        """The device is connected and sends nothing."""
         self._master: int | None = None
         self._poll = select.poll()
         self._banner = b""
@@ -142,24 +143,23 @@ class PtyDevice:
         self.unplug()
 
     async def wait_closed(self) -> None:
-        """Until serving ends, which is only by a fault of the simulator."""
+        """Wait until serving ends, which only a fault of the simulator causes."""
         if self._serving is not None:
             await asyncio.shield(self._serving)
 
     @property
     def opened(self) -> bool:
-        """Whether somebody has the path open."""
         return self._master is not None and not any(event & select.POLLHUP for _, event in self._poll.poll(0))
 
     def unplug(self) -> None:
-        """Pull it out: the path is gone, and whoever has it open gets a hang-up."""
+        """Unplug it: the path disappears, and a reader gets a hang-up."""
         if self._master is None:
             return
         self._close()
         self.path.unlink(missing_ok=True)
 
     def replug(self) -> None:
-        """Put it (back) in: a new pseudo-terminal under the same path; the device starts anew."""
+        """Plug it in: a new pseudo-terminal under the same path; the device starts anew."""
         if self._master is not None:
             return
         if self.path.exists() and not self.path.is_symlink():
@@ -174,7 +174,6 @@ class PtyDevice:
         self._master = None
 
     def _open(self) -> None:
-        """Make a pseudo-terminal and put its name under the path."""
         master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
@@ -189,7 +188,7 @@ class PtyDevice:
         self._poll.register(master, select.POLLHUP)
 
     def _unlock(self) -> None:
-        """Make the port free again after a reader that was killed, as a serial port is when its last reader ends.
+        """Free the port after a reader that was killed, as a serial port is when its last reader ends.
 
         The lock of such a reader (TIOCEXCL) stays on a pseudo-terminal as long as its other end is open.
         """
@@ -232,7 +231,7 @@ class PtyDevice:
             await asyncio.sleep(min(max(wait_s, _SHORTEST_SLEEP_S), 0.1))
 
     def _write(self, data: bytes) -> None:
-        """Into the port, or nowhere: never waits, never raises."""
+        """Write into the port, or drop the bytes: never waits, never raises."""
         if not data:
             return
         if self._master is None or self.muted or not self.opened:
@@ -256,7 +255,7 @@ class PtyDevice:
 
 
 def reader_setting(master: int) -> Setting:
-    """How whoever has the other end of a pseudo-terminal open has set it.
+    """Return the reader's setting of a pseudo-terminal.
 
     A pseudo-terminal forgets PARENB, but not whether parity is to be checked, nor which.
     """

@@ -18,7 +18,7 @@ _AT_ONCE_S: Final = 100.0
 
 
 def write(path: Path, part: str, hours: float, rate_hz: float, seed: int) -> int:
-    """Write the log; returns how many samples it has."""
+    """Write the log; return the number of samples."""
     model = ImuModel(
         VirtualAircraft(Pose(pitch_deg=2.0, roll_deg=-1.0, heading_deg=40.0), site_at(40.0, 116.0, 50.0)),
         part,
@@ -37,7 +37,6 @@ def write(path: Path, part: str, hours: float, rate_hz: float, seed: int) -> int
 
 
 def parser() -> argparse.ArgumentParser:
-    """Of the command line."""
     made = argparse.ArgumentParser(prog="python -m sim rest", description=(__doc__ or "").partition(": ")[2])
     made.add_argument("file", type=Path, metavar="FILE")
     made.add_argument("--part", choices=sorted(PARTS), default="adis16470")
@@ -48,7 +47,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
     made = parser()
     options = made.parse_args(arguments)
     if not 0.01 <= options.hours <= 24.0 or not 4.0 <= options.rate_hz <= 4000.0:

@@ -30,7 +30,7 @@ IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
     "xsens": XsensImu,
     "stim300": Stim300,
 }
-"""Made from the model whose readings they send."""
+"""Constructors from the model whose readings the device sends."""
 
 COMPASSES: dict[str, Callable[..., SerialDevice]] = {
     "hmr3300": HMR3300,
@@ -39,7 +39,7 @@ COMPASSES: dict[str, Callable[..., SerialDevice]] = {
     "nmea": NmeaCompass,
     "os5000": Os5000,
 }
-"""Made from the aircraft on which they sit and `seed`; upright, without errors but noise and lag."""
+"""Constructors from the aircraft and `seed`; upright, with noise and lag only."""
 
 GRADIENTERS: dict[str, Callable[..., SerialDevice]] = {
     "inclinometer_xy": Gradienter,
@@ -49,20 +49,20 @@ GRADIENTERS: dict[str, Callable[..., SerialDevice]] = {
     "stim300": lambda aircraft, seed: Stim300(ImuModel(aircraft, "adis16470", seed=seed), seed=seed),
     "jewell": Jewell,
 }
-"""Made in the same way; every compass but RION's also serves as a gradienter."""
+"""Constructors from the aircraft and `seed`; every compass but RION's also serves as a gradienter."""
 
 
 class Fit(NamedTuple):
-    """What a configuration has to say of a device of one of the tables, in one of its roles."""
+    """Configuration that a device of one of the tables needs in one of its roles."""
 
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Roll, pitch, yaw of the axes in which it speaks, as it lies on the aircraft."""
+    """Roll, pitch, yaw of the device's axes on the aircraft."""
     law: Law | None = None
-    """Of a gradienter; None: its own, or roll and pitch themselves."""
+    """Law of a gradienter; None: the protocol's own, or roll and pitch."""
     sigma_deg: float | None = None
-    """None: what the companion takes by itself is right."""
+    """None: the companion's default is right."""
     model_mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the model of an IMU that sends its model's readings as they are; one that turns them needs none."""
+    """Mounting of the model of an IMU that sends its model's readings unchanged; an IMU that turns them needs none."""
 
 
 Z_UP = (180.0, 0.0, 0.0)
@@ -76,22 +76,20 @@ FITS: dict[tuple[str, str], Fit] = {
     ("compass", "hmr3300"): Fit(sigma_deg=1.0),
     ("imu", "witmotion"): Fit(mounting_deg=Z_UP, model_mounting_deg=Z_UP),
 }
-"""By role ("imu", "gradienter", "compass") and protocol name; who is not here needs nothing said."""
+"""Key: role ("imu", "gradienter", "compass") and protocol name; a device not listed needs nothing."""
 
 
 def fit(role: str, name: str) -> Fit:
-    """What fits a device in a role."""
     return FITS.get((role, name), Fit())
 
 
 def law_of(device: SerialDevice) -> Law:
-    """What a device's two readings are."""
     own: Law = getattr(device, "law", "euler")
     return fit("gradienter", device.protocol).law or own
 
 
 class Devices(NamedTuple):
-    """One device for each role; one that serves two of them is there twice."""
+    """One device for each role; a device with two roles appears twice."""
 
     imu: SerialDevice
     gradienter: SerialDevice
@@ -99,14 +97,14 @@ class Devices(NamedTuple):
 
 
 def make(model: ImuModel, imu: str, gradienter: str, compass: str, seed: int) -> Devices:
-    """The devices of an aircraft, by their protocols; two roles of one name are one device.
+    """Make the devices of an aircraft, by their protocols; two roles of one name are one device.
 
     Args:
-        model: what the IMU measures; mounted as `Fit.model_mounting_deg` says.
+        model: model of the IMU, mounted as `Fit.model_mounting_deg` says.
         imu: a name of `IMUS`.
         gradienter: a name of `GRADIENTERS`.
         compass: a name of `COMPASSES`.
-        seed: of the noise.
+        seed: seed of the noise.
     """
     inertial, magnetic = IMUS[imu](model), COMPASSES[compass](model.aircraft, seed=seed)
     shared = {imu: inertial, compass: magnetic}
@@ -136,7 +134,7 @@ def site_at(latitude_deg: float, longitude_deg: float, height_m: float, unix_s: 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Everything that shares one truth."""
+    """An aircraft, its devices and its autopilot, with one truth."""
 
     aircraft: VirtualAircraft
     flight_controller_imus: tuple[ImuModel, ...]
@@ -149,7 +147,7 @@ class Scenario:
 
     @property
     def ports(self) -> dict[str, SerialDevice]:
-        """The devices by the names of their ports; one that serves two roles has one port."""
+        """Devices by the names of their ports; one with two roles has one port."""
         found: dict[str, SerialDevice] = {}
         for name, device in (("imu", self.imu), ("gradienter", self.gradienter), ("compass", self.compass)):
             if not any(device is other for other in found.values()):
@@ -178,30 +176,30 @@ def demo(
 ) -> Scenario:
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
-    The flight controller's first IMU has biases of the size of the paper's tables (162, 170, 98 deg/h; 2.4, 2.2, 0.9
-    mg: its fourth row), its second and the serial IMU others. The compass is 0.8 degrees off; the gradienter shows 3
-    and -2 millidegrees too much.
+    The flight controller's first IMU has biases of the size of the paper's tables (162, 170, 98 deg/h; 2.4, 2.2,
+    0.9 mg: its fourth row), its second and the serial IMU others. The compass is 0.8 degrees off; the gradienter shows 3 and
+    -2 millidegrees too much.
 
     Args:
-        pose: how it stands.
-        seed: of all noise.
-        unix_s: the date at the beginning.
-        motions: what happens to it.
-        gyr_cal_at_boot: the autopilot's default INS_GYR_CAL = 1, with which it has already found most of the gyro bias
-            (and has swallowed the Earth's rotation). The demonstration starts without, to have something to show.
-        firmware: whose manners the autopilot has.
-        part: what the flight controller's IMUs are.
+        pose: pose of the aircraft.
+        seed: seed of all noise.
+        unix_s: date at the beginning.
+        motions: motions of the aircraft.
+        gyr_cal_at_boot: the autopilot's default INS_GYR_CAL = 1, which has already removed most of the gyro bias (and
+            includes the Earth's rotation). The demonstration starts without, to have something to show.
+        firmware: firmware of the autopilot.
+        part: part of the flight controller's IMUs.
         gyro_deg_h: gyro biases of its first IMU.
-        accel_mg: likewise of the accelerometers.
+        accel_mg: accelerometer biases of its first IMU.
         accel_scale: relative scale errors of the accelerometers of its first two IMUs.
-        board_deg: roll and pitch by which the flight controller does not sit straight in the aircraft.
-        gradienter_offset_deg: what the gradienter shows too much, x and y.
+        board_deg: roll and pitch of the flight controller in the aircraft.
+        gradienter_offset_deg: offset of the gradienter, x and y.
         devices: families of IMU, gradienter and compass, by their names in `sim.scenario`; errors are those of the
             usual ones, any other has none.
-        warms: the air's temperature in degC, by how many kelvin the aircraft gets warmer by itself, and with which time
-            constant in s; then each IMU has a curve of its own over temperature, by the seed.
-        power_up: the same aircraft on another day: each has then other biases, about those usual ones.
-        aircraft: another that the sensors are on; `pose`, `motions` and `warms` are then its own.
+        warms: the air's temperature in degC, the self-heating in K, and its time constant in s; then each IMU has
+            a curve of its own over temperature, by the seed.
+        power_up: the same aircraft on another day: each power-up has other biases, about the usual ones.
+        aircraft: another aircraft for the sensors; `pose`, `motions` and `warms` are then its own.
     """
     air_degc, rise_k, time_constant_s = warms or (25.0, 0.0, 1.0)
     temperature_degc = Board(rise_k, time_constant_s).switched_on(air_degc)

@@ -1,4 +1,4 @@
-"""The simulator on the command line: devices on pseudo-terminals, the autopilot on UDP, and how to connect to them."""
+"""Command line of the simulator: devices on pseudo-terminals, the autopilot on UDP, and how to connect to them."""
 
 from __future__ import annotations
 
@@ -37,17 +37,16 @@ from sim.station import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
 _PROFILES = {"white_only": "icm42688p", "perfect": "icm42688p"}
-"""Parts that only simulators have, and what the companion is told instead."""
+"""Profile that the companion is told for parts that only simulators have."""
 FIRMWARE_COMMANDS = {
     "ardupilot": "a real ArduPilot SITL binary on this aircraft, and the devices",
     "px4": "a real PX4 SITL binary on this aircraft, and the devices",
     "residuals": "what each calibration leaves in a real autopilot, as a table",
 }
-"""Of `sim.sitl.cli`."""
+"""Commands of `sim.sitl.cli`."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of `python -m sim devices | autopilot | all`."""
     top = argparse.ArgumentParser(
         prog="python -m sim",
         description="A virtual aircraft that stands still somewhere near Beijing: its sensors and its autopilot.",
@@ -112,7 +111,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def add_world_options(command: argparse.ArgumentParser) -> None:
-    """--pose, --seed, --motion and --turn."""
     command.add_argument(
         "--pose",
         type=float,
@@ -136,19 +134,17 @@ def add_world_options(command: argparse.ArgumentParser) -> None:
 
 
 def add_hands(command: argparse.ArgumentParser) -> None:
-    """--hands."""
     command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
 
 
 def hands_of(arguments: argparse.Namespace, scenario: Scenario) -> Hands | None:
-    """Somebody who obeys typed lines, where --hands wants one."""
+    """Return the hands that obey typed lines, if --hands is given."""
     if not arguments.hands:
         return None
     return Hands(scenario.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=arguments.seed)
 
 
 def address(text: str) -> tuple[str, int]:
-    """HOST:PORT."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
         raise argparse.ArgumentTypeError(f"found {text!r}; allowed: HOST:PORT with a port from 1 to 65535")
@@ -185,7 +181,6 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
 
 
 def _device_lines(scenario: Scenario, directory: Path, role: str) -> list[str]:
-    """Port, line, protocol, and what fits the device in this role."""
     device: SerialDevice = getattr(scenario, role)
     fitting = fit(role, device.protocol)
     port = next(name for name, each in scenario.ports.items() if each is device)
@@ -201,7 +196,7 @@ def _device_lines(scenario: Scenario, directory: Path, role: str) -> list[str]:
 
 
 def describe(scenario: Scenario, *, devices: bool, autopilot: bool) -> str:
-    """The truth in a few lines: what a calibration should find."""
+    """Describe the truth in a few lines: the result that a calibration should find."""
     pose = scenario.aircraft.pose
     angles = f"pitch {pose.pitch_deg:g}, roll {pose.roll_deg:g}, heading {pose.heading_deg:g} deg"
     lines = [f"# The truth at the start: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
@@ -230,7 +225,7 @@ async def serve(
 ) -> None:
     """Serve until cancelled: devices if there is a directory, the autopilot if there is an address to send to.
 
-    `beside` runs with them; its end is theirs.
+    The tasks of `beside` run with them.
     """
     async with contextlib.AsyncExitStack() as stack:
         scenario.aircraft.begin(asyncio.get_running_loop().time())
@@ -262,7 +257,6 @@ async def serve(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run `devices`, `autopilot` or `all` until interrupted; returns the exit code."""
     arguments = parser().parse_args(argv)
     devices, autopilot = arguments.command != "autopilot", arguments.command != "devices"
     pitch, roll, heading = arguments.pose
@@ -316,11 +310,11 @@ def main(argv: Sequence[str]) -> int:
 async def run_until_stopped(
     serve: Callable[[asyncio.Event], Coroutine[None, None, None]], text: Callable[[], str]
 ) -> int:
-    """Serve until Ctrl-C or SIGTERM, and print how to use it once it is up; returns the exit code.
+    """Serve until Ctrl-C or SIGTERM, and print how to use it once it is up; return the exit code.
 
     Args:
-        serve: serves until cancelled, and sets the event when everything is up. What it raises is raised here.
-        text: truth and configuration, asked for when everything is up.
+        serve: serves until cancelled, and sets the event when everything is up. Its exceptions are raised here.
+        text: returns truth and configuration, once everything is up.
     """
     started = asyncio.Event()
     serving = asyncio.create_task(serve(started))

@@ -13,17 +13,17 @@ from typing import Protocol, TypeVar, cast
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MAX_QUEUED_BYTES = 65536
-"""More than this in the send buffer and packets are dropped, newest first."""
+"""With more bytes than this in the send buffer, new packets are dropped."""
 
 
 class End(Protocol):
-    """What can be put on UDP: the double, its `ground`."""
+    """One end of a UDP link: the double, its `ground`."""
 
     def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Take the function that sends."""
+        """Set the function that sends."""
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take what came."""
+        """Handle received bytes."""
 
 
 class UdpEnd(asyncio.DatagramProtocol):
@@ -33,30 +33,25 @@ class UdpEnd(asyncio.DatagramProtocol):
         self._end, self._target, self._peer = end, target, target
         self._transport: asyncio.DatagramTransport | None = None
         self.local: tuple[str, int] = ("", 0)
-        """The address the socket has."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Plug the end in."""
         self._transport = cast("asyncio.DatagramTransport", transport)
         self.local = transport.get_extra_info("sockname")[:2]
         self._end.attach(self._send)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Pull the end out."""
         self._end.attach(None)
         self._transport = None
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Give bytes to the end."""
         if self._target is None:
             self._peer = addr
         self._end.receive(data, asyncio.get_running_loop().time())
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody listens yet: go on sending."""
+        """Go on sending: nobody listens yet."""
 
     def close(self) -> None:
-        """Close the socket."""
         if self._transport is not None:
             self._transport.close()
 
@@ -70,7 +65,7 @@ class UdpEnd(asyncio.DatagramProtocol):
 
 
 async def open_udp(end: End, *, target: tuple[str, int] | None = None, listen: tuple[str, int] | None = None) -> UdpEnd:
-    """Put an end on UDP: send to `target` from any free port, or listen and answer whoever spoke last."""
+    """Open UDP for an end: send to `target` from any free port, or listen and answer the last sender."""
     if (target is None) == (listen is None):
         raise ValueError("give either a target to send to or an address to listen on")
     loop = asyncio.get_running_loop()
@@ -83,7 +78,7 @@ M = TypeVar("M", bound=mavlink.MAVLink_message)
 
 
 class Station:
-    """An `End`: sends what it is told to, keeps every message with its time. It has no opinion and no retries."""
+    """An `End` that sends given messages and keeps every received one with its time, without retries."""
 
     def __init__(self, system_id: int = 255, component_id: int = 190) -> None:
         self.heard: list[tuple[float, mavlink.MAVLink_message]] = []
@@ -92,16 +87,13 @@ class Station:
         self._transmit: Callable[[bytes], None] | None = None
 
     def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Plug in, or out."""
         self._transmit = transmit
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Remember what came."""
         for message in self._codec.parse_buffer(data) or ():
             self.heard.append((t_s, message))
 
     def send(self, message: mavlink.MAVLink_message) -> None:
-        """Send now."""
         data = message.pack(self._codec)
         self._codec.seq = (self._codec.seq + 1) % 256
         if self._transmit is not None:
@@ -113,7 +105,6 @@ class Station:
         return [(t_s, message) for t_s, message in self.heard[first:] if isinstance(message, kind)]
 
     def all(self, kind: type[M], *, since_s: float = 0.0) -> list[M]:
-        """Messages of a kind, oldest first."""
         return [message for _, message in self.timed(kind, since_s=since_s)]
 
     def texts(self) -> list[str]:
@@ -121,7 +112,7 @@ class Station:
         return [message.text for message in self.all(mavlink.MAVLink_statustext_message)]
 
     def heartbeat(self, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> None:
-        """Show that we are here, as an onboard controller or (MAV_TYPE_GCS) a ground station."""
+        """Send one heartbeat as an onboard controller or (MAV_TYPE_GCS) a ground station."""
         self.send(
             mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
         )
@@ -148,14 +139,14 @@ class Station:
         target: tuple[int, int] = (1, 1),
         kind: int = mavlink.MAV_PARAM_TYPE_REAL32,
     ) -> list[float]:
-        """PARAM_SET; returns the values of that name that come back within 0.1 s, as they are in the message."""
+        """Send PARAM_SET; return the values of that name received within 0.1 s, as they are in the message."""
         begun = len(self.heard)
         self.send(mavlink.MAVLink_param_set_message(*target, name.encode(), value, kind))
         await asyncio.sleep(0.1)
         return self._values(name, begun)
 
     async def read_parameter(self, name: str, *, target: tuple[int, int] = (1, 1)) -> list[float]:
-        """PARAM_REQUEST_READ by name; returns the values that come back within 0.1 s."""
+        """Send PARAM_REQUEST_READ by name; return the values received within 0.1 s."""
         begun = len(self.heard)
         self.send(mavlink.MAVLink_param_request_read_message(*target, name.encode(), -1))
         await asyncio.sleep(0.1)

@@ -1,4 +1,4 @@
-"""How warm a board gets by itself, and how a bias follows its temperature: for the aircraft, and for studies of days.
+"""Self-heating of a board, and a bias that follows its temperature: for the aircraft, and for studies of days.
 
 A piece of a part keeps its curve and its usual bias all its life; every power-up adds an offset of its own. The die is
 as warm as its thermometer was a moment before, so that heating and cooling differ.
@@ -16,49 +16,49 @@ import numpy as np
 from sim.earth import Array
 
 _BEND_K: Final = 40.0
-"""From the reference on a curve's square, and the cube against that, are as large as its line: one sigma."""
+"""Kelvin from the reference at which a curve's square, and its cube, are as large as its line: one sigma."""
 LAG_S: Final = (5.0, 30.0)
 RISE_K: Final = (10.0, 25.0)
 TIME_CONSTANT_S: Final = (100.0, 600.0)
 
 
 def warming(start_degc: float, end_degc: float, time_constant_s: float) -> Callable[[float], float]:
-    """A temperature that goes exponentially from one value to another, as a box that was just switched on."""
+    """Temperature that approaches `end_degc` exponentially, as in a box that was just switched on."""
     return lambda t_s: end_degc + (start_degc - end_degc) * math.exp(-max(t_s, 0.0) / time_constant_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """By how much it gets warmer than the air by itself, and with which time constant."""
+    """Self-heating over the air's temperature, and its time constant."""
 
     rise_k: float
     time_constant_s: float
 
     @classmethod
     def drawn(cls, random: np.random.Generator) -> Board:
-        """One as small aircraft have them."""
+        """Draw a typical board of a small aircraft."""
         time_constant_s = random.uniform(*TIME_CONSTANT_S)
         return cls(random.uniform(*RISE_K), time_constant_s)
 
     def switched_on(self, air_degc: float, cold: float = 1.0) -> Callable[[float], float]:
-        """Its temperature in degC by seconds since then; `cold` is 0 where it is still as warm as it gets."""
+        """Temperature in degC by seconds since power-on; `cold` is 0 for a board that is already warm."""
         return warming(air_degc + (1.0 - cold) * self.rise_k, air_degc + self.rise_k, self.time_constant_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A bias over the kelvin from the part's reference temperature.
+    """Bias over the kelvin from the part's reference temperature.
 
     Attributes:
         powers: coefficients (n,) of n axes: of the kelvin, their square, their cube.
-        lag_s: the die is as warm as its thermometer was so long before.
+        lag_s: lag of the die behind its thermometer.
     """
 
     powers: tuple[Array, ...]
     lag_s: float = 0.0
 
     def at(self, kelvin: float | Array) -> Array:
-        """The bias (n,) at one temperature, or (m, n) at m of them, (m, 1)."""
+        """Bias (n,) at one temperature, or (m, n) at m of them, (m, 1)."""
         found: Array = self.powers[-1] * kelvin
         for each in self.powers[-2::-1]:
             found = (found + each) * kelvin
@@ -67,12 +67,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """One piece of a part: three gyros, or these and three accelerometers.
+    """One piece of a part: three gyros, or three gyros and three accelerometers.
 
     Attributes:
-        curve: of its biases.
-        usual: bias (n,) at the reference temperature, in the mean of all power-ups.
-        scatter: one sigma (n,) of a power-up about that.
+        curve: curve of its biases.
+        usual: bias (n,) at the reference temperature, mean of all power-ups.
+        scatter: one sigma (n,) from power-up to power-up.
     """
 
     curve: Curve
@@ -81,11 +81,11 @@ class Piece:
 
     @classmethod
     def drawn(cls, random: np.random.Generator, usual: Array, scatter: Array, per_kelvin: Array) -> Piece:
-        """One whose slopes are normal with these sigmas (n,)."""
+        """Draw a piece whose slopes are normal with these sigmas (n,)."""
         powers = random.normal(0.0, 1.0, (3, len(per_kelvin))) * per_kelvin
         curve = Curve((powers[0], powers[1] / _BEND_K, powers[2] / _BEND_K**2), random.uniform(*LAG_S))
         return cls(curve, usual, scatter)
 
     def turned_on(self, random: np.random.Generator) -> Array:
-        """Its biases (n,) at the reference temperature in one more power-up."""
+        """Draw the biases (n,) at the reference temperature of one more power-up."""
         return np.asarray(random.normal(self.usual, self.scatter))
