@@ -177,8 +177,8 @@ def demo(
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
     The flight controller's first IMU has biases of the size of the paper's tables (162, 170, 98 deg/h; 2.4, 2.2,
-    0.9 mg: its fourth row), its second and the serial IMU others. The compass is 0.8 degrees off; the gradienter shows 3 and
-    -2 millidegrees too much.
+    0.9 mg: its fourth row), its second and the serial IMU others. The compass is 0.8 degrees off; the gradienter shows
+    3 and -2 millidegrees too much.
 
     Args:
         pose: pose of the aircraft.
