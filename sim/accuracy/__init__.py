@@ -1,1 +1,1 @@
-"""How good the estimator is: Monte Carlo of what flies, beside the physical bound and what else is done."""
+"""Accuracy of the estimator: Monte Carlo of the flying code, beside the physical bound and the common alternatives."""

@@ -1,4 +1,4 @@
-"""One aircraft of which nothing is known: turned on spots, propped up twelve times; what is found, and by others."""
+"""Aircraft without any prior calibration: turned on spots, propped up twelve times."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ PROPPED_DEG: Final = 5.0
 ARDUPILOT_READINGS: Final = 50
 """Number of readings that a level calibration of ArduPilot averages."""
 SLOPE_DEG: Final = 3.0
-"""Of the ground on which it is propped."""
+"""Slope of the ground on which it is propped."""
 SLOPES_DEG: Final = (0.5, 1.0, 3.0, 5.0)
-"""Of the spots on which it is turned."""
+"""Slopes of the spots on which it is turned."""
 TURNS: Final = tuple((headings, slope) for headings in (2, 4) for slope in SLOPES_DEG)
 """Headings and slope."""
 GYRO_SCALE, GYRO_SHEAR, STAMPS_S = 0.01, 0.005, 0.5e-3
-"""One sigma of the gyros that count the turns; and half of what their stamps are rounded to."""
+"""One sigma of scale and shear of the gyros that count the turns; half the rounding of their time stamps."""
 _FACES: Final = ((90, 0), (-90, 0), (0, -90), (0, 90), (0, 180), (0, 0))
 """Pitch and roll; up is +x, -x, +y, -y, +z, -z."""
 _EDGES: Final = ((45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90))
@@ -48,28 +48,28 @@ _EDGES: Final = ((45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandRun:
-    """Errors of one aircraft, and sigmas, in SI units; biases against their mean over the next three minutes."""
+    """Errors of one aircraft, and sigmas, in SI units; biases relative to their mean over the next three minutes."""
 
     faces: Array
     """(9,) bias, scale, shear."""
     faces_sigma: Array
     faces_checked: bool
-    """No stand was left out or in doubt."""
+    """No stand was rejected or in doubt."""
     turn: Array
     """(TURNS, 2) level bias ahead and to the right."""
     turn_sigma: Array
     slope: Array
-    """(TURNS) of the spot, rad."""
+    """Slope of the spot (TURNS), rad."""
     level: Array
     """(2,) roll and pitch of the board, on the steepest spot."""
     level_sigma: Array
     level_firmware: Array
-    """(2,) likewise of a level calibration there, with biases and scales known exactly."""
+    """(2,) the same from a firmware's level calibration there, with biases and scales known exactly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stood:
-    """One stand, as measured."""
+    """Measurement of one stand."""
 
     start_s: float
     end_s: float
@@ -94,14 +94,14 @@ class _Stood:
 
 
 class _Spot:
-    """One spot: five stands, each a quarter turn farther, and what the gyros read all the while."""
+    """One spot: five stands, each a quarter turn farther, and the gyros' readings throughout."""
 
     def __init__(self) -> None:
         self.stood: list[_Stood] = []
         self.counter = TurnCounter()
 
     def chosen(self, headings: int) -> list[StandMeans]:
-        """As `align turn` asks: there, turned by half a turn, and on to the first; or by quarters all round."""
+        """Stands that `align turn` asks for: first heading, half a turn, first heading; or quarters all round."""
         found: list[StandMeans] = []
         counter = copy.deepcopy(self.counter)  # which lets go of what was before a stand
         chosen = self.stood[::2] if headings == 2 else self.stood
@@ -116,7 +116,7 @@ class _Spot:
 
 
 class _Aircraft:
-    """An autopilot's board, put in by eye and never calibrated; somebody who moves it; and its collector."""
+    """An autopilot's board, mounted by eye and never calibrated; a person who moves it; and its collector."""
 
     def __init__(self, part: str, seed: int, number: int) -> None:
         self.random = np.random.default_rng([seed, 6, BY_HAND.index(part), number])
@@ -146,7 +146,7 @@ class _Aircraft:
         self._read_s = 0.0
 
     def _read(self, seconds: float, counter: TurnCounter | None) -> tuple[Array, Array]:
-        """The next seconds, at times whose stamps are whole milliseconds."""
+        """Read the next seconds, with time stamps in whole milliseconds."""
         times = self._read_s + (np.arange(round(seconds * RATE_HZ)) + 0.5) / RATE_HZ
         self._read_s += seconds
         rows = self.imu.read(times, 1.0 / RATE_HZ)
@@ -157,7 +157,7 @@ class _Aircraft:
         return times, rows
 
     def stand(self, move: Callable[[float], float], counter: TurnCounter | None = None) -> _Stood:
-        """Move it, and measure."""
+        """Move the aircraft and measure."""
         begin_s = math.ceil(move(self.t_s) + 1.0)
         if counter is not None:
             self._read(begin_s + 0.5 - self._read_s, counter)
@@ -179,13 +179,13 @@ class _Aircraft:
         return _Stood(window.start_s, window.end_s, window.imus[0], rows[:, 3:])
 
     def propped(self, pitch_deg: float, roll_deg: float) -> _Stood:
-        """By hand, on a slope that falls to any side."""
+        """Prop it up by hand, on a slope in a random direction."""
         azimuth = self.random.uniform(0.0, 2.0 * math.pi)
         off = self.random.normal(size=2) * PROPPED_DEG + SLOPE_DEG * np.array([math.cos(azimuth), math.sin(azimuth)])
         return self.stand(lambda t_s: self.hands.hold(t_s, pitch_deg + float(off[0]), roll_deg + float(off[1])))
 
     def on_spot(self, slope_deg: float) -> _Spot:
-        """Four quarter turns and the way on to the first heading, on a slope that falls to any side."""
+        """Measure four quarter turns and the way on to the first heading, on a slope in a random direction."""
         azimuth = self.random.uniform(0.0, 2.0 * math.pi)
         pitch, roll = slope_deg * math.cos(azimuth), slope_deg * math.sin(azimuth)
         spot = _Spot()
@@ -195,20 +195,18 @@ class _Aircraft:
         return spot
 
     def level_reading(self, bias: Array) -> Array:
-        """What the accelerometers read of a level aircraft with these biases."""
+        """Accelerometer reading of a level aircraft with these biases."""
         level = VirtualAircraft(Pose(), self.aircraft.site)
         return self.imu.in_accel_axes(level.truth_at(0.0).force_m_s2) + bias
 
 
 def _ground(site: Site) -> Ground:
-    """With no north."""
     earth = local(site)
     rate, of_rate = earth.rate_in_body(np.eye(3), heading_known=False)
     return Ground(earth.gravity_m_s2, earth.gravity_sigma_m_s2, rate, of_rate)
 
 
 def by_hand(part: str, seed: int, number: int) -> HandRun:
-    """One aircraft with this part."""
     here = _Aircraft(part, seed, number)
     spots = {slope: here.on_spot(slope) for slope in SLOPES_DEG}
     held = [here.propped(*pose) for pose in (*_FACES, *_EDGES)]
@@ -239,7 +237,7 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
 
 
 def _wander(stands: list[_Stood]) -> Array:
-    """What the bias of the next minutes is away from that of a stand, (3,)."""
+    """Change of the bias from a stand to the next minutes, (3,)."""
     use, stat = (
         np.array([getattr(one.window, name) for one in stands])
         for name in ("accel_sigma_use_m_s2", "accel_sigma_stat_m_s2")
@@ -248,7 +246,7 @@ def _wander(stands: list[_Stood]) -> Array:
 
 
 def _tilt(force: Array) -> Array:
-    """Roll and pitch of corrected accelerometers."""
+    """Roll and pitch from corrected accelerometers."""
     x, y, z = force
     return np.array([math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))])
 
@@ -266,7 +264,6 @@ COVERS: Final = (93.0, 98.0)
 
 
 def section(runs: list[HandRun], each: int) -> Section:
-    """So many aircraft of every part."""
     parts = {part: runs[each * k : each * (k + 1)] for k, part in enumerate(BY_HAND)}
     lines: list[str] = []
     claims: list[Claim] = []

@@ -16,7 +16,6 @@ HELP: Final = "errors and sigmas of the estimator, beside the physical bound"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     parser.add_argument("--runs", type=int, default=2000, help="stands with white noise (default 2000); others scale")
     parser.add_argument("--seed", type=int, default=1, help="of everything (default 1)")
     parser.add_argument("--only", help=f"sections, comma between: {','.join(SECTIONS)}")

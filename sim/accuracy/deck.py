@@ -1,7 +1,7 @@
 """Calibrations on a deck in waves: the errors and the sigmas.
 
-What the sensors say is made sample by sample by the simulator; the seconds go into `Deck` as they do in the daemon, its
-windows into `solve`.
+The simulator makes the readings sample by sample; the seconds go into `Deck` as in the daemon, its windows
+into `solve`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _CHUNK_S: Final = 30
 
 @dataclass(frozen=True, slots=True)
 class Voyage:
-    """What an aircraft on a deck goes through."""
+    """Conditions of an aircraft on a deck."""
 
     waves: tuple[Wave, ...] = SWELL
     turn_deg_s: float = 0.3
@@ -54,12 +54,12 @@ class Voyage:
     latitude_deg: float = 45.0
     compass_sigma_deg: float = COMPASS_SIGMA_DEG
     gyro_axes_sigma: float = 0.0029
-    """Scale and cross-axis errors of the gyros, one sigma: 0.5 % at the most, each as likely."""
+    """Scale and cross-axis errors of the gyros, one sigma: uniform up to 0.5 %."""
     gyro_bias_rad_s: float = GYRO_BIAS_RAD_S
     """One sigma."""
 
     def motions(self, seed: int) -> list[Motion]:
-        """From before the beginning on, for all day."""
+        """Motions from before the beginning until after the end."""
         found: list[Motion] = []
         if self.waves:
             found.append(Sea(start_s=-_BEFORE_S, waves=self.waves, seed=seed))
@@ -71,7 +71,7 @@ class Voyage:
 def sail(
     voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[GradienterModel, CompassModel], Deck] = Deck
 ) -> Errors:
-    """One aircraft with one IMU, calibrated after so many seconds each (ascending) by the deck that is `made`.
+    """Calibrate one aircraft with one IMU after each span (ascending), by the deck that `made` returns.
 
     Errors (spans, 6) are against the mean bias of the next minutes: rad/s, m/s^2, vehicle FRD.
     """
@@ -113,7 +113,7 @@ def sail(
 
 
 def feed(deck: Deck, imu: ImuModel, seconds: int, random: np.random.Generator, compass_sigma_deg: float) -> None:
-    """So many seconds of an IMU, a gradienter and a compass, from the first on."""
+    """Feed so many seconds of an IMU, a gradienter and a compass."""
     headings, tilts = _headings(imu.aircraft, seconds, random, compass_sigma_deg), _tilts(imu.aircraft, seconds, random)
     for first in range(0, seconds, _CHUNK_S):
         count = min(_CHUNK_S, seconds - first)
@@ -131,7 +131,7 @@ def feed(deck: Deck, imu: ImuModel, seconds: int, random: np.random.Generator, c
 
 
 def _headings(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator, sigma_deg: float) -> Array:
-    """Magnetic, degrees: half of the error's variance is the same on all headings, half goes with them (iron)."""
+    """Magnetic headings, degrees: half of the error's variance is constant, half depends on the heading (iron)."""
     times = np.arange(seconds * HEADING_HZ) / HEADING_HZ
     true = aircraft.angles_over(times)[:, 2]
     constant, sine, cosine = random.normal(size=3) * sigma_deg * math.sqrt(0.5)
@@ -142,7 +142,7 @@ def _headings(aircraft: VirtualAircraft, seconds: int, random: np.random.Generat
 
 
 def _tilts(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator) -> Array:
-    """What the fluid shows, degrees: as `Gradienter` has it, for all times at once."""
+    """Readings of the fluid, degrees, by the law of `Gradienter`, for all times at once."""
     step_s, each = 0.01, round(100 / TILT_HZ)
     times = np.arange(-10.0, seconds, step_s)
     felt = np.concatenate(
@@ -186,7 +186,7 @@ MOST: Final = {("gyros, deg/h", 120): 40.0, ("gyros, deg/h", 600): 10.0,
 
 
 def section(voyages: int, stands: int, seed: int, jobs: int) -> Section:
-    """The table, and what must hold of it."""
+    """Make the table and the claims."""
     sea = many(sail, [(Voyage(), SPANS_S, 10_000 * seed + number) for number in range(voyages)], jobs)
     still = many(sail, [(STILL, STILL_S, 10_000 * seed + 5_000 + number) for number in range(stands)], jobs)
     lines = [
@@ -225,7 +225,7 @@ def _rows(title: str, runs: list[Errors], index: int) -> list[str]:
 
 
 def _over_the_ground(runs: list[Errors], index: int, span_s: int) -> Figure:
-    """Sigma of the gyros over that of a mean of as long, V(T, H)."""
+    """Sigma of the gyros over that of a mean of the same length, V(T, H)."""
     model = PROFILES[STILL.part].gyro
     at_rest = math.sqrt(model.white**2 / span_s + float(floor_variance(model.flicker, model.walk, span_s, NEXT_S)))
     return rms(stack(runs, "sigma")[:, index, :3] / at_rest)

@@ -1,6 +1,6 @@
-"""The experiments: many stands each, in several processes; what comes back are errors and sigmas, truth known.
+"""The experiments: many stands each, in several processes; each returns errors and sigmas against the known truth.
 
-Each is one function of a seed, so that a run is the same however many processes share the work.
+Each is one function of a seed, so that a run does not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ TILTS: Final = (
     ("0.05 deg", 0.05),
     ("0.1 deg", 0.1),
 )
-"""References of the tilt and their sigma in degrees; of the first, every error up to its limit is as likely."""
+"""References of the tilt and their sigma in degrees; the error of the first is uniform up to its limit."""
 TILT_DRAWS: Final = 8
-"""Of a reference's error, for one stand."""
+"""Draws of a reference's error, per stand."""
 FIELD_TILT_DEG: Final = 0.01
 FIELD_HEADING_DEG: Final = 1.0
 STEP_RAD_S: Final = 1e-3
@@ -55,7 +55,7 @@ _Found = TypeVar("_Found")
 
 
 def many(one: Callable[..., _Found], arguments: Sequence[tuple[object, ...]], jobs: int) -> list[_Found]:
-    """`one(*arguments)` of all, in order."""
+    """Return `one(*arguments)` of all arguments, in order."""
     if jobs == 1:
         return [one(*each) for each in arguments]
     with ProcessPoolExecutor(jobs) as pool:
@@ -63,13 +63,13 @@ def many(one: Callable[..., _Found], arguments: Sequence[tuple[object, ...]], jo
 
 
 def plain_mean(rows: Array) -> tuple[Array, Array]:
-    """Bias (6) and its sigma (6) of readings (n, 6): their mean less a level aircraft's on an Earth at rest."""
+    """Bias (6) and its sigma (6) from readings (n, 6): their mean less that of a level aircraft on an Earth at rest."""
     level = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -STANDARD_GRAVITY_M_S2])
     return rows.mean(axis=0) - level, np.asarray(rows.std(axis=0, ddof=1) / math.sqrt(len(rows)))
 
 
 def whole_seconds(times: Array, rows: Array, window: Window) -> Array:
-    """The readings that are of this window."""
+    """Return the readings that belong to this window."""
     return np.asarray(rows[(times >= window.start_s) & (times < window.end_s)])
 
 
@@ -113,11 +113,11 @@ class FloorRun:
 
     posture: str
     ideal: Array
-    """Error with perfect references: what the IMU alone leaves."""
+    """Error with perfect references: the part of the IMU alone."""
     error: Array
     """Error with a gradienter of 0.01 deg and a compass of 1 deg."""
     sigma: Array
-    """sigma_use of the latter."""
+    """Stated sigma_use of `error`."""
     plain: Array
     plain_sigma: Array
     tilted: Array
@@ -125,7 +125,6 @@ class FloorRun:
 
 
 def floors(part: str, seed: int, number: int) -> FloorRun:
-    """One stand of this part."""
     posture = POSTURES[number % len(POSTURES)]
     site = sites()[number // len(POSTURES) % len(sites())]
     standing = stand(
@@ -176,18 +175,18 @@ def _tilted(standing: Stand, window: Window, truth: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntegerRun:
-    """One stand whose readings are cut to whole mrad/s and mg; arrays (6), in steps."""
+    """One stand whose readings are truncated to whole mrad/s and mg; arrays (6), in steps."""
 
     error: Array
     """NaN: refused."""
     sigma: Array
-    """sigma_stat; 0.5 and more where the readings do not tell."""
+    """sigma_stat; at least 0.5 where the readings do not determine the mean."""
     plain: Array
-    """Error of the plain mean with the Earth and the pose taken off."""
+    """Error of the plain mean less Earth and pose."""
 
 
 def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
-    """One stand of noise of so many steps a reading, biases uniform over two and a half steps to either side."""
+    """One stand with noise of so many steps a reading, biases uniform over two and a half steps to either side."""
     steps = np.repeat([STEP_RAD_S, MG], 3)
     density = noise_lsb / np.sqrt(float(RATE_HZ))
     spec = ImuSpec(name="cut", gyro=AxisNoise(white=density * STEP_RAD_S), accel=AxisNoise(white=density * MG))

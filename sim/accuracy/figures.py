@@ -1,4 +1,4 @@
-"""Figures with their own uncertainty, out of many stands; claims on them, and the tables that they stand in."""
+"""Figures with their own uncertainty from many stands; claims about them, and their tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Figure(NamedTuple):
     error: float
 
     def times(self, factor: float) -> Figure:
-        """In another unit."""
+        """Return the figure in another unit."""
         return Figure(self.value * factor, self.error * abs(factor))
 
 
@@ -37,7 +37,7 @@ def stack(runs: Sequence[object], name: str) -> Any:
 
 
 def rms(errors: Array) -> Figure:
-    """Root mean square of errors (stands, …), the standard error by the scatter between stands; NaN are left out."""
+    """Root mean square of errors (stands, …), the standard error from the scatter between stands; NaN is left out."""
     each = np.square(errors).reshape(len(errors), -1)
     counted = np.isfinite(each).sum(axis=1)
     if not counted.any():
@@ -50,7 +50,7 @@ def rms(errors: Array) -> Figure:
 
 
 def covered(errors: Array, sigmas: Array, times: float) -> Figure:
-    """Share of errors (stands, …) within so many sigmas, likewise."""
+    """Share of errors (stands, …) within so many sigmas, the standard error from the scatter; NaN is left out."""
     inside = (np.abs(errors) <= times * sigmas).astype(np.float64).reshape(len(errors), -1)
     known = np.isfinite(errors).reshape(len(errors), -1)
     count = float(known.sum())
@@ -65,8 +65,8 @@ def covered(errors: Array, sigmas: Array, times: float) -> Figure:
 def beside(errors: Array, efficient: Array) -> Figure:
     """Rms of errors over that of an efficient estimator on the same readings, in units of the bound (stands, …).
 
-    What is added to an efficient estimator is uncorrelated with it (Rao), so this is sqrt(1 + rms(difference)^2): the
-    luck of the readings, which both share, falls out, and few stands tell a per cent.
+    The excess over an efficient estimator is uncorrelated with it (Rao), so this is sqrt(1 + rms(difference)^2): the
+    luck of the readings, common to both, cancels, and few stands resolve one per cent.
     """
     added = rms(errors - efficient)
     value = math.sqrt(1.0 + added.value**2)
@@ -75,7 +75,7 @@ def beside(errors: Array, efficient: Array) -> Figure:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What must hold, and whether it does: beyond what chance does with this number of stands (three sigmas)."""
+    """A limit on a figure; it fails beyond the chance variation of this number of stands (three sigmas)."""
 
     words: str
     unit: str
@@ -85,7 +85,6 @@ class Claim:
 
     @property
     def holds(self) -> bool:
-        """Whether it does."""
         slack = 3.0 * self.found.error
         return self.at_least - slack <= self.found.value <= self.at_most + slack
 
@@ -99,8 +98,6 @@ class Claim:
 
 @dataclass(slots=True)
 class Section:
-    """One table."""
-
     title: str
     lines: list[str]
     claims: list[Claim] = field(default_factory=list)

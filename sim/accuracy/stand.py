@@ -1,4 +1,4 @@
-"""One aircraft standing still: a simulated IMU read sample by sample into the collector that flies, and its solution.
+"""One aircraft standing still: a simulated IMU read sample by sample into the flying collector, and its solution.
 
 Nothing of the estimator is copied or shortened: samples go into `RollingCollector` (seconds, stillness, stretch, robust
 means, ramps, sigmas), its windows into `solve` (pose, Earth, biases, covariance). The truth, its noise, its Earth and
@@ -34,14 +34,14 @@ from sim.scenario import site_at
 from sim.thermal import Curve
 
 BEGIN_S: Final = 0.5
-"""The stream begins in the middle of a second, which is not counted; the windows begin at 1 s."""
+"""Start of the stream within a second, which is not counted; the windows begin at 1 s."""
 NEXT_S: Final = 180.0
 RATE_HZ: Final = 100
 GYRO_BIAS_RAD_S: Final = 100.0 * DEG_H
-"""One sigma of the bias of a power-up, as the paper's tables scatter (method 1.3)."""
+"""One sigma of the bias of a power-up, the scatter of the paper's tables (method 1.3)."""
 ACCEL_BIAS_M_S2: Final = 2.0 * MG
 GRAVITY_ANOMALY_M_S2: Final = 3.0e-4
-"""30 mGal, one sigma: what the formula of normal gravity leaves (method 2.1)."""
+"""30 mGal, one sigma: error of the formula of normal gravity (method 2.1)."""
 STEADY_DEGC: Final = 25.0
 THERMOMETER_K: Final = 0.02
 """Noise of one reading of the IMU's own thermometer."""
@@ -54,7 +54,7 @@ _HEADING_NOISE_DEG: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Posture:
-    """How it stands, and with what: degrees; the law of the gradienter; the IMU's mounting."""
+    """Pose in degrees, law of the gradienter, mounting of the IMU."""
 
     name: str
     pitch_deg: float
@@ -62,7 +62,7 @@ class Posture:
     law: Law = "axis"
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     by_eye_deg: float = 0.0
-    """One sigma of what is added to pitch and roll, by somebody who levels it by eye."""
+    """One sigma added to pitch and roll by a person who levels it by eye."""
 
 
 POSTURES: Final = (
@@ -72,7 +72,7 @@ POSTURES: Final = (
     Posture("20/15", 20.0, 15.0, "slope", (180.0, 0.0, 90.0)),
     Posture("inverted", 10.0, 170.0, "euler"),
 )
-"""The last hangs on its back, which gradienters of law "euler" can tell; the one before carries its IMU upside down."""
+"""The last hangs on its back, for gradienters of law "euler"; the one before carries its IMU upside down."""
 
 
 @functools.cache
@@ -92,38 +92,36 @@ def local(site: Site) -> LocalEarth:
 
 @dataclass(frozen=True, slots=True)
 class AnomalousSite(Site):
-    """A place where gravity is not that of the formula."""
+    """A place where gravity differs from the formula."""
 
     anomaly_m_s2: float = 0.0
 
     @property
     def gravity_m_s2(self) -> float:
-        """What a pendulum measures there."""
+        """True gravity there."""
         return super(AnomalousSite, self).gravity_m_s2 + self.anomaly_m_s2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stand:
-    """An aircraft at rest with one IMU."""
-
     posture: Posture
     site: Site
-    """As its formula has it; the aircraft's own may have an anomaly."""
+    """Place by the formula; the aircraft's own may have an anomaly."""
     imu: ImuModel
     random: np.random.Generator
 
     @property
     def heading_deg(self) -> float:
-        """True."""
+        """True heading."""
         return self.imu.aircraft.pose.heading_deg
 
     def in_vehicle(self, rows: Array) -> Array:
-        """Readings (…, 6) of sensor axes in the vehicle's."""
+        """Turn readings (…, 6) from sensor axes to the vehicle's."""
         turn = self.imu.mounting.T
         return np.concatenate([rows[..., :3] @ turn, rows[..., 3:] @ turn], axis=-1)
 
     def bias(self, start_s: float, end_s: float) -> Array:
-        """The true mean bias (6) over a time, vehicle FRD."""
+        """True mean bias (6) over a time, vehicle FRD."""
         return self.in_vehicle(np.concatenate(self.imu.mean_bias(start_s, end_s)))
 
 
@@ -139,7 +137,7 @@ def stand(
     temperature_degc: float | Callable[[float], float] = STEADY_DEGC,
     curve: Curve | None = None,
 ) -> Stand:
-    """Put one up: its heading, its biases (unless given, in sensor axes) and its noise come from the seed."""
+    """Make a stand: heading, biases (unless given, in sensor axes) and noise come from the seed."""
     random = np.random.default_rng([*seed, 21])
     tilt = random.normal(size=2) * posture.by_eye_deg
     heading_deg = float(random.uniform(0.0, 360.0))
@@ -159,7 +157,7 @@ def stand(
 
 
 def samples(standing: Stand, seconds: float, rate_hz: int = RATE_HZ) -> tuple[Array, Array]:
-    """What the IMU says from `BEGIN_S` until `seconds` good ones are over: times (n) and readings (n, 6), its axes."""
+    """Read the IMU from `BEGIN_S` until `seconds` good ones are over: times (n) and readings (n, 6), its axes."""
     times = BEGIN_S + (np.arange(round((1.0 - BEGIN_S + seconds) * rate_hz)) + 0.5) / rate_hz
     return times, standing.imu.read(times, 1.0 / rate_hz)
 
@@ -174,9 +172,9 @@ def collected(
     horizon_s: float = NEXT_S,
     thermometer: bool = True,
 ) -> list[Window]:
-    """The windows after so many seconds each (ascending), fed sample by sample in the order of time.
+    """Return the windows after each span (ascending), fed sample by sample in the order of time.
 
-    Gradienter and compass are read without an error of their own; what a reference is wrong by comes in `solved`.
+    Gradienter and compass are read without error; `solved` adds the errors of the references.
     """
     wanted = Settings(
         min_still_s=float(spans_s[0]),
@@ -202,7 +200,7 @@ def collected(
 
 
 def _temperatures(standing: Stand, times: Array) -> list[float | None]:
-    """What its thermometer says at these times, each 0.1 s or so."""
+    """Readings of its thermometer at these times, one per 0.1 s."""
     noise = np.random.default_rng(round(1e6 * standing.heading_deg))
     coarse = np.linspace(times[0], times[-1], max(2, round(float(times[-1] - times[0]) * 10.0)))
     smooth = np.interp(times, coarse, [standing.imu.temperature_degc(float(t_s)) for t_s in coarse])
@@ -232,7 +230,7 @@ def _headings(standing: Stand, until_s: float) -> list[CompassSample]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class References:
-    """What tilt and heading are believed to be good to, and what they are wrong by; degrees."""
+    """Stated sigmas of tilt and heading, and their errors; degrees."""
 
     tilt_sigma_deg: float = 0.0
     tilt_error_deg: tuple[float, float] = (0.0, 0.0)
@@ -241,7 +239,7 @@ class References:
 
     @classmethod
     def drawn(cls, tilt_sigma_deg: float, heading_sigma_deg: float, random: np.random.Generator) -> References:
-        """Wrong by what their sigmas say."""
+        """Draw errors from the stated sigmas."""
         x, y, heading = (random.normal(size=3) * [tilt_sigma_deg, tilt_sigma_deg, heading_sigma_deg]).tolist()
         return cls(
             tilt_sigma_deg=tilt_sigma_deg,
@@ -255,12 +253,11 @@ EXACT: Final = References()
 
 
 def solved(standing: Stand, window: Window, references: References = EXACT) -> Solution:
-    """The solution of one window."""
     return solve(window, local(standing.site), *_models(standing, references), What.BOTH)
 
 
 def _models(standing: Stand, references: References) -> tuple[GradienterModel, CompassModel]:
-    """A reading that is wrong by e and taken as it is does what a right one does from which -e is taken off."""
+    """Return models with an offset of -e, which have the effect of readings that are wrong by e."""
     x, y = references.tilt_error_deg
     tilt = GradienterModel(standing.posture.law, np.eye(3), (-x, -y), references.tilt_sigma_deg)
     heading = CompassModel(
@@ -273,7 +270,7 @@ def _models(standing: Stand, references: References) -> tuple[GradienterModel, C
 
 
 def biases(found: ImuSolution) -> Array:
-    """(6,) as found, vehicle FRD; NaN where a triad is refused."""
+    """Estimated biases (6,), vehicle FRD; NaN where a triad is refused."""
     refused = np.full(3, math.nan)
     return np.concatenate(
         [
@@ -284,5 +281,4 @@ def biases(found: ImuSolution) -> Array:
 
 
 def sigmas_use(found: ImuSolution) -> Array:
-    """(6,) sigma_use."""
     return np.sqrt(np.diag(found.use_covariance))

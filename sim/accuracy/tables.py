@@ -1,4 +1,4 @@
-"""The experiments as tables, and as claims that hold or do not."""
+"""The experiments as tables and claims."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from sim.earth import STANDARD_GRAVITY_M_S2
 from sim.imu_model import DEG_H, PARTS, UG
 
 UPRIGHT: Final = ("level", "by eye", "5/-3")
-"""Where the horizontal accelerometers are the body's x and y."""
+"""Postures in which the horizontal accelerometers are the body's x and y."""
 PAPER_LEFT_UG: Final = (56.80, 36.24)
-"""Mean absolute E and N of the paper's table 1, worked out again (method 1.3)."""
+"""Mean absolute E and N of the paper's table 1, recomputed (method 1.3)."""
 _TRIADS: Final = (("gyro", "deg/h", DEG_H, slice(0, 3)), ("accel", "ug", UG, slice(3, 6)))
 _LSB_DEG_H: Final = STEP_RAD_S / DEG_H
 _REFERENCES: Final = f"gradienter {FIELD_TILT_DEG:g} deg, compass {FIELD_HEADING_DEG:g} deg"
@@ -45,16 +45,16 @@ _HALF_A_STEP: Final = 0.45
 def report(
     runs: int, seed: int, only: tuple[str, ...], jobs: int, progress: Callable[[str], None]
 ) -> dict[str, Section]:
-    """All sections asked for, by name.
+    """Return all sections asked for, by name.
 
     Args:
-        runs: stands with white noise; a fifth of it of every part, a hundredth of it in every case of a warm-up, a
-            twentieth for every step of noise under integers, a thirty-second of every rate of a ground that turns,
-            a tenth of it aircraft that are turned by hand, a twentieth that are switched on day after day.
-        seed: of everything.
-        only: of `cli.SECTIONS`.
-        jobs: processes.
-        progress: is told what begins.
+        runs: stands with white noise. A fifth of it for every part, a hundredth for every case of a warm-up, a twentieth
+            for every step of noise under integers, a thirty-second for every rate of a ground that turns; a tenth of it
+            aircraft turned by hand, a twentieth switched on day after day.
+        seed: seed of everything.
+        only: some of `cli.SECTIONS`.
+        jobs: number of processes.
+        progress: receives the name of each section at its start.
     """
     found: dict[str, Section] = {}
     if "white" in only:

@@ -1,4 +1,4 @@
-"""Aircraft that are switched on day after day: their gyros at the next power-up, and calibrated in mid-warm-up.
+"""Aircraft over many days: gyro biases at the next power-up, and calibrations in mid-warm-up.
 
 Pieces and boards are those of `sim.thermal`; each day one warms up and stands still now and then. The days are means of
 still seconds, drawn directly.
@@ -27,7 +27,7 @@ from sim.thermal import Board, Curve, Piece
 
 DAYS: Final = 20
 TRIED: Final = ("icm42688p", "bmi088", "adis16405")
-"""Their scatter includes the wandering within each power-up."""
+"""Parts whose scatter includes the wander within each power-up."""
 AMBIENT_DEGC: Final = (5.0, 40.0)
 SESSION_S: Final = (300.0, 900.0)
 AT_MOST: Final = 1.3
@@ -40,7 +40,7 @@ _UP: Final = (0.0, 0.0, -1.0)
 
 @dataclass(frozen=True, slots=True)
 class Day:
-    """A second is a row."""
+    """One row per second."""
 
     degc: Array
     k_s: Array
@@ -49,12 +49,10 @@ class Day:
 
 
 class Aircraft:
-    """One piece of a part on one board."""
-
     def __init__(
         self, noise: AxisNoise, random: np.random.Generator, shown: Callable[[Array, float], Array] | None = None
     ) -> None:
-        """`shown` makes of the board's temperature each second, and that of the air, what a thermometer shows."""
+        """`shown` maps the board's temperature each second, and the air's, to the thermometer's reading."""
         self._noise, self._random = noise, random
         self._shown = shown or (lambda board_degc, air_degc: board_degc)
         self._flicker_sigma = noise.flicker * math.sqrt(math.log(3.0) / math.pi)
@@ -64,7 +62,7 @@ class Aircraft:
         self.board = Board.drawn(random)
 
     def day(self) -> Day:
-        """The next one."""
+        """Return the next day."""
         random, count = self._random, int(self._random.uniform(*SESSION_S))
         turned_on = self.piece.turned_on(random)
         # Three times in ten it is switched on again while it is warm.
@@ -83,7 +81,7 @@ class Aircraft:
         return Day(degc + random.normal(0.0, _THERMOMETER_K, count), np.gradient(degc), bias, still)
 
     def _flicker(self, count: int) -> Array:
-        """Of many time constants: Gauss-Markov processes that add up to it."""
+        """Flicker as a sum of Gauss-Markov processes of many time constants."""
         decay = np.exp(-1.0 / _TAUS_S)[:, None]
         sigma = self._flicker_sigma
         state = self._random.normal(0.0, sigma, (len(_TAUS_S), 3))
@@ -95,7 +93,7 @@ class Aircraft:
         return found
 
     def seen(self, day: Day, number: int) -> list[Point]:
-        """What a daemon remembers of its still seconds, by kelvin."""
+        """Points by kelvin that a daemon would remember of the still seconds."""
         points = []
         kelvin = np.floor(day.degc)
         for step in dict.fromkeys(kelvin[day.still].tolist()):
@@ -124,7 +122,7 @@ class Aircraft:
 
 
 def power_up(part: str, seed: int, number: int) -> Errors:
-    """One aircraft of a part: twenty days, and what is known when it is switched on again, over the part's scatter."""
+    """One aircraft of a part: twenty days, then the error at the next power-up, over the part's scatter."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
     aircraft = Aircraft(PARTS[part].gyro, random)
@@ -154,7 +152,6 @@ def _vector(values: Array) -> tuple[float, float, float]:
 
 
 def power_up_section(runs: list[Errors], each: int) -> Section:
-    """So many aircraft of every part."""
     lines = [
         "the gyros' bias at power-up, rms error in deg/h: by the curve, sigma, 2 sigma cover;",
         "over the scatter",
@@ -186,25 +183,25 @@ def power_up_section(runs: list[Errors], each: int) -> Section:
 RATES_K_MIN: Final = (0.5, 2.0, 5.0)
 SPANS_S: Final = (15, 60)
 _FLAT: Final = 5.0
-"""Time constants after which it is warm."""
+"""Time constants until it counts as warm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MidRun:
-    """Of every span, (spans, 3): errors and sigmas at the end of the window, and when warm; rad/s; NaN: not told."""
+    """Per span, (spans, 3): errors and sigmas at the end of the window, and when warm; rad/s; NaN: no estimate."""
 
     error: Array
     sigma: Array
     warm_error: Array
     warm_sigma: Array
     plain_error: Array
-    """Without the curve."""
+    """Error without the curve."""
     plain_sigma: Array
     plain_warm_error: Array
 
 
 def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
-    """One aircraft, its earlier days, and a stand in whose middle its temperature rises so fast."""
+    """One aircraft, its earlier days, and a stand in whose middle the temperature rises at this rate."""
     random = np.random.default_rng([seed, 77, number, round(10.0 * rate_k_min)])
     rate_k_s = rate_k_min / 60.0
     on_s = -1.0
@@ -259,7 +256,6 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
 
 
 def mid_warm_up_section(runs: list[MidRun], each: int) -> Section:
-    """So many aircraft of every part and rate."""
     lines = [
         "gyros, rms error in deg/h, sigma, 2 sigma cover:",
         "at the end of the window without and with the curve; when warm, as foretold;",

@@ -1,8 +1,8 @@
-"""A platform that turns slowly, from the start or after a rest: what is written all the same?
+"""Calibrations on a platform that turns slowly, from the start or after a rest: share of wrong results that would be written.
 
-An aircraft stands on something that turns about the vertical. Its readings go second by second into the collector that
-flies; whenever that has enough and nothing is in the way, a calibration is worked out, as if somebody had asked at that
-very moment. Counted are those whose error is more than three times the sigma that they state.
+An aircraft stands on a platform that turns about the vertical. Its readings go second by second into the flying
+collector; at every moment at which a calibration is possible, one is computed. A wrong result is one whose error
+exceeds three times its stated sigma.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sim.scenario import site_at
 RATES_DEG_S: Final = (0.0, 0.01, 0.02, 0.05, 0.15, 0.4, 1.0, 2.0)
 REST_S: Final = 40.0
 TURNS_S: Final = 80.0
-"""So long it is watched, from the start of the turn on."""
+"""Observed time from the start of the turn on."""
 SIGMAS: Final = 3.0
 FALSE_PERCENT: Final = 0.5
 NEXT_S: Final = 180.0
@@ -56,7 +56,7 @@ VN100: Final = ImuSpec(
     gyro=AxisNoise(white=8.9 * DEG_H, flicker=7.0 / 0.664 * DEG_H, walk=7.0 * math.sqrt(3e-3) * DEG_H),
     accel=AxisNoise(white=99 * _UG, flicker=40 / 0.664 * _UG, walk=40 * math.sqrt(3e-3) * _UG),
 )
-"""0.0035 deg/s/sqrt(Hz), 5 to 7 deg/h; 140 ug/sqrt(Hz), 40 ug (VectorNav's data sheet); random walk as the others'."""
+"""0.0035 deg/s/sqrt(Hz), 5 to 7 deg/h; 140 ug/sqrt(Hz), 40 ug (VectorNav's data sheet); random walk as of the other parts."""
 SPECS: Final = {"vn100": VN100, **{name: PARTS[name] for name in ("icm42688p", "bmi088", "adis16405")}}
 
 
@@ -66,11 +66,9 @@ COMPASSES: Final = {"0.5 deg": (0.5, 0.0), "steps of 0.1": (0.05, 0.1), "steps o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One stand."""
-
     part: str
     learned: bool
-    """The part's own profile; else that of an unknown part."""
+    """Profile of the part itself; else that of an unknown part."""
     compass: str
     rate_deg_s: float
     begins: Begins
@@ -79,16 +77,16 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What came of it."""
+    """Result of one stand."""
 
     looks: int
-    """Seconds at which it was looked at, as soon as it could have been enough."""
+    """Number of seconds at which a calibration was possible in time."""
     refused: int
-    """At so many of them something was in the way."""
+    """Number of them at which a calibration was refused."""
     named: int
-    """Of those, so many said that the aircraft turns."""
+    """Number of refusals that named a turn."""
     worst: float
-    """Largest error of a gyro over the sigma stated, against the bias of the window."""
+    """Largest gyro error over its stated sigma, against the bias of the window."""
     largest_deg_h: float
     """Largest error against the bias of the window."""
 
@@ -102,7 +100,7 @@ def _profile(case: Case) -> NoiseProfile:
 
 
 class Platform:
-    """One stand, its collector, and what has become of it."""
+    """One stand, its collector, and the result so far."""
 
     def __init__(self, case: Case) -> None:
         self.random = random = np.random.default_rng([case.seed, 31])
@@ -146,7 +144,7 @@ class Platform:
         return found.gyro_rad_s - then, found.gyro_sigma_use_rad_s
 
     def samples(self) -> list[tuple[float, Callable[[], object]]]:
-        """All samples in the order of time, each with what hands it over."""
+        """All samples in the order of time, each with the call that delivers it."""
         collector, random, end_s = self.collector, self.random, self.end_s
         found: list[tuple[float, Callable[[], object]]] = []
         times = (np.arange(round(end_s * IMU_HZ)) + 0.5) / IMU_HZ
@@ -171,7 +169,6 @@ class Platform:
 
 
 def run(case: Case) -> Found:
-    """Play one stand."""
     platform = Platform(case)
     collector, samples = platform.collector, platform.samples()[::-1]
     found: list[tuple[Array, Array]] = []
@@ -197,7 +194,7 @@ def run(case: Case) -> Found:
 
 
 def cases(rate_deg_s: float, seeds: int, first: int = 0) -> list[Case]:
-    """So many stands of one rate, over all parts, profiles, compasses and beginnings in turn."""
+    """Cases of one rate, over all parts, profiles, compasses and beginnings in turn."""
     begins: tuple[Begins, ...] = ("at the start", "after rest")
     kinds = [
         kind
@@ -217,7 +214,7 @@ deg/s  compass       stands  looks   way, %       %   sigmas  sigmas  deg/h"""
 
 
 def section(stands: int, seed: int, jobs: int) -> Section:
-    """By rate, with and without a compass: so many stands of every rate."""
+    """Make the table by rate, with and without a compass."""
     work = [(case,) for rate in RATES_DEG_S for case in cases(rate, stands, 1_000_000 * (seed - 1))]
     rows: dict[tuple[float, bool], list[Found]] = {}
     for (case,), one in zip(work, many(run, work, jobs), strict=True):

@@ -36,21 +36,21 @@ from sim.thermal import warming
 NEXT_MINUTE_S: Final = 60.0
 WARMING: Final = ("adis16405", "icm42688p", "bmi088", "vn100")
 RAMPS: Final = (0.3, 1.0, 3.0, 10.0)
-"""Of the gyros, (deg/h)/s; the accelerometers' are what the same change of temperature makes."""
+"""Rates of the gyro biases, (deg/h)/s; the accelerometers' follow from the same change of temperature."""
 CURVES_S: Final = (60.0, 300.0, 1200.0)
 """Time constants."""
 CURVE_K: Final = 20.0
 LATE_S: Final = (5.0, 120.0)
-"""After the switch-on, when the stream begins."""
+"""Start of the stream after the switch-on."""
 ON_S: Final = (0.0, 600.0, 3600.0)
-"""For how long a part at a steady temperature has been on already."""
+"""Time since the switch-on of a part at a steady temperature."""
 VN100: Final = (allan_model(8.9 * DEG_H, 5.0 * DEG_H), allan_model(99.0 * UG, 40.0 * UG))
-"""The catalogue has none."""
+"""Profile by the data sheet; the catalogue has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What its temperature does, and what is known of that."""
+    """A temperature history, and the knowledge of it."""
 
     thermometer: bool
     ramp_deg_h_s: float = 0.0
@@ -60,11 +60,11 @@ class Case:
 
     @property
     def is_steady(self) -> bool:
-        """Whether it neither warms nor cools."""
+        """Neither warms nor cools."""
         return not self.ramp_deg_h_s and not self.curve_s
 
     def temperature(self, per_kelvin_rad_s: float) -> Callable[[float], float]:
-        """By aircraft time."""
+        """Temperature by aircraft time."""
         if self.curve_s:
             curve = warming(STEADY_DEGC - CURVE_K, STEADY_DEGC, self.curve_s)
             return lambda t_s: curve(t_s + self.late_s)
@@ -73,7 +73,6 @@ class Case:
 
 
 def cases() -> tuple[Case, ...]:
-    """All of the table, in its order."""
     found: list[Case] = []
     for seen in (False, True):
         found += [Case(seen, on_s=on_s) for on_s in (ON_S if not seen else ON_S[:1])]
@@ -84,7 +83,7 @@ def cases() -> tuple[Case, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WarmRun:
-    """Errors against the mean bias of the next minute, sigma_use, and the warm-up's part of that; (spans, 6)."""
+    """Errors against the mean bias of the next minute, sigma_use, and the warm-up's part of it; (spans, 6)."""
 
     error: Array
     sigma: Array
@@ -92,7 +91,6 @@ class WarmRun:
 
 
 def warm(part: str, case: Case, seed: int, number: int) -> WarmRun:
-    """One stand of this part in this case."""
     posture, site = POSTURES[number % 3], sites()[number % len(sites())]
     standing = stand(
         part,
@@ -123,7 +121,7 @@ def warm(part: str, case: Case, seed: int, number: int) -> WarmRun:
 
 
 def _windows(standing: Stand, taken: ImuInput, times: Array, rows: Array, *, thermometer: bool) -> list[Window | None]:
-    """One of each span; None from where on it is refused: what drifts too fast is no still stretch."""
+    """Windows of each span; None from the first refusal on: a stretch that drifts too fast is not still."""
     for count in range(len(SPANS_S), 0, -1):
         spans = SPANS_S[:count]
         until = times < 1.0 + spans[-1]
@@ -144,7 +142,6 @@ _ON: Final = {0.0: "just on", 600.0: "10 min on", 3600.0: "1 h on"}
 
 
 def section(runs: list[WarmRun], each: int) -> Section:
-    """Of every part, case after case: so many runs each."""
     flat = iter(runs)
     by_case = {(part, case): [next(flat) for _ in range(each)] for part in WARMING for case in cases()}
     lines = [

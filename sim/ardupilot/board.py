@@ -1,4 +1,4 @@
-"""What ArduPilot's parts have in common: sensors, estimator, parameters, and a voice."""
+"""The base of ArduPilot's parts: sensors, estimator, parameters, and texts."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ LOOP_RATE_HZ = {"copter": 400.0, "plane": 50.0}
 
 
 class YawSource(Protocol):
-    """An external estimate as the messages show it."""
+    """An external attitude estimate, as the messages show it."""
 
     @property
     def selected(self) -> bool:
-        """Whether the heading comes from it."""
+        """Heading comes from it."""
 
     @property
     def aligned(self) -> bool:
-        """Whether the filter has taken a heading from it."""
+        """The filter has accepted a heading from it."""
 
     def choose(self, source_set: int) -> None:
-        """Take another set of sources, 1 to 3."""
+        """Select another set of sources, 1 to 3."""
 
 
 class Board(AutopilotDouble):
@@ -40,14 +40,14 @@ class Board(AutopilotDouble):
 
     Args:
         aircraft: the truth.
-        imus: one to three models; the first is IMU 1. Their `mounting_deg` is how the board is really turned, which
+        imus: one to three models; the first is IMU 1. Their `mounting_deg` is the true orientation of the board, which
             AHRS_ORIENTATION (default none) is meant to undo.
-        version: "4.3" to "4.8"; `sim.ardupilot.parameters` says how they differ.
+        version: "4.3" to "4.8"; `sim.ardupilot.parameters` has the differences.
         vehicle: "copter" (loop 400 Hz) or "plane" (50 Hz: nothing above 40 Hz).
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
-        up_s: how long it has been running when the simulation begins.
-        auxiliary: whether the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
-        script: whether companion_arming.lua runs on it; of that, only what it tells of the IMUs in floats.
+        up_s: time since its boot at the beginning of the simulation.
+        auxiliary: the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
+        script: companion_arming.lua runs on it; modelled are only its IMU readings in floats.
     """
 
     external_nav: YawSource
@@ -82,20 +82,20 @@ class Board(AutopilotDouble):
         self.parameters = self._new_store(parameters or {}, auxiliary=auxiliary)
         self.estimator = CoarseEstimator()
         self.airspeed_m_s = 0.0
-        """What its VFR_HUD says."""
+        """Airspeed in VFR_HUD."""
         self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]
         self.calibrations = Calibrations(self._paths, self.parameters, self.random)
         self._frozen: dict[int, Array] = {}
 
     def exchange_imu(self, model: ImuModel, device_id: int) -> None:
-        """Another sensor in the place of IMU 1: its id comes with the restart, the offsets stay (`register_accel`)."""
+        """Put another sensor in the place of IMU 1: its id comes with the restart, the offsets stay (`register_accel`)."""
         self._paths[0] = InertialPath(model, 1, self.parameters, seed=device_id)
         for half in ("GYR", "ACC"):
             self.parameters.set(f"INS_{half}_ID", device_id)
         self.reboot()
 
     def residual(self, instance: int, loop_s: float) -> Bias:
-        """What is left in the output of IMU `instance` (1..3) after offsets and scales: output minus truth, FRD."""
+        """Error left in the output of IMU `instance` (1..3) after offsets and scales: output minus truth, FRD."""
         t_s = self.aircraft.time_at(loop_s)
         output, truth = self._paths[instance - 1].corrected(t_s, armed=self.armed), self.aircraft.truth_at(t_s)
         return Bias(output[:3] - truth.rate_rad_s, output[3:] - truth.force_m_s2)
@@ -119,7 +119,7 @@ class Board(AutopilotDouble):
         return output
 
     def update_estimator(self, loop_s: float) -> None:
-        """Bring the estimator to this time; to be called before anything changes the output."""
+        """Bring the estimator to this time; call it before anything changes the output."""
         error = self.residual(1, loop_s)
         self.estimator.update(self.aircraft.time_at(loop_s), error.gyro_rad_s, error.accel_m_s2)
 
@@ -134,10 +134,10 @@ class Board(AutopilotDouble):
 
     @abc.abstractmethod
     def announce(self, names: Iterable[str]) -> None:
-        """PARAM_VALUE on every port for what the autopilot itself has changed and saved."""
+        """Send PARAM_VALUE on every port for values that the autopilot itself has changed and saved."""
 
     def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT on every port, cut at 50 characters a chunk."""
+        """Send STATUSTEXT on every port, in chunks of 50 characters."""
         data = text.encode()
         chunks = [data[start : start + 50] for start in range(0, len(data), 50)]
         text_id = int(self.random.integers(1, 65536)) if len(chunks) > 1 else 0
@@ -157,7 +157,7 @@ class Board(AutopilotDouble):
 
 
 MAX_INTERVALS = 10
-"""Different intervals that one port can keep, beside the heartbeat's; the next one gets the nearest of these."""
+"""Different intervals per port, beside the heartbeat's; a further one gets the nearest of these."""
 
 
 class ArduPilotChannel(Channel):
@@ -176,7 +176,7 @@ class ArduPilotChannel(Channel):
         self.streams[message_id] = Stream(interval_s, now_s + interval_s)
 
     def due(self, now_s: float) -> list[int]:
-        """Message ids whose time has come; a stream that fell behind skips, it never bursts."""
+        """Message ids that are due; a stream that fell behind skips, it never bursts."""
         due = []
         for message_id, stream in self.streams.items():
             if stream.next_s <= now_s + 1e-9:

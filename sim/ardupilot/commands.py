@@ -21,9 +21,9 @@ ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
 )
 ACK_DELAY_S = 0.003
 REBOOT_DELAY_S = 0.7
-"""From the acknowledgement to the restart; until then it goes on as if nothing were."""
+"""Time from the acknowledgement to the restart; until then it runs normally."""
 _FORCE_ARM: dict[float, Version] = {2989.0: "4.3", 21196.0: "4.6"}
-"""The words that force arming, and since when."""
+"""Magic numbers that force arming, and their first version."""
 
 
 class CommandServer:
@@ -43,7 +43,7 @@ class CommandServer:
         }
 
     def handle(self, command: Command) -> None:
-        """Do it, and acknowledge."""
+        """Carry out a command, and acknowledge."""
         handler = self._handlers.get(command.number)
         result = UNSUPPORTED if handler is None else handler(command)
         if result is not None:

@@ -1,7 +1,7 @@
-"""An ArduPilot that fits in a test: parameters, telemetry and manners of the real one, on any event loop.
+"""A double of ArduPilot: parameters, telemetry and behaviour of the real one, on any event loop.
 
-What is modelled follows what was read in ArduPilot's sources and seen in runs of the real firmware (autopilots
-1, 2, 3, 5.4, 7.5, 9.1 and 9.3.1); the class says what is not.
+The model follows ArduPilot's sources and runs of the real firmware (autopilots 1, 2, 3, 5.4, 7.5, 9.1 and 9.3.1); the
+class lists what is missing.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ FLOATS_ASKED_S = 3.0
 class ArduPilotDouble(Board):
     """An autopilot with up to three IMUs on a virtual aircraft.
 
-    It is an `End` (attach, receive) on which the companion is plugged in; `ground` is a second one for a ground
-    station. `run` sends what is due; answers need only the running loop. Time is the loop's clock.
+    It is an `End` (attach, receive) for the companion; `ground` is a second one for a ground station. `run` sends due
+    messages; answers need only the running loop. Time is the loop's clock.
 
     Not modelled: flight, notches, the learning of a temperature calibration (INS_TCALn_ENABLE = 2), missions,
     LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, calibrations of accelerometers and of the level, ODOMETRY,
@@ -53,34 +53,30 @@ class ArduPilotDouble(Board):
     # What tests and people do to it.
 
     def parameter(self, name: str) -> float:
-        """What is stored; KeyError if there is none of that name."""
         return self.parameters.values[name]
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set without telling anyone, as if it had always been so."""
+        """Set a value silently, as if it had always been so."""
         self.parameters.set(name, value)
 
     def write_as_another_station(self, name: str, value: float) -> None:
-        """Another ground station sets a parameter: stored, and announced on every port."""
+        """Set a parameter as another ground station does: stored, and announced on every port."""
         self.update_estimator(self.now_s())
         self.parameters.set(name, value)
         for member in self.parameters.family(name):
             self._parameter_server.announce(member)
 
     def arm(self) -> None:
-        """The pilot arms."""
         if not self.armed:
             self.armed = True
             self.say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
 
     def disarm(self) -> None:
-        """The pilot disarms."""
         if self.armed:
             self.armed = False
             self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
     def prearm_failures(self, loop_s: float) -> list[str]:
-        """Why it would not arm, in the firmware's words without the prefix."""
         failures = [] if self.calibrations.gyros_ok else ["Gyros not calibrated"]
         values = self.parameters.values
         outputs = [path.corrected(self.aircraft.time_at(loop_s)) for path in self._paths]
@@ -114,14 +110,13 @@ class ArduPilotDouble(Board):
         return roll + roll_error - trim["AHRS_TRIM_X"], pitch + pitch_error - trim["AHRS_TRIM_Y"], float(yaw)
 
     def announce(self, names: Iterable[str]) -> None:
-        """PARAM_VALUE on every port for what the autopilot itself has changed and saved."""
         for name in names:
             self._parameter_server.announce(name)
 
     # The inside.
 
     def build(self, message_id: int, loop_s: float) -> Message | None:
-        """A message of `BUILDERS`, or the script's floats; None while it may not send those."""
+        """Build a message of `BUILDERS`, or the script's floats; None while the script may not send."""
         if message_id != FLOATS:
             return BUILDERS[message_id](self, loop_s)
         return script_floats(self, loop_s) if loop_s < self._floats_until_s and not self.armed else None
@@ -144,7 +139,7 @@ class ArduPilotDouble(Board):
         self._start_heartbeats(loop_s)
 
     def _choose_yaw_source(self, loop_s: float) -> None:
-        """A boot: without a compass the heading begins at north, whatever it is."""
+        """Handle a boot: without a compass the estimated heading begins at north."""
         self.external_nav.restart()
         self.estimator.compass = not self.external_nav.selected
         if self.external_nav.selected:
@@ -152,7 +147,7 @@ class ArduPilotDouble(Board):
             self.estimator.yaw_error_rad = -yaw
 
     def _boot_gyros(self, t_s: float) -> None:
-        """INS_GYR_CAL = 1: every boot measures the gyro offsets anew and throws the stored ones away."""
+        """INS_GYR_CAL = 1: every boot measures the gyro offsets anew and drops the stored ones."""
         self.calibrations.gyros_ok = True
         if self.parameters.values["INS_GYR_CAL"] == 1:
             self.calibrations.gyros(t_s)
@@ -190,10 +185,10 @@ class ArduPilotDouble(Board):
 
 
 class Router:
-    """Learns where components are from every message, and never forgets until a reboot.
+    """Learns routes from every message, and keeps them until a reboot.
 
-    A message addressed to the vehicle's system and to a component that has been heard only on the sender's own port,
-    or never, is executed by the autopilot itself (autopilots 5.4, rule 1e).
+    A message addressed to the vehicle's system and to a component that has been heard only on the sender's own port, or
+    never, is executed by the autopilot itself (autopilots 5.4, rule 1e).
     """
 
     def __init__(self, system_id: int, channels: Sequence[Channel]) -> None:
@@ -202,11 +197,10 @@ class Router:
         self._routes: dict[tuple[int, int], set[int]] = {}
 
     def forget(self) -> None:
-        """A reboot."""
         self._routes.clear()
 
     def route(self, came_by: Channel, message: Message) -> bool:
-        """Learn, forward, and say whether the autopilot is to handle the message itself."""
+        """Learn, forward, and return whether the autopilot handles the message itself."""
         here = self._channels.index(came_by)
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self._system_id, 1):

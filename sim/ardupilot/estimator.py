@@ -1,8 +1,8 @@
 """A coarse stand-in for EKF3: a gyro bias estimate that goes stale after a write, and an attitude that follows.
 
-Only what a companion can see and must reckon with (autopilots 1.7 and 9.3.1): after a step in the offsets the old
-estimate stays and fades over about two minutes; the autopilot's own gyro calibration resets it; a horizontal
-accelerometer error becomes a tilt error; after a boot the vertical estimate is wrong by hundreds of deg/h for a while.
+Only effects that matter to a companion (autopilots 1.7 and 9.3.1): after a step in the offsets the old estimate stays
+and fades over about two minutes; the autopilot's own gyro calibration resets it; a horizontal accelerometer error
+becomes a tilt error; after a boot the vertical estimate is wrong by hundreds of deg/h for a while.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from sim.imu_model import DEG_H
 _BIAS_FADES_S = 40.0
 _TILT_FADES_S = 10.0
 _YAW_FADES_S = 40.0
-"""How fast the compass takes a wrong heading back: 5 deg at 40 s after a step of 0.3 deg/s, under 1 deg at 140 s."""
+"""Time constant of the compass correcting a wrong heading: 5 deg at 40 s after a step of 0.3 deg/s, under 1 deg at 140 s."""
 _TILT_PART_1_S = 0.135
 _TILT_PART_FADES_S = 9.0
-"""After a reset of the gyro biases the estimator takes part of a tilt error that it corrects for gyro bias: 850 deg/h
-of 1.75 deg, gone within half a minute, as the real one showed after a step of 30 mg."""
+"""After a reset of the gyro biases the estimator mistakes part of a tilt error that it corrects for gyro bias: 850 deg/h
+of 1.75 deg, gone within half a minute, as in the real firmware after a step of 30 mg.
+"""
 _START_ERROR_RAD_S = np.array([60.0, 40.0, -1500.0]) * DEG_H
 
 
 class CoarseEstimator:
-    """States in vehicle FRD; `update` wants the current errors of the corrected IMU output."""
+    """States in vehicle FRD; `update` takes the current errors of the corrected IMU output."""
 
     def __init__(self) -> None:
         self.gyro_bias_rad_s = np.zeros(3)
@@ -34,7 +35,7 @@ class CoarseEstimator:
         """Roll, pitch."""
         self.yaw_error_rad = 0.0
         self.compass = True
-        """Whether a compass takes a wrong heading back."""
+        """A compass corrects a wrong heading."""
         self._start_error = np.zeros(3)
         self._tilt_part: Array = np.zeros(3)
         self._tilt_goal: Array = np.zeros(2)
@@ -42,7 +43,7 @@ class CoarseEstimator:
         self.reset(0.0)
 
     def reset(self, t_s: float) -> None:
-        """A start at this time: nothing known yet, and the vertical bias about to be mistaken."""
+        """Start at this time: nothing is known yet, and the vertical bias will be mistaken."""
         self.gyro_bias_rad_s[:] = 0.0
         self.tilt_error_rad[:] = 0.0
         self.yaw_error_rad = 0.0
@@ -51,19 +52,19 @@ class CoarseEstimator:
         self._time_s = t_s
 
     def reset_gyro_bias(self) -> None:
-        """What the autopilot's own gyro calibration does."""
+        """Reset as the autopilot's own gyro calibration does."""
         self.gyro_bias_rad_s[:] = 0.0
         self._start_error[:] = 0.0
         self._tilt_part[:2] = _TILT_PART_1_S * (self._tilt_goal - self.tilt_error_rad)
 
     @property
     def omega_i(self) -> Array:
-        """What AHRS.omegaI shows: minus the estimated gyro bias."""
+        """AHRS.omegaI: minus the estimated gyro bias."""
         result: Array = -(self.gyro_bias_rad_s + self._start_error + self._tilt_part)
         return result
 
     def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
-        """Go to this time, the errors (output minus truth) having been these since the last update."""
+        """Advance to this time, with these errors (output minus truth) since the last update."""
         tilt = np.array([-accel_error[1], accel_error[0]]) / STANDARD_GRAVITY_M_S2
         span = max(t_s - self._time_s, 0.0)
         stays = math.exp(-span / _BIAS_FADES_S)

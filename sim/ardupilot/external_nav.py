@@ -1,4 +1,4 @@
-"""What the double makes of an attitude from outside: VisOdom takes it in, EKF3 uses its yaw where it is told to.
+"""External attitude in the double: VisOdom accepts it, EKF3 uses its yaw if a source set selects it.
 
 Facts: ArduPilot `GCS_Common.cpp`, `AP_VisualOdom_MAV.cpp`, `AP_NavEKF3_Measurements.cpp` (writeExtNavData),
 `AP_NavEKF3_MagFusion.cpp` (2026-03). VISO_TYPE and EK3_SRCn_YAW count as they were at the boot. Not modelled: position
@@ -19,11 +19,11 @@ EXTNAV = 6
 LEAST_SPACING_MS = 20
 HEALTHY_S = 0.3
 YAW_NOISE_RAD = 0.2
-"""VISO_YAW_M_NSE's default: the least sigma that is believed; above 1.5 rad it is cut."""
+"""VISO_YAW_M_NSE's default: the smallest accepted sigma; above 1.5 rad it is cut."""
 GATE_SIGMAS = 3.0
 """EK3_YAW_I_GATE."""
 FUSED_S = 2.0
-"""How fast the heading follows: of the order of the real one's at 30 Hz and this noise."""
+"""Time constant of the heading: about that of the real one at 30 Hz and this noise."""
 
 
 class ExternalNav:
@@ -32,15 +32,14 @@ class ExternalNav:
     def __init__(self, double: Board) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
-        """By reason."""
+        """Rejected messages by reason."""
         self.consumed = 0
-        """Messages that came through to the EKF."""
+        """Messages that reached the EKF."""
         self.sigma_rad = math.nan
-        """Of yaw, as the EKF took it last."""
+        """Sigma of the yaw last used by the EKF."""
         self.restart()
 
     def restart(self) -> None:
-        """A boot."""
         values = self._double.parameters.values
         self.enabled = values["VISO_TYPE"] == 1
         self._sources = {number: values.get(f"EK3_SRC{number}_YAW", 0.0) for number in (1, 2, 3)}
@@ -51,7 +50,7 @@ class ExternalNav:
         self._heard_s = self._fused_s = -math.inf
 
     def choose(self, source_set: int) -> None:
-        """Take the sources of a set: the heading is reset to what the new one says, as soon as it says it."""
+        """Select the sources of a set: the heading is reset to the new source's next value."""
         double = self._double
         self.source_set = source_set
         self.selected = self._sources[source_set] == EXTNAV
@@ -62,11 +61,10 @@ class ExternalNav:
             self.aligned = True
 
     def healthy(self, loop_s: float) -> bool:
-        """What the check before arming asks."""
+        """Return the result of the check before arming."""
         return loop_s - self._heard_s < HEALTHY_S
 
     def take(self, message: mavlink.MAVLink_vision_position_estimate_message, loop_s: float) -> None:
-        """Handle a VISION_POSITION_ESTIMATE."""
         covariance = message.covariance
         if not self.enabled:
             self.rejected["off"] += 1

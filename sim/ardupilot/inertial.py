@@ -38,7 +38,7 @@ _DAMPING = math.sqrt(0.5)
 
 
 def orientation_matrix(store: ParameterStore) -> Array:
-    """Board to vehicle for AHRS_ORIENTATION, with 101 and 102 the custom rotations; unknown numbers are none."""
+    """Board to vehicle for AHRS_ORIENTATION, with 101 and 102 the custom rotations; unknown numbers mean no rotation."""
     number = int(store.effective["AHRS_ORIENTATION"])
     if number in (101, 102):
         if not store.effective["CUST_ROT_ENABLE"]:
@@ -49,7 +49,7 @@ def orientation_matrix(store: ParameterStore) -> Array:
 
 
 class InertialPath:
-    """One IMU as the autopilot reports it. Times are aircraft time and must not go back between `reset`s."""
+    """Output of one IMU of the autopilot. Times are aircraft time and must not go back between `reset`s."""
 
     def __init__(self, model: ImuModel, instance: int, store: ParameterStore, *, seed: int) -> None:
         self.model, self.instance = model, instance
@@ -70,16 +70,16 @@ class InertialPath:
         self._board_checked_s = -math.inf
 
     def reset(self) -> None:
-        """A boot: the filter starts anew."""
+        """Handle a boot: the filter starts anew."""
         self._time_s = None
         self._board_checked_s = -math.inf
 
     def corrected(self, t_s: float, *, armed: bool = False) -> Array:
-        """What the output would be without noise and filter (6): rates and specific forces in vehicle FRD."""
+        """Output without noise and filter (6): rates and specific forces in vehicle FRD."""
         return self._correct(self.model.expected(t_s), t_s, armed=armed)
 
     def output(self, t_s: float, *, armed: bool = False) -> Array:
-        """The filtered reading at this time (6), in vehicle FRD by the orientation that is set."""
+        """Filtered reading at this time (6), in vehicle FRD by the orientation that is set."""
         if self._time_s is None:
             self._start(t_s)
         assert self._time_s is not None
@@ -112,7 +112,7 @@ class InertialPath:
         return max(self._store.effective["INS_GYRO_FILTER"], 1.0)
 
     def _correct(self, raw: Array, t_s: float, *, armed: bool) -> Array:
-        """Readings (6) or (n, 6) as they come out, with the parameters and the temperature of this time."""
+        """Apply the parameters and the temperature of this time to readings (6) or (n, 6)."""
         store = self._store
         if self._revision != store.revision:
             self._revision = store.revision
@@ -128,7 +128,7 @@ class InertialPath:
         return result
 
     def _warm(self, t_s: float) -> Array:
-        """What INS_TCALn_* takes off, (6): zero at CALTEMP, and level beyond TMIN and TMAX."""
+        """Correction by INS_TCALn_*, (6): zero at CALTEMP, and level beyond TMIN and TMAX."""
         if self._tcal is None:
             return np.zeros(6)
         low, high, coefficients, caltemps = self._tcal
@@ -187,30 +187,30 @@ AVERAGED_S = 0.5
 
 @dataclass(slots=True)
 class Calibrations:
-    """Works on the parameters of all IMUs at once. Offsets are found in board axes, before scale and orientation."""
+    """Works on the parameters of all IMUs at once. Offsets are in board axes, before scale and orientation."""
 
     paths: list[InertialPath]
     store: ParameterStore
     random: np.random.Generator
     gyros_ok: bool = True
-    """Whether the last gyro calibration converged; if not, it does not arm."""
+    """The last gyro calibration converged; if not, it does not arm."""
 
     def _mean(self, path: InertialPath, t_s: float) -> Array:
-        """The sensor's mean over the averaging time that ends now, with its white noise."""
+        """Mean of the sensor over the averaging time that ends now, with its white noise."""
         times = np.linspace(t_s - AVERAGED_S, t_s, 21)[1:]
         mean: Array = path.model.expected_block(times).mean(axis=0)
         return mean + self.random.standard_normal(6) * (path.model.white / math.sqrt(AVERAGED_S))
 
     def clear_gyros(self) -> None:
-        """The start of a gyro calibration: what is read meanwhile is zero."""
+        """Start a gyro calibration: readings are zero meanwhile."""
         for path in self.paths:
             for name in offset_names(path.instance, "gyro"):
                 self.store.set(name, 0.0)
 
     def gyros(self, t_s: float, *, converged: bool = True) -> tuple[str, ...]:
-        """Mean rate becomes the offset: the Earth's rotation goes into it. Returns the names that it has saved.
+        """Make the mean rate the offset, Earth's rotation included; return the saved names.
 
-        Also without success; only the temperature is then not noted. What belongs to no gyro is set to nothing.
+        Offsets are saved without success too; only the temperature is then not noted. Instances without a gyro are zeroed.
         """
         before = dict(self.store.values)
         for path in self.paths:

@@ -1,4 +1,4 @@
-"""What the double says of itself, message by message, with ArduPilot's units, rounding and traps."""
+"""Messages of the double, with ArduPilot's units, rounding and traps."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _integers(double: Board, index: int, loop_s: float) -> tuple[int, ...]:
 
 
 def raw_imu(double: Board, loop_s: float) -> Message:
-    """RAW_IMU: not raw at all, the same as SCALED_IMU."""
+    """RAW_IMU: not raw at all, equal to SCALED_IMU."""
     ax, ay, az, gx, gy, gz, mx, my, mz, temperature = _integers(double, 0, loop_s)
     return mavlink.MAVLink_raw_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz, id=0, temperature=temperature
@@ -66,12 +66,12 @@ def raw_imu(double: Board, loop_s: float) -> Message:
 
 
 def scaled_imu(double: Board, loop_s: float, index: int) -> Message:
-    """SCALED_IMU, 2, 3; the third is all zero if there is none."""
+    """SCALED_IMU, 2, 3; a missing third IMU reads zero."""
     return SCALED_IMU[index](double.boot_ms(loop_s), *_integers(double, index, loop_s))
 
 
 def attitude(double: Board, loop_s: float) -> Message:
-    """ATTITUDE: the estimator's, in the vehicle frame, that is with AHRS_TRIM taken off."""
+    """ATTITUDE: the estimator's, in the vehicle frame, that is less AHRS_TRIM."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s)[:3] + double.estimator.omega_i
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
@@ -87,7 +87,7 @@ def ahrs(double: Board, loop_s: float) -> Message:
 def ekf_status_report(double: Board, loop_s: float) -> Message:
     """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS.
 
-    The ratio is of any yaw: a compass', ours, or the one it holds while it stands (seen on the real one).
+    The ratio is of any yaw: a compass', ours, or the one it holds while it stands (seen in the real firmware).
     """
     flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
     external = double.external_nav
@@ -123,7 +123,7 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
 
 
 def script_floats(double: Board, loop_s: float) -> Message:
-    """DEBUG_FLOAT_ARRAY of companion_arming.lua; where the script averages four readings, this is one."""
+    """DEBUG_FLOAT_ARRAY of companion_arming.lua; one reading where the script averages four."""
     values = [0.0] * 58
     for index, imu in enumerate(double.imus):
         degc = imu.temperature_degc(double.aircraft.time_at(loop_s))

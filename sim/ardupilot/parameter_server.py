@@ -25,7 +25,7 @@ class ParameterServer:
         self._double = double
 
     def set(self, channel: Channel, message: mavlink.MAVLink_param_set_message, loop_s: float) -> None:
-        """PARAM_SET: stored at once, armed or not; the answer goes to every port some milliseconds later."""
+        """Handle PARAM_SET: stored at once, armed or not; the answer goes to every port some milliseconds later."""
         double, faults = self._double, self._double.faults
         name, value = message.param_id, message.param_value
         source = (message.get_srcSystem(), message.get_srcComponent())
@@ -51,7 +51,7 @@ class ParameterServer:
                 self.announce(member, wrong=wrong and member == name)
 
     def read(self, channel: Channel, message: mavlink.MAVLink_param_request_read_message) -> None:
-        """PARAM_REQUEST_READ by name (index -1) or by index; an unknown one is an error, or silence before 4.7."""
+        """Handle PARAM_REQUEST_READ by name (index -1) or by index; an unknown one is an error, or silence before 4.7."""
         double = self._double
         if message.param_index >= 0:
             names = double.parameters.names
@@ -69,7 +69,7 @@ class ParameterServer:
             double.soon(double.read_delay_s(), lambda: self._send(channel, name, index))
 
     def list_all(self, channel: Channel) -> None:
-        """PARAM_REQUEST_LIST: paced, with true indices; the other streams slow down meanwhile."""
+        """Handle PARAM_REQUEST_LIST: paced, with true indices; the other streams slow down meanwhile."""
         if channel.listing:
             return
         channel.listing = True
@@ -85,12 +85,12 @@ class ParameterServer:
             channel.listing = False
 
     def _whose_turn(self, asker: Channel) -> Channel:
-        """The link by which the error to a read leaves: the one that is served when it is ready."""
+        """Link for the error to a read: the one served when it is ready."""
         others = [channel for channel in self._double.channels if channel is not asker]
         return others[0] if others and self._double.random.integers(2) else asker
 
     def announce(self, name: str, *, wrong: bool = False) -> None:
-        """PARAM_VALUE on every port, index 65535, as after a write."""
+        """Send PARAM_VALUE on every port, index 65535, as after a write."""
         self._double.soon(self._double.answer_delay_s(), lambda: self._send_everywhere(name, wrong=wrong))
 
     def _send_everywhere(self, name: str, *, wrong: bool) -> None:

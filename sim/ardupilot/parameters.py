@@ -1,7 +1,7 @@
-"""ArduPilot's parameters: names by release, float32 values, and what the IMU path really uses.
+"""ArduPilot's parameters: names by release, float32 values, and the effective values.
 
-Releases differ in what a companion sees (autopilots 1.1, 1.3, 2, 5.3): 4.4 brought the parameters of IMU 4 and 5; 4.6
-HIGHRES_IMU, the DENIED for a rate above the loop's and the second word that forces arming; 4.7 PARAM_ERROR, MAV_SYSID
+Releases differ for a companion (autopilots 1.1, 1.3, 2, 5.3): 4.4 brought the parameters of IMU 4 and 5; 4.6
+HIGHRES_IMU, the DENIED for a rate above the loop's and the second number that forces arming; 4.7 PARAM_ERROR, MAV_SYSID
 for SYSID_THISMAV, MAVn_ for SRn_ and ARMING_SKIPCHK for ARMING_CHECK.
 """
 
@@ -17,11 +17,11 @@ Version = Literal["4.3", "4.4", "4.5", "4.6", "4.7", "4.8"]
 
 VERSIONS: Final[tuple[Version, ...]] = get_args(Version)
 NEWEST: Final[Version] = "4.8"
-"""In development, as the real firmware that was run."""
+"""Development version, as the real firmware that was run."""
 
 
 def since(version: Version, first: Version) -> bool:
-    """Whether a release has what came with `first`."""
+    """Whether a release has the features of `first`."""
     return VERSIONS.index(version) >= VERSIONS.index(first)
 
 
@@ -48,30 +48,28 @@ def offset_names(instance: int, kind: Literal["gyro", "accel", "scale"]) -> tupl
 
 
 def gyro_id_name(instance: int) -> str:
-    """Name of the gyro's device id."""
     if instance > 3:
         return f"INS{instance}_GYR_ID"
     return f"INS_GYR{'' if instance == 1 else instance}_ID"
 
 
 def caltemp_name(instance: int, kind: Literal["GYR", "ACC"]) -> str:
-    """Name of the calibration temperature; here the first has its number."""
+    """Name of the calibration temperature; here the first instance has its number."""
     return f"INS{instance}_{kind}_CALTEMP" if instance > 3 else f"INS_{kind}{instance}_CALTEMP"
 
 
 def tcal_name(instance: int, what: str) -> str:
-    """Name of a parameter of the temperature calibration."""
     return f"INS{instance}_TCAL_{what}" if instance > 3 else f"INS_TCAL{instance}_{what}"
 
 
 def tcal_names(instance: int, kind: Literal["GYR", "ACC"]) -> list[tuple[str, str, str]]:
-    """Names of its coefficients, first to third order."""
+    """Names of the temperature coefficients, first to third order."""
     x, y, z = AXES
     return [(base + x, base + y, base + z) for base in (f"{tcal_name(instance, kind)}{order}_" for order in (1, 2, 3))]
 
 
 class ParameterStore:
-    """Name to value. `values` is what is read back; `effective` is what the firmware works with."""
+    """Values by name. `values` are the stored ones; `effective` those in use."""
 
     def __init__(self, defaults: dict[str, tuple[float, int]]) -> None:
         self._types = {name: kind for name, (_, kind) in defaults.items()}
@@ -80,17 +78,16 @@ class ParameterStore:
         self.revision = 0
         """Grows with every change of `effective`."""
         self.names = tuple(self.values)
-        """In the order of their indices."""
+        """Names in the order of their indices."""
 
     def __contains__(self, name: object) -> bool:
         return name in self.values
 
     def type_of(self, name: str) -> int:
-        """MAV_PARAM_TYPE."""
         return self._types[name]
 
     def set(self, name: str, value: float, *, takes_effect: bool = True) -> float:
-        """Store as the firmware would (float32; integers rounded and limited); returns what is stored."""
+        """Store as the firmware would (float32; integers rounded and limited); return the stored value."""
         kind = self._types[name]
         if kind == REAL32:
             value = float32(value)
@@ -104,12 +101,11 @@ class ParameterStore:
         return value
 
     def reload(self) -> None:
-        """A boot: what is stored is what is used."""
+        """Handle a boot: the stored values come into use."""
         self.effective = dict(self.values)
         self.revision += 1
 
     def vector(self, names: tuple[str, str, str]) -> tuple[float, float, float]:
-        """Three effective values."""
         x, y, z = (self.effective[name] for name in names)
         return x, y, z
 
@@ -123,11 +119,10 @@ class ParameterStore:
 
 
 def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) -> dict[str, tuple[float, int]]:
-    """The parameters a companion meets, in a fixed order, with values of a calibrated board with `imus` IMUs.
+    """Parameters that a companion meets, in a fixed order, with values of a calibrated board with `imus` IMUs.
 
-    With `auxiliary` there are names of IMU 4 and 5 too, and a gyro behind 4; not before 4.4.
-
-    Offsets of 0.001 m/s^2 stand for "has been accelerometer-calibrated", as ArduPilot's own simulator does.
+    With `auxiliary` there are names of IMU 4 and 5 too, and a gyro behind 4; not before 4.4. Offsets of 0.001 m/s^2 stand
+    for "has been accelerometer-calibrated", as in ArduPilot's own simulator.
     """
     table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == NEWEST else 16, INT16)}
     old = not since(version, "4.7")

@@ -1,1 +1,1 @@
-"""What the doubles of both firmwares share: ports, the loop they run on, faults, common messages."""
+"""Parts that the doubles of both firmwares share: ports, their loop, faults, common messages."""

@@ -1,7 +1,7 @@
-"""The buzzer of a double: what PLAY_TUNE makes it play, note by note, written from MAVLink's text and the firmwares.
+"""The buzzer of a double: PLAY_TUNE note by note, written from MAVLink's text and the firmwares.
 
-Both firmwares take QBasic's PLAY (ArduPilot MMLPlayer.cpp, PX4 lib/tunes/tunes.cpp); only the part of it is here that
-anybody needs for a signal.
+Both firmwares take QBasic's PLAY (ArduPilot MMLPlayer.cpp, PX4 lib/tunes/tunes.cpp); only the part of it is here that a
+signal needs.
 """
 
 from __future__ import annotations
@@ -25,18 +25,15 @@ class Note(NamedTuple):
 
 
 class Played(NamedTuple):
-    """A tune that was played."""
-
     at_s: float
     notes: tuple[Note, ...]
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
         return sum(note.seconds for note in self.notes)
 
     def __str__(self) -> str:
-        """What people hear, such as "2 short notes, rising"."""
+        """Describe the sound, such as "2 short notes, rising"."""
         heard = [note for note in self.notes if note.frequency_hz]
         if not heard:
             return "silence"
@@ -48,17 +45,15 @@ class Played(NamedTuple):
 
 
 class Buzzer:
-    """Plays; `goes_on`: as PX4, which reads on in the new tune where it was in the one that still plays."""
+    """Plays tunes. `goes_on`: behave as PX4, which continues in the new tune at the position of the interrupted one."""
 
     def __init__(self, *, goes_on: bool) -> None:
         self.played: list[Played] = []
-        """Every tune, in order."""
         self.broken_off = 0
-        """Tunes that a later one cut short, or that were read from their middle."""
+        """Tunes that a later one cut short, or that began in the middle."""
         self._goes_on = goes_on
 
     def take(self, message: mavlink.MAVLink_play_tune_message, now_s: float) -> None:
-        """PLAY_TUNE for this autopilot."""
         tune = Played(now_s, notes_of(message.tune + message.tune2))
         if self.played and now_s < self.played[-1].at_s + self.played[-1].seconds:
             self.broken_off += 1
@@ -68,12 +63,11 @@ class Buzzer:
 
     @property
     def heard(self) -> list[str]:
-        """All of it in words."""
+        """Describe all tunes."""
         return [str(tune) for tune in self.played]
 
 
 def notes_of(text: str) -> tuple[Note, ...]:
-    """The notes of a tune."""
     tempo, octave, length, sounding = 120, 4, 4, 7.0 / 8.0
     found: list[Note] = []
     rest = text.upper().replace(" ", "")

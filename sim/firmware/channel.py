@@ -1,6 +1,6 @@
-"""A MAVLink port of a double (sequence numbers, streams, bytes), and what arrives at it: commands and writes.
+"""A MAVLink port of a double (sequence numbers, streams, bytes), and received commands and writes.
 
-When streams are due is the firmware's own.
+The firmware decides when streams are due.
 """
 
 from __future__ import annotations
@@ -18,24 +18,23 @@ Message = mavlink.MAVLink_message
 
 @dataclass(slots=True)
 class Stream:
-    """One message that is sent by itself."""
+    """One message that is sent periodically."""
 
     interval_s: float
     next_s: float
 
 
 class Channel(abc.ABC):
-    """An `End` as tests/support/wire.py means it: attach how to send, receive what came."""
+    """An `End` for tests/support/wire.py: `attach` sets the way to send, `receive` handles bytes."""
 
     UNSIGNED: tuple[int, ...] = (mavlink.MAVLINK_MSG_ID_RADIO, mavlink.MAVLINK_MSG_ID_RADIO_STATUS)
     """Messages that need no signature where one is required."""
 
     def __init__(self, system_id: int, handle: Callable[[Channel, Message, float], None]) -> None:
         self.received: Counter[str] = Counter()
-        """Messages by name, and "bad" for bytes that are none."""
+        """Messages by name, and "bad" for invalid bytes."""
         self.sent: Counter[str] = Counter()
         self.streams: dict[int, Stream] = {}
-        """By message id."""
         self.listing = False
         """A parameter list is under way."""
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
@@ -44,23 +43,22 @@ class Channel(abc.ABC):
         self._handle = handle
 
     def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Give the function that sends bytes, or None to pull the plug."""
+        """Set the function that sends bytes, or None to pull the plug."""
         self._transmit = transmit
         self._codec.buf = bytearray()
         self._codec.buf_index = 0
 
     @property
     def attached(self) -> bool:
-        """Whether anything is plugged in."""
         return self._transmit is not None
 
     def has_room(self, size: int) -> bool:
-        """Whether so many bytes could be sent now, where what carries them can tell (`has_room` of it)."""
+        """Whether so many bytes could be sent now, if the carrier can tell (its `has_room`)."""
         room: Callable[[int], bool] | None = getattr(self._transmit, "has_room", None)
         return room is None or room(size)
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take bytes; never raises, whatever they are."""
+        """Handle bytes; never raises."""
         try:
             messages = self._codec.parse_buffer(data) or ()
         except Exception:  # noqa: BLE001 - the generated parser's own faults on garbage
@@ -77,7 +75,7 @@ class Channel(abc.ABC):
             self._handle(self, message, t_s)
 
     def send(self, message: Message) -> None:
-        """Pack with this port's sequence number and send; nothing happens when nothing is plugged in."""
+        """Pack with this port's sequence number and send; does nothing while unplugged."""
         if self._transmit is None:
             return
         data = message.pack(self._codec)
@@ -86,14 +84,14 @@ class Channel(abc.ABC):
         self._transmit(data)
 
     def require_signatures(self, key: bytes, ticks: int, link_id: int) -> None:
-        """Sign, and take what is not signed with the key only of the kinds in `UNSIGNED`: as on every port but USB.
+        """Sign, and accept unsigned messages only of the kinds in `UNSIGNED`, as on every port but USB.
 
-        By pymavlink's own signing, which is not the companion's.
+        Uses pymavlink's own signing, which is not the companion's.
 
         Args:
             key: 32 bytes.
-            ticks: how far its clock is, in 10 us since 2015; an autopilot without GNSS may be far behind.
-            link_id: of this port.
+            ticks: its clock, in 10 us since 2015; an autopilot without GNSS may be far behind.
+            link_id: number of this port.
         """
         signing = self._codec.signing
         signing.secret_key, signing.timestamp, signing.link_id = key, ticks, link_id
@@ -101,7 +99,7 @@ class Channel(abc.ABC):
         signing.allow_unsigned_callback = lambda _codec, message_id: message_id in self.UNSIGNED
 
     def forward(self, data: bytes) -> None:
-        """Send somebody else's packet unchanged."""
+        """Send another sender's packet unchanged."""
         if self._transmit is not None:
             self._transmit(data)
 
@@ -111,15 +109,15 @@ class Channel(abc.ABC):
 
     @abc.abstractmethod
     def due(self, now_s: float) -> list[int]:
-        """Message ids whose time has come."""
+        """Message ids that are due."""
 
     def next_due_s(self) -> float | None:
-        """When the next stream wants to be sent."""
+        """Time of the next stream."""
         return min((stream.next_s for stream in self.streams.values()), default=None)
 
 
 class Command(NamedTuple):
-    """COMMAND_LONG or COMMAND_INT, and where to answer."""
+    """COMMAND_LONG or COMMAND_INT, and the port for the answer."""
 
     channel: Channel
     number: int
@@ -132,7 +130,7 @@ class Command(NamedTuple):
 def command_of(
     channel: Channel, message: mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message, loop_s: float
 ) -> Command:
-    """The common content of the two kinds; in COMMAND_INT x, y, z are params 5 to 7."""
+    """Return the common content of the two kinds; in COMMAND_INT x, y, z are params 5 to 7."""
     first = (message.param1, message.param2, message.param3, message.param4)
     if isinstance(message, mavlink.MAVLink_command_int_message):
         params = (*first, float(message.x), float(message.y), message.z)
@@ -142,10 +140,10 @@ def command_of(
 
 
 class Write(NamedTuple):
-    """One PARAM_SET as it arrived: the independent witness of what the companion wrote, and when."""
+    """One received PARAM_SET: the independent witness of the companion's writes and their times."""
 
     t_s: float
-    """The loop's clock."""
+    """Time by the loop's clock."""
     name: str
     value: float
     armed: bool

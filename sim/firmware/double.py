@@ -1,4 +1,4 @@
-"""The outside of a double and the loop it runs on: the same for every firmware."""
+"""The outside of a double and its loop, common to every firmware."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ FIELD_MILLIGAUSS = (280.0, 450.0)
 class AutopilotDouble(abc.ABC):
     """An autopilot on a virtual aircraft with two ports, `self` for the companion and `ground` for a ground station.
 
-    It is an `End` (attach, receive). `run` sends what is due; answers need only the running loop. Time is the loop's
-    clock. What a firmware does with a message, and what it says, is its own.
+    It is an `End` (attach, receive). `run` sends due messages; answers need only the running loop. Time is the loop's
+    clock. Each firmware handles messages and composes its own.
 
     Args:
         aircraft: the truth.
         imus: the models; the first is IMU 1.
         channels: the companion's port and the ground station's.
-        up_s: how long it has been running when the simulation begins.
-        tunes_go_on: as `Buzzer`.
+        up_s: time since its boot at the beginning of the simulation.
+        tunes_go_on: `goes_on` of `Buzzer`.
     """
 
     def __init__(
@@ -54,17 +54,16 @@ class AutopilotDouble(abc.ABC):
         self.calibrating = False
         self.boots = 0
         self.writes: list[Write] = []
-        """Every PARAM_SET that arrived, obeyed or not, in order; integers as numbers."""
+        """Every received PARAM_SET, obeyed or not, in order; integers as numbers."""
         declination = math.radians(aircraft.site.declination_deg)
         north, down = FIELD_MILLIGAUSS
         self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
-        """Magnetic field at the site in milligauss."""
         self.channels = channels
         self._port, self.ground = channels
         self.random = np.random.default_rng([seed, 4])
-        """For everything that varies and is not a sensor's noise."""
+        """Random numbers for everything but sensor noise."""
         self.has_compass = False
-        """Whether its own magnetometer works, and holds its yaw."""
+        """Its own magnetometer works, and holds its yaw."""
         self._up_s = up_s
         self._booted_s: float | None = None
         self._down = False
@@ -80,11 +79,11 @@ class AutopilotDouble(abc.ABC):
         self._port.attach(transmit)
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Bytes from the companion's wire; never raises."""
+        """Handle bytes from the companion's wire; never raises."""
         self._port.receive(data, t_s)
 
     def require_signatures(self, key: bytes, ticks: int = 0) -> None:
-        """Sign on both ports and take only what is signed with the key, as after SETUP_SIGNING."""
+        """Sign on both ports and accept only signed messages, as after SETUP_SIGNING."""
         for number, channel in enumerate(self.channels, start=1):
             channel.require_signatures(key, ticks, number)
 
@@ -105,15 +104,15 @@ class AutopilotDouble(abc.ABC):
 
     @abc.abstractmethod
     def parameter(self, name: str) -> float:
-        """What is read back; KeyError if there is none of that name."""
+        """Return the stored value; KeyError for an unknown name."""
 
     @abc.abstractmethod
     def set_parameter(self, name: str, value: float) -> None:
-        """Set without telling anyone, as if it had always been so."""
+        """Set a value silently, as if it had always been so."""
 
     @abc.abstractmethod
     def write_as_another_station(self, name: str, value: float) -> None:
-        """Another ground station sets a parameter."""
+        """Set a parameter as another ground station does."""
 
     @abc.abstractmethod
     def arm(self) -> None:
@@ -125,31 +124,31 @@ class AutopilotDouble(abc.ABC):
 
     @abc.abstractmethod
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
-        """Roll, pitch, yaw as ATTITUDE tells them."""
+        """Roll, pitch, yaw as in ATTITUDE."""
 
     @abc.abstractmethod
     def residual(self, instance: int, loop_s: float) -> Bias:
-        """What is left in the output of IMU `instance` (1..) after its offsets and scales: output minus truth, FRD."""
+        """Error left in the output of IMU `instance` (1..) after its offsets and scales: output minus truth, FRD."""
 
     @abc.abstractmethod
     def prearm_failures(self, loop_s: float) -> list[str]:
-        """Why it would not arm, in the firmware's words without the prefix."""
+        """Reasons against arming, in the firmware's words without the prefix."""
 
     @abc.abstractmethod
     def build(self, message_id: int, loop_s: float) -> Message | None:
-        """The message of a stream, now; None when there is nothing to send."""
+        """Build the message of a stream; None when there is nothing to send."""
 
     @abc.abstractmethod
     def _started(self, loop_s: float) -> None:
-        """The first instant on a loop: it has been up for a while."""
+        """Handle the first instant on a loop: the autopilot has been up for a while."""
 
     @abc.abstractmethod
     def _restarted(self, loop_s: float) -> None:
-        """A boot: forget what is not stored, set up the streams."""
+        """Handle a boot: forget what is not stored, set up the streams."""
 
     @abc.abstractmethod
     def _receive_message(self, channel: Channel, message: Message, loop_s: float) -> None:
-        """A message came while it was up."""
+        """Handle a message received while up."""
 
     # What happens to it.
 
@@ -165,42 +164,39 @@ class AutopilotDouble(abc.ABC):
     # What its parts use.
 
     def boot_us(self, loop_s: float) -> int:
-        """Microseconds since boot on its own clock."""
         assert self._booted_s is not None
         return int((loop_s - self._booted_s) * 1e6)
 
     def boot_ms(self, loop_s: float) -> int:
-        """Milliseconds since boot."""
         return self.boot_us(loop_s) // 1000
 
     def unix_s(self, loop_s: float) -> float:
-        """The date it knows."""
+        """Date known to the autopilot."""
         return self.aircraft.unix_s + self.aircraft.time_at(loop_s)
 
     def now_s(self) -> float:
-        """The loop's clock."""
         return asyncio.get_running_loop().time()
 
     def later(self, delay_s: float, action: Callable[[], None]) -> None:
-        """Do something after a delay, unless a reboot comes first."""
+        """Run an action after a delay, unless a reboot comes first."""
         generation = self._generation
         loop = asyncio.get_running_loop()
         loop.call_later(delay_s, lambda: action() if generation == self._generation else None)
 
     def soon(self, delay_s: float, action: Callable[[], None], *, lane: str = "") -> None:
-        """The same for what must keep its order among the others of its lane, such as answers on a port."""
+        """Run an action after a delay, in order with the others of its lane, such as answers on a port."""
         now_s = self.now_s()
         at_s = max(now_s + delay_s, self._lanes.get(lane, 0.0) + 1e-6)
         self._lanes[lane] = at_s
         self.later(at_s - now_s, action)
 
     def answer(self, channel: Channel, message: Message) -> None:
-        """Send an answer, unless it answers nothing."""
+        """Send an answer, unless the double is silent."""
         if not self._down and not self.faults.silent:
             channel.send(message)
 
     def wake(self) -> None:
-        """Tell `run` that something is due earlier than it thought."""
+        """Wake `run`: a message is due earlier than planned."""
         if self._failed is not None:
             asyncio.get_running_loop().call_soon(self._tick)
 
@@ -245,7 +241,7 @@ class AutopilotDouble(abc.ABC):
         self.wake()
 
     def _tick(self) -> None:
-        """Send what is due and come back for what is next: plain callbacks, cheaper than a task."""
+        """Send due messages and schedule the next call: plain callbacks, cheaper than a task."""
         if self._failed is None or self._failed.done():
             return
         if self._timer is not None:
@@ -262,7 +258,7 @@ class AutopilotDouble(abc.ABC):
             self._timer = loop.call_at(min(due), self._tick)
 
     def _holds_back(self, message_id: int) -> bool:
-        """Whether a fault keeps this stream from being sent."""
+        """Whether a fault suppresses this stream."""
         return self.faults.heartbeat_off if message_id == HEARTBEAT else self.faults.telemetry_off
 
     def _send_due(self, loop_s: float) -> None:

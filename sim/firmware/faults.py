@@ -1,4 +1,4 @@
-"""What can go wrong with an autopilot; every field may be changed at any time while the double runs."""
+"""Faults of an autopilot; every field may be changed at any time while the double runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Faults:
     """Switches. Sets of names may contain patterns such as "INS_ACC*"."""
 
     echo_without_effect: bool = False
-    """PARAM_SET is stored and echoed, but the telemetry goes on with the old value until the next reboot."""
+    """PARAM_SET is stored and echoed, but the telemetry uses the old value until the next reboot."""
     refuse: set[str] = field(default_factory=set)
     """PARAM_SET of these is refused as ArduPilot does: "Param write denied", PARAM_ERROR (4.8), the old value."""
     ignore: set[str] = field(default_factory=set)
@@ -20,26 +20,26 @@ class Faults:
     wrong_echo: set[str] = field(default_factory=set)
     """The answer to PARAM_SET of these carries another value than the one that was set and stored."""
     silent: bool = False
-    """Answers nothing: no parameters, no acknowledgements; heartbeats and telemetry go on."""
+    """No answers: no parameters, no acknowledgements; heartbeats and telemetry go on."""
     heartbeat_off: bool = False
     telemetry_off: bool = False
-    """Nothing but heartbeats and answers is sent."""
+    """Only heartbeats and answers are sent."""
     frozen_imu: bool = False
     """IMU messages repeat the last values."""
     int_only: bool = False
     """A board with 1 MB of flash: HIGHRES_IMU is not in the firmware."""
     reboot_after_writes: int | None = None
-    """Reboot at the n-th PARAM_SET from now, after storing it and before answering; then None again."""
+    """Reboot at the n-th PARAM_SET from now, after storing it and before answering; then None."""
     arm_after_writes: int | None = None
-    """The pilot arms at the n-th PARAM_SET from now, which is still obeyed and answered; then None again."""
+    """Arm at the n-th PARAM_SET from now, which is still obeyed and answered; then None."""
     gyro_calibration_fails: bool = False
     """The autopilot's own gyro calibration does not converge."""
     reboot_while_calibrating: bool = False
-    """It restarts in the middle of its next own gyro calibration; then False again."""
+    """Restart in the middle of the next own gyro calibration; then False."""
     foreign_write_after: tuple[int, str, float] | None = None
     """(n, name, value): another ground station sets a parameter right after the n-th PARAM_SET from now."""
 
 
 def names_match(patterns: Iterable[str], name: str) -> bool:
-    """Whether a name is one of, or fits one of, the patterns."""
+    """Whether a name matches one of the patterns."""
     return any(fnmatchcase(name, pattern) for pattern in patterns)

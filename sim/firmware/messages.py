@@ -1,4 +1,4 @@
-"""Messages that both firmwares fill alike."""
+"""Messages that both firmwares fill in the same way."""
 
 from __future__ import annotations
 
@@ -34,18 +34,17 @@ def pressure_hpa(height_m: float) -> float:
 
 
 def magnetic_body(double: AutopilotDouble, t_s: float) -> Array:
-    """Milligauss in body axes."""
+    """Magnetic field in body axes, milligauss."""
     result: Array = double.aircraft.body_from_ned(t_s) @ double.field_ned
     return result
 
 
 def system_time(double: AutopilotDouble, loop_s: float) -> Message:
-    """SYSTEM_TIME; the date is known because there is GNSS."""
+    """SYSTEM_TIME; GNSS supplies the date."""
     return mavlink.MAVLink_system_time_message(int(double.unix_s(loop_s) * 1e6), double.boot_ms(loop_s))
 
 
 def global_position_int(double: AutopilotDouble, loop_s: float) -> Message:
-    """GLOBAL_POSITION_INT."""
     site = double.aircraft.site
     _, _, yaw = double.estimated_angles_rad(loop_s)
     heading = int(math.degrees(yaw) % 360.0 * 100.0) % 36000

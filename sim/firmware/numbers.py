@@ -1,4 +1,4 @@
-"""Numbers as small computers make them, and the numbered board orientations that both firmwares share with MAVLink."""
+"""Numbers of small computers, and the numbered board orientations of MAVLink."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sim.earth import Array, mounting_matrix
 
 
 def float32(value: float) -> float:
-    """The nearest float32, as everything the autopilot stores."""
+    """Round to the nearest float32."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 def truncated_16(value: float) -> int:
-    """A C conversion of float to int16: toward zero; what does not fit is cut at the ends."""
+    """Convert as C does from float to int16: toward zero, saturated."""
     return int(max(-32768.0, min(32767.0, value)))
 
 
@@ -26,7 +26,7 @@ _NOT_IN_MAVLINK = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0
 
 
 def rotation_matrix(number: int) -> Array:
-    """Board to vehicle for a MAV_SENSOR_ORIENTATION below 100; unknown numbers are none."""
+    """Board to vehicle for a MAV_SENSOR_ORIENTATION below 100; unknown numbers mean no rotation."""
     if number in _NOT_IN_MAVLINK:
         return mounting_matrix(*_NOT_IN_MAVLINK[number])
     entry = mavlink.enums["MAV_SENSOR_ORIENTATION"].get(number)

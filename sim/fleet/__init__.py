@@ -1,1 +1,1 @@
-"""Simulated aircraft that tell a fleet's collector what happens to them."""
+"""Simulated aircraft that report to a fleet's collector."""

@@ -1,4 +1,4 @@
-"""Simulated aircraft of a fleet: each is a client of the broker that keeps the items it tells.
+"""Simulated aircraft of a fleet: each is a client of the broker that keeps its items until they are confirmed.
 
 There is no daemon and no calibration in them: records are made from known biases, drawn from a seed.
 """
@@ -22,7 +22,7 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 
 WINDOW: Final = 8
-"""The most items that are under way without a confirmation."""
+"""Most unconfirmed items at a time."""
 AGAIN_S: Final = 30.0
 FIRST_WAIT_S: Final = 0.2
 _NAMES: Final = ("Heron", "Crane", "Kite", "Swift", "Tern", "Stork", "Plover", "Wren", "Gannet", "Osprey")
@@ -48,7 +48,7 @@ class Aircraft:
         self.deliveries = 0
         self.again_s = AGAIN_S
         self.moved_rad_s = 0.0
-        """By how much the first gyro of its second IMU has moved: a fault."""
+        """Step of the bias of the first gyro of its second IMU: a fault."""
         self._of_imus = [(self._triad(120.0 * DEG_H), self._triad(4.0 * MG)) for _ in range(2)]
         self._changed = asyncio.Event()
         self._wanted: set[int] = set()
@@ -60,7 +60,7 @@ class Aircraft:
     # --- what happens to it
 
     def tell(self, kind: str, at: datetime.datetime, body: Any) -> int:
-        """Keep an item; its sequence."""
+        """Keep an item; return its sequence."""
         sequence = len(self.told) + 1
         item = {"format_version": FORMAT_VERSION, "aircraft": self.id, "epoch": self.epoch, "sequence": sequence}
         self.told[sequence] = msgspec.json.encode(
@@ -70,7 +70,7 @@ class Aircraft:
         return sequence
 
     def calibrate(self, at: datetime.datetime, reason: str = "", *, held_back: bool = False) -> int:
-        """A calibration at a power-up of its own; one with a reason has failed for it."""
+        """Calibrate at a new power-up; `reason` makes it a failure."""
         degc = self._dice.uniform(15.0, 45.0)
         true = {} if reason else {f"fc{k + 1}": self._power_up(k, degc) for k in range(2)}
         imus = tuple(self._imu(name, k, degc, *each) for k, (name, each) in enumerate(sorted(true.items())))
@@ -93,7 +93,7 @@ class Aircraft:
         return sequence
 
     def arm(self, at: datetime.datetime) -> int:
-        """It arms, with what is in force."""
+        """Arm with the active calibration."""
         known = self._calibration is not None
         arming = ArmingRecord(
             armed_at=_iso(at),
@@ -109,12 +109,12 @@ class Aircraft:
         return self.tell("arming", at, arming)
 
     def undo(self, at: datetime.datetime) -> int:
-        """The calibration in force is put back."""
+        """Undo the active calibration."""
         of, self._calibration = self._calibration, None
         return self.tell("undo", at, {"what": "calibration", "of": of, "undone_at": _iso(at)})
 
     def learn(self, at: datetime.datetime) -> None:
-        """It tells how the biases of its IMUs follow the temperature."""
+        """Report the temperature curves of its IMUs."""
         for k in range(2):
             true = [(degc, *self._biases(k, degc)) for degc in range(15, 46)]
             gyro = [{"degc": degc, "gyro_deg_h": _in(DEG_H, of), "sigma_deg_h": (5.0,) * 3} for degc, of, _ in true]
@@ -123,7 +123,7 @@ class Aircraft:
             self.tell("curve", at, {**known, "curve": gyro, "accel_curve": accel})
 
     def fly(self, at: datetime.datetime) -> int:
-        """A flight whose log is read on the aircraft."""
+        """Make a flight whose log is read on the aircraft."""
         nothing: dict[str, Any] = dict.fromkeys((*ImuFlight.__struct_fields__, *Split.__struct_fields__))
         imus = []
         for k in range(2):
@@ -143,7 +143,7 @@ class Aircraft:
         return self.tell("flight", at + datetime.timedelta(minutes=15), {**log, "flight": flight})
 
     def live(self, until: datetime.datetime, flights: int, days: float = 90.0) -> None:
-        """Flights in the days before, each with a calibration; here and there one fails, or is put back."""
+        """Make flights in the days before, each with a calibration; some fail, some are undone."""
         days_ago = sorted((self._dice.uniform(0.05, days) for _ in range(flights)), reverse=True)
         for ago in days_ago:
             at = until - datetime.timedelta(days=ago)
@@ -192,7 +192,7 @@ class Aircraft:
 
     @property
     def hello(self) -> bytes:
-        """What it keeps."""
+        """Return the hello message: what it keeps."""
         return msgspec.json.encode(
             {
                 "format_version": FORMAT_VERSION,
@@ -206,7 +206,7 @@ class Aircraft:
         )
 
     async def run(self, host: str, port: int) -> None:
-        """Be at the broker until cancelled; whoever is thrown out comes again."""
+        """Stay connected to the broker until cancelled; reconnect after every loss."""
         while True:
             with contextlib.suppress(*_LEAVES):
                 async with connected(aiomqtt.Client(host, port, identifier=f"aircraft-{self.id}")) as client:

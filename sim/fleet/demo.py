@@ -34,7 +34,6 @@ _ENDS_WITH_US: Final = 'exec 3<&0; (read -r _ <&3; kill $$) & exec "$@" 3<&-'
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the demonstration until Ctrl-C; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sim fleet", description=__doc__)
     parser.add_argument("--page", default=PAGE, metavar="HOST:PORT", help=f"address of the page (default {PAGE})")
     options = parser.parse_args(argv)

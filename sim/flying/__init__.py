@@ -1,1 +1,1 @@
-"""Real firmware flies by its own physics; the sensors follow its truth: what faults do to the heading."""
+"""Flights of real firmware by its own physics; the sensors follow its truth: effects of faults on the heading."""

@@ -1,4 +1,4 @@
-"""ArduPilot's own multicopter and plane: its physics tells us the truth, its ground station flies it."""
+"""ArduPilot's own multicopter and plane: its physics is the truth, its ground station flies it."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.process import LOOPBACK, BinaryError, FirmwareProcess, port_free
 
 RIDER_PORT = 9012
-"""Where a SITL that is told of one slave waits for it (SIM_JSON_Master.cpp); it cannot be told another."""
+"""Port on which a SITL with one slave waits for it (SIM_JSON_Master.cpp); it is fixed."""
 SERVO_MAGIC = 18458
 _SILENT_S = 0.1
 AHEAD = 40
-"""Steps for which it has our word beforehand: it needs not wait while we are at something else."""
+"""Steps acknowledged in advance, so that SITL need not wait while we are busy."""
 COPTER_MODES = {"guided": 4, "hold": 5}
 PLANE_MODES = {"takeoff": 13, "hold": 15}
 STICKS_S = 0.2
@@ -32,7 +32,7 @@ LOWEST_US, MIDDLE_US = 1000, 1500
 
 
 def state_of(line: bytes) -> State | None:
-    """What SITL tells a slave, one JSON object (SIM_JSON_Master.cpp: send); None if it is none."""
+    """Decode the JSON object that SITL sends to a slave (SIM_JSON_Master.cpp: send); None if it is invalid."""
     try:
         told = json.loads(line)
         imu = told["imu"]
@@ -45,10 +45,10 @@ def state_of(line: bytes) -> State | None:
 
 
 class Rider:
-    """A slave of SITL's physics that only listens: each step of it, in time. An async context manager.
+    """A slave of SITL's physics that only listens. An async context manager.
 
     Args:
-        aircraft: that follows it.
+        aircraft: follows the physics.
     """
 
     def __init__(self, aircraft: FlyingAircraft) -> None:
@@ -78,7 +78,7 @@ class Rider:
         self._socket.close()
 
     async def _knock(self) -> None:
-        """It waits for our word before its first step, and after a loss."""
+        """Send acknowledgements: SITL waits for one before its first step, and after a loss."""
         loop = asyncio.get_running_loop()
         while True:
             if loop.time() - self._heard_s > _SILENT_S:
@@ -161,10 +161,10 @@ class FlyingArduPilot(ArduPilot, FlyingVehicle):
 
     Args:
         binary: the firmware.
-        scenario: whose aircraft is a `FlyingAircraft`.
-        folder: for the binary's files.
-        companion: where SERIAL1 sends to.
-        wind: speed in m/s and where from in degrees.
+        scenario: its aircraft is a `FlyingAircraft`.
+        folder: folder for the binary's files.
+        companion: address to which SERIAL1 sends.
+        wind: speed in m/s and direction of origin in degrees.
     """
 
     backend: Rider
@@ -186,7 +186,7 @@ class FlyingArduPilot(ArduPilot, FlyingVehicle):
         return self._process_of("--model", "plane" if self.is_plane else "quad", "--slave", "1")
 
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
-        """Armed as pilots do, with all its checks, and up."""
+        """Arm as pilots do, with all checks, and take off."""
         await self.mode(ground, "takeoff" if self.is_plane else "guided")
         await self.arm(ground)
         if not self.is_plane:
@@ -196,11 +196,11 @@ class FlyingArduPilot(ArduPilot, FlyingVehicle):
         await asyncio.sleep(2.0 * STICKS_S)
 
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """All its compasses are turned by 45 deg, as of now."""
+        """Turn all its compasses by 45 deg from now on."""
         await ground.put_all({f"SIM_MAG{number}_ORIENT": 1.0 for number in (1, 2, 3)})  # ROTATION_YAW_45
 
     async def hold(self, ground: GroundStation) -> None:
-        """Loiter, sticks in the middle; a plane circles clockwise from here (Guided)."""
+        """Loiter, sticks centred; a plane circles clockwise from here (Guided)."""
         if not self.is_plane:
             await self.mode(ground, "hold")
             return
@@ -219,7 +219,7 @@ class FlyingArduPilot(ArduPilot, FlyingVehicle):
         await self.until_mode(ground, "hold")
 
     async def steer(self, ground: GroundStation) -> None:
-        """Sends the sticks until cancelled."""
+        """Send the sticks until cancelled."""
         while True:
             ground.send(mavlink.MAVLink_rc_channels_override_message(self.system_id, 1, *self.sticks_us, *[0] * 4))
             await asyncio.sleep(STICKS_S)

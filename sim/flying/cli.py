@@ -1,4 +1,4 @@
-"""`python -m sim fly`: flights of a real firmware with our heading, and what a fault does to them."""
+"""`python -m sim fly`: flights of a real firmware with our heading, and the effect of a fault."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ HELP = "A real firmware flies with our heading, and something fails: the largest
 
 
 def parser() -> argparse.ArgumentParser:
-    """Of `python -m sim fly`."""
     command = argparse.ArgumentParser(prog="python -m sim fly", description=HELP)
     command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter, arduplane or px4")
     command.add_argument(
@@ -52,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def plans_of(arguments: argparse.Namespace) -> list[Plan]:
-    """What the options ask for, the flights of one fault and set-up together; each seed has a wind of its own."""
+    """Return the flights that the options ask for, those of one fault and set-up together; each seed has its own wind."""
     plans = []
     px4 = "px4" in arguments.binary.name
     if any((set_up == "px4") is not px4 for set_up in arguments.set_up):
@@ -76,7 +75,6 @@ def plans_of(arguments: argparse.Namespace) -> list[Plan]:
 
 
 async def fly(plan: Plan, folder: Path) -> tuple[Record, Figures]:
-    """One flight and its figures."""
     async with flying(plan, folder, time.time()) as flight:
         await flight.set_up()
         await flight.calibrate()
@@ -85,7 +83,7 @@ async def fly(plan: Plan, folder: Path) -> tuple[Record, Figures]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Fly; 0 if every flight was good, 1 if one was not, 2 if one did not come about."""
+    """Fly; 0: every flight was good, 1: one was not, 2: one failed to start."""
     command = parser()
     arguments = command.parse_args(argv)
     try:
@@ -105,7 +103,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def flown(plan: Plan, folder: Path) -> Figures | None:
-    """One flight, with its line of the table; None if it did not come about, which is said."""
+    """Fly once and print the line of the table; None if the flight failed to start."""
     plan = replace(plan, stored=folder / f"set-up-{plan.set_up}")
     try:
         record, found = asyncio.run(fly(plan, folder / f"{plan.fault}-{plan.set_up}-{plan.seed}"))

@@ -1,4 +1,4 @@
-"""One flight: set up, calibrated, taken off, and then a fault while it holds its place in the wind."""
+"""One flight: set up, calibrate, take off, then a fault while it holds its place in the wind."""
 
 from __future__ import annotations
 
@@ -38,34 +38,32 @@ CALIBRATED_WITHIN_S = 120.0
 PUSHED_WITHIN_S = 60.0
 STARTED_S = 2.0
 STORED_S = 3.0
-"""By then PX4 has stored what was written."""
+"""Time in which PX4 stores written values."""
 RESTARTED_S = 6.0
 HEIGHT_M = 10.0
 PLANE_HEIGHT_M = 60.0
 SETTLED_S = 6.0
 PLANE_SETTLED_S = 75.0
-"""By then it has been on its circle for a whole one."""
+"""Time for a whole circle of the plane."""
 WATCHED_S = 35.0
 SLOWEST = 0.9
-"""Share of the wall's time in which firmware and daemon still see the same world."""
+"""Share of real time at which firmware and daemon still see the same world."""
 HANGS_S = 0.3
-"""A daemon cannot tell a firmware or a bench that this machine lets wait for so long from the fault of a flight."""
+"""A stall of the firmware of this length makes a flight invalid: the daemon cannot tell it from a fault."""
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
-"""The pilot turns it about, with the fault in force."""
+"""The pilot turns it about, with the fault active."""
 DRIFT_DEG_S = 3.0
 LIE_DEG = 40.0
 STEP_S = 0.05
 POWERLESS_S = 20.0
 RESTARTED_AFTER_S = 1.0
-"""What a service manager waits before it starts the daemon anew."""
+"""Delay of a service manager before it restarts the daemon."""
 OTHER_SETS = ("EK3_SRC2", "EK3_SRC3")
 SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be flown."""
-
     binary: Path
     fault: str
     set_up: SetUp = "script"
@@ -74,11 +72,11 @@ class Plan:
     seed: int = 0
     watched_s: float = WATCHED_S
     stored: Path | None = None
-    """What an autopilot that is set up has stored: taken from this folder if it is there, else put there."""
+    """Folder with the stored parameters of an autopilot that is set up: used if it exists, else filled."""
 
 
 class Flight:
-    """A vehicle, a daemon, and what happens to them; made by `flying`."""
+    """A vehicle, a daemon, and their events; made by `flying`."""
 
     def __init__(
         self, plan: Plan, vehicle: FlyingVehicle, ground: GroundStation, link: LossyLink, folder: Path
@@ -88,28 +86,27 @@ class Flight:
         self._since_s = 0.0
         self._background: list[asyncio.Task[None]] = []
         self._hung_s = 0.0
-        """The longest time without news of the firmware since the watch began."""
+        """Longest time without news of the firmware since the watch began."""
         self._stack = contextlib.AsyncExitStack()
         self.daemon: CompanionProcess
 
     def signal(self, number: signal.Signals) -> None:
-        """To the daemon, if there is one."""
+        """Send a signal to the daemon, if it runs."""
         with contextlib.suppress(ProcessLookupError):
             self.daemon.signal(number)
 
     async def start_daemon(self) -> None:
-        """Start it, with what it has stored."""
+        """Start the daemon with its stored state."""
         log = self.folder / "daemon.log"
         if log.exists():
             log.rename(self.folder / "daemon-before.log")
         self.daemon = await self._stack.enter_async_context(CompanionProcess(self.folder))
 
     def in_background(self, work: Coroutine[Any, Any, None]) -> None:
-        """Goes on until the end of the flight."""
+        """Run a task until the end of the flight."""
         self._background.append(asyncio.create_task(work))
 
     async def close(self) -> None:
-        """End what was begun."""
         for task in self._background:
             task.cancel()
         await asyncio.gather(*self._background, return_exceptions=True)
@@ -117,9 +114,9 @@ class Flight:
         await self._stack.aclose()
 
     async def set_up(self) -> None:
-        """As `companion autopilot-setup` says, from a ground station, and a restart of the autopilot.
+        """Set the parameters of `companion autopilot-setup` from a ground station, and restart the autopilot.
 
-        Nothing is to be done to one that has stored it already.
+        Does nothing for an autopilot that has them stored.
         """
         shown, stored = await self.daemon.ask("autopilot-setup"), self.plan.stored
         only_one = self.plan.set_up == "today"
@@ -153,7 +150,7 @@ class Flight:
         await self.pushed()
 
     async def pushed(self) -> None:
-        """Wait until the heading is pushed, and in use again where another has been."""
+        """Wait until the heading is pushed, and in use again where another one was."""
         attitude: dict[str, Any] = {}
         try:
             async with asyncio.timeout(PUSHED_WITHIN_S):
@@ -167,7 +164,7 @@ class Flight:
         return [each.text for each in self.ground.all(mavlink.MAVLink_statustext_message, since_s=self._since_s)]
 
     async def fly(self) -> Record:
-        """Take off, hold, let the fault happen, and watch; the record."""
+        """Take off, hold, trigger the fault, and watch; return the record."""
         vehicle, ground, record = self.vehicle, self.ground, self.record
         await vehicle.ask_streams(ground)
         self.in_background(vehicle.steer(ground))
@@ -202,7 +199,7 @@ class Flight:
                 moved_s, own_s = loop.time(), truth.own_s
 
     def _take_down(self) -> None:
-        """What truth and ground station have seen, as a record."""
+        """Record what truth and ground station saw."""
         ground, record = self.ground, self.record
         record.truth = np.array(self.vehicle.truth.recorded)
         attitudes = [
@@ -290,11 +287,11 @@ FAULTS: dict[str, tuple[str, Strike]] = {
     "restart": (f"kill -9 of the daemon, started anew after {RESTARTED_AFTER_S:g} s", _killed_for(RESTARTED_AFTER_S)),
     "board": (f"its board has no power, and starts again after {POWERLESS_S:g} s", _killed_for(POWERLESS_S)),
 }
-"""What happens, in words, and how."""
+"""Description and action of each fault."""
 
 
 def is_ours(texts: Sequence[str]) -> bool:
-    """Whether the latest that was said of the source of the heading, if anything, names the companion."""
+    """Whether the latest text about the source of the heading, if any, names the companion."""
     told = [text for text in texts if text.startswith("Heading: ")]
     return not told or told[-1].startswith("Heading: companion")
 
@@ -304,7 +301,7 @@ def _at(t_s: float, arrived: Array, own: Array) -> float:
 
 
 def events_of(ground: GroundStation, since_s: float, own: Callable[[float], float]) -> list[Event]:
-    """Changes of mode, of arming and of the source set, and what was said; times by `own` from loop times."""
+    """Changes of mode, of arming and of the source set, and texts; times by `own` from loop times."""
     found, mode, armed = list[Event](), None, None
     for t_s, message in ground.heard:
         if t_s < since_s:
@@ -329,7 +326,7 @@ def events_of(ground: GroundStation, since_s: float, own: Callable[[float], floa
 
 @contextlib.asynccontextmanager
 async def flying(plan: Plan, folder: Path, unix_s: float) -> AsyncIterator[Flight]:
-    """Everything running on the ground: firmware, devices, daemon; nothing set up."""
+    """Run firmware, devices and daemon on the ground, without any set-up."""
     site = site_at(40.0, 116.0, 50.0, unix_s)
     aircraft = FlyingAircraft(site, heading_deg=plan.heading_deg, unix_s=unix_s)
     scenario = demo(seed=plan.seed, unix_s=unix_s, aircraft=aircraft)

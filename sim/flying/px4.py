@@ -1,4 +1,4 @@
-"""PX4's own quadrotor (SIH, `sihsim_quadx`): its ground truth tells us the truth, it takes off and holds by itself."""
+"""PX4's own quadrotor (SIH, `sihsim_quadx`): its ground truth is the truth; it takes off and holds by itself."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from sim.station import Station, open_udp
 
 MAGNETOMETER = {"cs_mag_hdg", "cs_mag_3d"}
 AUTO, LOITER = 4, 3
-"""A main mode and its sub mode."""
+"""Main mode and sub mode."""
 _UDP_TRUTH = 19410
 TRUTH_HZ = 250.0
 ASKED_EVERY_S = 1.0
 GUST_EVERY_S = 5.0
-"""Not oftener: a parameter that changes while PX4 stores another brings its simulated time to a stop."""
+"""Interval of gusts. A parameter that changes while PX4 stores another one stops its simulated time."""
 GUST_SHARE = 0.1
-"""Of the mean wind: this aircraft has a drag of 1 N for 1 m/s at 1 kg, ten times that of others."""
+"""Gusts over the mean wind: this aircraft has a drag of 1 N for 1 m/s at 1 kg, ten times that of others."""
 TURNED_S = 4.0
 FORCE_OVER = 25
-"""Steps over which velocities, told in whole cm/s, are compared."""
+"""Steps between compared velocities, which are sent in whole cm/s."""
 
 
 class Truth(Station):
-    """Takes HIL_STATE_QUATERNION of SIH for an aircraft: rates from attitudes, forces from velocities."""
+    """Feeds HIL_STATE_QUATERNION of SIH to an aircraft: rates from attitudes, forces from velocities."""
 
     def __init__(self, aircraft: FlyingAircraft, system_id: int) -> None:
         super().__init__(system_id, mavlink.MAV_COMP_ID_USER2)
@@ -53,7 +53,7 @@ class Truth(Station):
         self._start: tuple[float, float, float] | None = None
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take what came, and keep nothing; it is asked for oftener, now and then."""
+        """Handle bytes without keeping messages; renew the request for a higher rate now and then."""
         super().receive(data, t_s)
         for _, message in self.heard:
             if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
@@ -71,7 +71,7 @@ class Truth(Station):
             )
 
     def state(self, told: mavlink.MAVLink_hil_state_quaternion_message) -> State | None:
-        """The next one; None for the first after a start, and for what is out of order."""
+        """Return the next state; None for the first after a start, and for one out of order."""
         w, x, y, z = told.attitude_quaternion
         own_s, turn = told.time_usec * 1e-6, Rotation.from_quat((x, y, z, w))
         before = self._before
@@ -98,7 +98,7 @@ class Truth(Station):
 
 
 def source_changes(flags: str) -> list[Event]:
-    """From what `listener estimator_status_flags` prints: changes between "1", a heading that is sent, and "2"."""
+    """Parse `listener estimator_status_flags`: changes between "1", a heading that is sent, and "2"."""
     found, source = list[Event](), ""
     for printed in flags.split("TOPIC:")[1:]:
         own_s = re.search(r"timestamp: (\d+)", printed)
@@ -117,10 +117,10 @@ class FlyingPx4(Px4, FlyingVehicle):
 
     Args:
         binary: the firmware; its `etc` lies beside its folder.
-        scenario: whose aircraft is a `FlyingAircraft`.
-        folder: for the binary's files.
-        wind: speed in m/s and where from in degrees.
-        seed: of the gusts.
+        scenario: its aircraft is a `FlyingAircraft`.
+        folder: folder for the binary's files.
+        wind: speed in m/s and direction of origin in degrees.
+        seed: seed of the gusts.
     """
 
     model = "sihsim_quadx"
@@ -147,7 +147,7 @@ class FlyingPx4(Px4, FlyingVehicle):
         self.sticks_us = []
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """SIH's IMU has noise, and no bias."""
+        """Return zero: SIH's IMU has noise, and no bias."""
         return Bias(np.zeros(3), np.zeros(3))
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
@@ -157,7 +157,7 @@ class FlyingPx4(Px4, FlyingVehicle):
         return self._process_of()
 
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
-        """Armed with all its checks, and up to MIS_TAKEOFF_ALT."""
+        """Arm with all checks, and climb to MIS_TAKEOFF_ALT."""
         await ground.put("MIS_TAKEOFF_ALT", height_m)
         await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, *[0.0] * 3, *[math.nan] * 4)
         await self.arm(ground)
@@ -168,7 +168,7 @@ class FlyingPx4(Px4, FlyingVehicle):
         return number >> 16 & 0xFF, number >> 24
 
     async def ask_streams(self, ground: GroundStation) -> None:
-        """Besides, its estimator's flags on its console: each change of them, with its time."""
+        """Ask for the streams, and for the estimator's flags on the console: each change with its time."""
         await super().ask_streams(ground)
         with self._flags.open("wb") as flags:
             listener = await asyncio.create_subprocess_exec(
@@ -185,26 +185,26 @@ class FlyingPx4(Px4, FlyingVehicle):
         self._stack.push_async_callback(end)
 
     def source_changes(self) -> list[Event]:
-        """By the estimator's flags: "1" is the heading that it is sent, "2" its magnetometer."""
+        """Changes by the estimator's flags: "1" is the heading that is sent, "2" its magnetometer."""
         return source_changes(self._flags.read_text(errors="replace"))
 
     async def hold(self, ground: GroundStation) -> None:
-        """It holds by itself once it is up."""
+        """Do nothing: it holds by itself once it is up."""
         await self.until_mode(ground, "hold")
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
-        """Told to turn clockwise on its spot."""
+        """Command a clockwise turn on its spot."""
         yaw_rad = math.remainder(self.truth.recorded[-1][3] + math.radians(degrees), math.tau)
         await ground.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 0.0, 0.0, yaw_rad, *[math.nan] * 3)
         await self.sleep(TURNED_S)
 
     async def steer(self, ground: GroundStation) -> None:
-        """Gusts, until cancelled: no sticks."""
+        """Make gusts until cancelled: there are no sticks."""
         while True:
             for name, mean in self._wind.items():
                 ground.send_put(name, mean + self._dice.gauss(0.0, self._gust_m_s), mavlink.MAV_PARAM_TYPE_REAL32)
             await asyncio.sleep(GUST_EVERY_S)
 
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """SIH's cannot be turned."""
+        """Raise: SIH's compass cannot be turned."""
         raise BinaryError("the compass of PX4's simulation cannot be turned")

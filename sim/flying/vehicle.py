@@ -1,8 +1,8 @@
 """A firmware that flies by its own physics, and the aircraft whose truth comes from it.
 
 The firmware's clock runs beside the wall's, a little behind it on a busy machine. Aircraft time is the wall's: states
-are put where they arrive, smoothed, and rates are what turns the attitude in that time, so that an IMU on the wall
-clock integrates to the attitude there is, however slow the firmware.
+are dated at their arrival, smoothed, and rates are the turn of the attitude in that time, so that an IMU on the wall
+clock integrates to the true attitude, however slow the firmware.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.vehicle import FirmwareVehicle
 
 BEHIND_S = 0.015
-"""So long after an instant it is measured: what is asked for has arrived by then."""
+"""Delay of measurements: states for an instant have arrived by then."""
 MEAN_S = 0.005
-"""Rates and forces are means over so long: the interval of an IMU of 200 Hz."""
+"""Averaging time of rates and forces: the interval of an IMU of 200 Hz."""
 _FOLLOWS = 0.02
-"""Share of the lateness of a state by which the smoothed clock follows."""
+"""Share of a state's lateness by which the smoothed clock follows."""
 _JUMP_S = 0.5
 LATE_S = 0.1
 _SLOPE_ROWS = 4
@@ -43,10 +43,10 @@ RECORDED_S = 0.02
 
 
 class State(NamedTuple):
-    """What a firmware says of its simulated aircraft; body FRD, navigation NED from the place of the start."""
+    """State of a firmware's simulated aircraft; body FRD, navigation NED from the place of the start."""
 
     own_s: float
-    """On the firmware's clock."""
+    """Time by the firmware's clock."""
     quaternion: tuple[float, float, float, float]
     """w, x, y, z; from body to NED."""
     rate_rad_s: tuple[float, float, float]
@@ -66,7 +66,7 @@ def angles_of_quaternion(quaternion: tuple[float, float, float, float]) -> tuple
 
 
 class FlyingAircraft(VirtualAircraft):
-    """Follows the states that `take` is given; until the first it stands level on its spot."""
+    """Follows the states given to `take`; until the first it stands level on its spot."""
 
     def __init__(self, site: Site, *, heading_deg: float = 0.0, unix_s: float) -> None:
         super().__init__(Pose(heading_deg=heading_deg), site, unix_s=unix_s)
@@ -77,21 +77,20 @@ class FlyingAircraft(VirtualAircraft):
 
     @property
     def own_s(self) -> float:
-        """The firmware's clock at the latest state."""
+        """Firmware's clock at the latest state."""
         return float(self._rows[_OWN, self._count - 1]) if self._count else 0.0
 
     @property
     def has_state(self) -> bool:
-        """Whether the firmware has told anything."""
         return self._count > 0
 
     def restart(self) -> None:
-        """The firmware has started anew: its clock begins again."""
+        """Handle a restart of the firmware: its clock begins again."""
         self._count = 0
         self.recorded.clear()
 
     def take(self, state: State, loop_s: float) -> None:
-        """A state that has arrived at this instant of the loop's clock."""
+        """Add a state that arrived at this instant of the loop's clock."""
         at_s = self.time_at(loop_s)
         roll, pitch, yaw = angles_of_quaternion(state.quaternion)
         if self._count == _ROWS:
@@ -117,16 +116,16 @@ class FlyingAircraft(VirtualAircraft):
             self.recorded.append((state.own_s, roll, pitch, yaw, *state.position_m, *state.velocity_m_s))
 
     def still_at(self, t_s: float) -> bool:
-        """Never for sure."""
+        """Return False: it may move at any time."""
         return False
 
     def _still_at(self, t_s: float) -> None:
         return None
 
     def _columns(self, t_s: Array, columns: slice) -> Array:
-        """Interpolated at aircraft times, `BEHIND_S` before them; (n, columns).
+        """Interpolate at aircraft times, `BEHIND_S` before them; (n, columns).
 
-        What has not arrived yet goes on as it was: else a turn would lose whatever comes late.
+        A late state is extrapolated: without that a turn would lose it.
         """
         rows = self._rows[:, max(0, self._count - _KEPT) : self._count]
         asked, last = t_s - BEHIND_S, rows[:, -1]
@@ -186,9 +185,9 @@ class FlyingVehicle(FirmwareVehicle):
     """Roll, pitch, throttle, yaw."""
     is_plane = False
     circle: tuple[float, float, float] | None = None
-    """What a plane that holds is to fly, in m: north and east of the start, and the radius."""
+    """Circle of a plane that holds, in m: north and east of the start, and the radius."""
     modes: Mapping[str, int]
-    """Custom modes by what they are for."""
+    """Custom modes by purpose."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         super().__init__(scenario, folder)
@@ -197,25 +196,23 @@ class FlyingVehicle(FirmwareVehicle):
 
     @property
     def physics_s(self) -> float:
-        """The firmware's clock."""
         return self.truth.own_s
 
     @property
     def height_m(self) -> float:
-        """True height above the place of the start."""
         return -self.truth.recorded[-1][6] if self.truth.recorded else 0.0
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """What it was told at its start."""
+        """Bias set at its start."""
         return self.scenario.flight_controller_imus[instance - 1].true_bias(0.0)
 
     async def ask_streams(self, ground: GroundStation) -> None:
-        """ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
+        """Ask for ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
         for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
             await ground.stream(number, 25.0)
 
     async def arm(self, ground: GroundStation) -> None:
-        """Ask until it arms, with all its checks."""
+        """Ask until it arms, with all checks."""
         await _until_accepted(ground, lambda: ground.arm(wait_s=2.0), ARM_WITHIN_S, "it does not arm")
 
     @abstractmethod
@@ -223,14 +220,14 @@ class FlyingVehicle(FirmwareVehicle):
         """Arm, with all its checks, and climb."""
 
     async def mode(self, ground: GroundStation, name: str) -> None:
-        """Ask until it changes its mode."""
+        """Ask until the mode changes."""
         words = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *self.mode_parameters(self.modes[name])
         ask = functools.partial(ground.command, mavlink.MAV_CMD_DO_SET_MODE, *words)
         await _until_accepted(ground, ask, MODE_WITHIN_S, f"no mode {name}")
         await self.until_mode(ground, name)
 
     async def until_mode(self, ground: GroundStation, name: str) -> None:
-        """Wait until it says that it is in a mode."""
+        """Wait until it reports a mode."""
         since_s = asyncio.get_running_loop().time()
         await ground.wait_for(
             lambda: any(beat.custom_mode == self.modes[name] for beat in ground.vehicle_heartbeats(since_s)),
@@ -238,23 +235,23 @@ class FlyingVehicle(FirmwareVehicle):
         )  # fmt: skip
 
     def mode_parameters(self, number: int) -> tuple[float, ...]:
-        """A custom mode in the parameters of MAV_CMD_DO_SET_MODE."""
+        """Parameters of MAV_CMD_DO_SET_MODE for a custom mode."""
         return (number,)
 
     def source_changes(self) -> list[Event]:
-        """What heading its estimator used, and since when, where it does not say so in words."""
+        """Heading sources of its estimator and their times, where it does not send them as text."""
         return []
 
     @abstractmethod
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """Its own compasses are turned by 45 deg as of now."""
+        """Turn its own compasses by 45 deg from now on."""
 
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:
-        """Stay over the spot, or about it, until told otherwise."""
+        """Hold the spot, or circle about it, until another command."""
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
-        """Turned clockwise by the yaw stick, by the truth; a plane turns anyway."""
+        """Turn clockwise by the yaw stick, measured by the truth; a plane turns anyway."""
         if self.is_plane:
             return
         middle, begun_rad = self.sticks_us[3], self.truth.recorded[-1][3]

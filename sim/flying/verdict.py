@@ -1,4 +1,4 @@
-"""What a flight was like: from the record of truth, estimate and events to figures, and whether they are good enough.
+"""Verdict on a flight: figures from the record of truth, estimate and events, and their limits.
 
 Pure; times are on the firmware's clock, in seconds.
 """
@@ -18,20 +18,20 @@ from sim.earth import Array
 YAW_LIMIT_DEG = 10.0
 POSITION_LIMIT_M = 3.0
 TILT_LIMIT_DEG = 70.0
-"""Beyond it an aircraft that hovers is falling."""
+"""A hovering aircraft beyond this tilt is falling."""
 LOW_M = 1.0
-"""Below it the flight is over."""
+"""The flight is over below this height."""
 BEFORE_S = 10.0
-"""What is compared with how it was before the fault is compared with so many seconds."""
+"""Length of the reference before the fault."""
 CIRCLE_S = 50.0
-"""A plane's circle takes about so long in any wind, which it is off by in one part of it more than in another."""
+"""Time of a plane's circle in any wind; its error varies along the circle."""
 SETTLED_S = 1.0
-"""What the estimate is off by, in place, is taken over so long before the fault."""
+"""Averaging time of the estimator's place error before the fault."""
 HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'other set':>13}{'off truth':>11}{'off spot':>10}  verdict"
 
 
 class Event(NamedTuple):
-    """Something that the firmware said or did."""
+    """An event that the firmware reported."""
 
     own_s: float
     kind: Literal["mode", "set", "disarmed", "text"]
@@ -40,54 +40,53 @@ class Event(NamedTuple):
 
 @dataclass
 class Record:
-    """One flight."""
-
     fault: str
     set_up: str
     wind: tuple[float, float]
-    """Speed in m/s, and where from in degrees."""
+    """Speed in m/s, and direction of origin in degrees."""
     truth: Array = field(default_factory=lambda: np.empty((0, 10)))
     """Rows of `FlyingAircraft.recorded`."""
     estimate: Array = field(default_factory=lambda: np.empty((0, 3)))
     """own_s, yaw of the firmware's estimator in rad, 0."""
     place: Array = field(default_factory=lambda: np.empty((0, 4)))
-    """own_s and where the firmware's estimator believes to be: north, east, down in m."""
+    """own_s, and the place by the firmware's estimator: north, east, down in m."""
     events: list[Event] = field(default_factory=list)
     struck_s: float = math.inf
-    """When the fault happened."""
+    """Time of the fault."""
     circle: tuple[float, float, float] | None = None
-    """Where it is to be, if not on its spot: north and east of the middle, and the radius, in m."""
+    """Target circle, if it does not hold its spot: north and east of the middle, and the radius, in m."""
 
     def after(self, kind: str) -> list[Event]:
-        """Events of a kind after the fault."""
+        """Return the events of a kind after the fault."""
         return [event for event in self.events if event.kind == kind and event.own_s >= self.struck_s]
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Of a flight from its fault on."""
+    """Figures of a flight from the fault on."""
 
     yaw_deg: float
     """Largest error of the estimator's yaw."""
     yaw_before_deg: float
-    """The same in the last seconds before the fault."""
+    """Largest error of the estimator's yaw in the last seconds before the fault."""
     fallback_s: float
-    """Until the other source set was in use; inf: never."""
+    """Time until the other source set was in use; inf: never."""
     estimate_m: float
-    """Largest horizontal error of the estimated place, less what it was before."""
+    """Largest horizontal error of the estimated place, less its error before."""
     spot_m: float
-    """Largest true horizontal distance from where it was at the fault, or from the circle that it is to fly: that one
-    less its largest distance in the circle before."""
+    """Largest true horizontal distance from the place at the fault; on a circle: from the circle, less the largest distance
+    before.
+    """
     sets: int
     """Changes of the source set."""
     modes: int
-    """Changes of the flight mode that nobody has asked for."""
+    """Changes of the flight mode that nobody asked for."""
     crashed: str
-    """How it ended badly, in words; empty if it did not."""
+    """Description of a crash; empty without one."""
 
     @property
     def wrong(self) -> list[str]:
-        """What is not good enough."""
+        """Return the reasons why the flight was not good."""
         found = []
         if not self.yaw_deg <= YAW_LIMIT_DEG:
             found.append(f"yaw above {YAW_LIMIT_DEG:g} deg")
@@ -110,7 +109,6 @@ def _yaw_errors_deg(record: Record) -> tuple[Array, Array]:
 
 
 def figures(record: Record) -> Figures:
-    """The figures of a flight."""
     own_s, errors = _yaw_errors_deg(record)
     struck = record.struck_s
     if not (own_s > struck).any() or not (own_s < struck).any() or not len(record.place):
@@ -155,7 +153,6 @@ def _crashed(record: Record, flown: Array) -> str:
 
 
 def row(record: Record, found: Figures) -> str:
-    """One line of the table."""
     fallback = f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "never"
     wind = f"{record.wind[0]:.0f} m/s {record.wind[1]:03.0f}"
     return (
@@ -165,9 +162,9 @@ def row(record: Record, found: Figures) -> str:
 
 
 def summary(fault: str, set_up: str, flights: Sequence[Figures | None]) -> str:
-    """Of several flights with the same fault: how many were good, and the largest figures with their medians.
+    """Summarise flights with the same fault: number of good ones, and the largest figures with their medians.
 
-    A flight that did not come about is None.
+    None stands for a flight that failed to start.
     """
     found = [flight for flight in flights if flight is not None]
     text = f"{fault}, {set_up}: {sum(not flight.wrong for flight in found)} of {len(found)} flights good"
