@@ -1,4 +1,4 @@
-"""Calibrations on a platform that turns slowly, from the start or after a rest: share of wrong results that would be written.
+"""Calibrations on a platform that turns slowly, from the start or after a rest: share of wrong results.
 
 An aircraft stands on a platform that turns about the vertical. Its readings go second by second into the flying
 collector; at every moment at which a calibration is possible, one is computed. A wrong result is one whose error
@@ -56,7 +56,7 @@ VN100: Final = ImuSpec(
     gyro=AxisNoise(white=8.9 * DEG_H, flicker=7.0 / 0.664 * DEG_H, walk=7.0 * math.sqrt(3e-3) * DEG_H),
     accel=AxisNoise(white=99 * _UG, flicker=40 / 0.664 * _UG, walk=40 * math.sqrt(3e-3) * _UG),
 )
-"""0.0035 deg/s/sqrt(Hz), 5 to 7 deg/h; 140 ug/sqrt(Hz), 40 ug (VectorNav's data sheet); random walk as of the other parts."""
+"""0.0035 deg/s/sqrt(Hz), 5 to 7 deg/h; 140 ug/sqrt(Hz), 40 ug (VectorNav's data sheet)."""
 SPECS: Final = {"vn100": VN100, **{name: PARTS[name] for name in ("icm42688p", "bmi088", "adis16405")}}
 
 

@@ -88,7 +88,7 @@ class Board(AutopilotDouble):
         self._frozen: dict[int, Array] = {}
 
     def exchange_imu(self, model: ImuModel, device_id: int) -> None:
-        """Put another sensor in the place of IMU 1: its id comes with the restart, the offsets stay (`register_accel`)."""
+        """Replace the sensor of IMU 1: its id comes with the restart, the offsets stay (`register_accel`)."""
         self._paths[0] = InertialPath(model, 1, self.parameters, seed=device_id)
         for half in ("GYR", "ACC"):
             self.parameters.set(f"INS_{half}_ID", device_id)

@@ -17,11 +17,11 @@ from sim.imu_model import DEG_H
 _BIAS_FADES_S = 40.0
 _TILT_FADES_S = 10.0
 _YAW_FADES_S = 40.0
-"""Time constant of the compass correcting a wrong heading: 5 deg at 40 s after a step of 0.3 deg/s, under 1 deg at 140 s."""
+"""Time constant of a wrong heading: 5 deg at 40 s after a step of 0.3 deg/s, under 1 deg at 140 s."""
 _TILT_PART_1_S = 0.135
 _TILT_PART_FADES_S = 9.0
-"""After a reset of the gyro biases the estimator mistakes part of a tilt error that it corrects for gyro bias: 850 deg/h
-of 1.75 deg, gone within half a minute, as in the real firmware after a step of 30 mg.
+"""After a reset of the gyro biases the estimator mistakes part of a tilt error that it corrects for gyro bias: 850
+deg/h of 1.75 deg, gone within half a minute, as in the real firmware after a step of 30 mg.
 """
 _START_ERROR_RAD_S = np.array([60.0, 40.0, -1500.0]) * DEG_H
 

@@ -1,4 +1,4 @@
-"""From the sensor to the autopilot's output (offsets, scales, orientation, the 20 Hz filter); its gyro calibration.
+"""Path from the sensor to the autopilot's output: offsets, scales, orientation, 20 Hz filter; its gyro calibration.
 
     gyro_body  = R_b (raw - warm - GYROFFS)
     accel_body = R_b diag(ACCSCAL) (raw - warm - ACCOFFS)
@@ -38,7 +38,7 @@ _DAMPING = math.sqrt(0.5)
 
 
 def orientation_matrix(store: ParameterStore) -> Array:
-    """Board to vehicle for AHRS_ORIENTATION, with 101 and 102 the custom rotations; unknown numbers mean no rotation."""
+    """Board to vehicle for AHRS_ORIENTATION, 101 and 102 custom; unknown numbers mean no rotation."""
     number = int(store.effective["AHRS_ORIENTATION"])
     if number in (101, 102):
         if not store.effective["CUST_ROT_ENABLE"]:
@@ -210,7 +210,8 @@ class Calibrations:
     def gyros(self, t_s: float, *, converged: bool = True) -> tuple[str, ...]:
         """Make the mean rate the offset, Earth's rotation included; return the saved names.
 
-        Offsets are saved without success too; only the temperature is then not noted. Instances without a gyro are zeroed.
+        Offsets are saved without success too; only the temperature is then not noted. Instances without a gyro are
+        zeroed.
         """
         before = dict(self.store.values)
         for path in self.paths:

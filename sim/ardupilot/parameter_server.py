@@ -51,7 +51,7 @@ class ParameterServer:
                 self.announce(member, wrong=wrong and member == name)
 
     def read(self, channel: Channel, message: mavlink.MAVLink_param_request_read_message) -> None:
-        """Handle PARAM_REQUEST_READ by name (index -1) or by index; an unknown one is an error, or silence before 4.7."""
+        """Handle PARAM_REQUEST_READ by name (index -1) or index; an unknown one is an error, silence before 4.7."""
         double = self._double
         if message.param_index >= 0:
             names = double.parameters.names

@@ -121,8 +121,8 @@ class ParameterStore:
 def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) -> dict[str, tuple[float, int]]:
     """Parameters that a companion meets, in a fixed order, with values of a calibrated board with `imus` IMUs.
 
-    With `auxiliary` there are names of IMU 4 and 5 too, and a gyro behind 4; not before 4.4. Offsets of 0.001 m/s^2 stand
-    for "has been accelerometer-calibrated", as in ArduPilot's own simulator.
+    With `auxiliary` there are names of IMU 4 and 5 too, and a gyro behind 4; not before 4.4. Offsets of 0.001 m/s^2
+    stand for "has been accelerometer-calibrated", as in ArduPilot's own simulator.
     """
     table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == NEWEST else 16, INT16)}
     old = not since(version, "4.7")

@@ -63,7 +63,7 @@ class AutopilotDouble(abc.ABC):
         self.random = np.random.default_rng([seed, 4])
         """Random numbers for everything but sensor noise."""
         self.has_compass = False
-        """Its own magnetometer works, and holds its yaw."""
+        """The own magnetometer works, and holds the yaw."""
         self._up_s = up_s
         self._booted_s: float | None = None
         self._down = False

@@ -19,7 +19,7 @@ SCALED_IMU = (
     mavlink.MAVLink_scaled_imu2_message,
     mavlink.MAVLink_scaled_imu3_message,
 )
-"""By number of the IMU."""
+"""Message classes by number of the IMU."""
 
 
 def in_integers(output: Array) -> list[int]:

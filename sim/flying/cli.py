@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def plans_of(arguments: argparse.Namespace) -> list[Plan]:
-    """Return the flights that the options ask for, those of one fault and set-up together; each seed has its own wind."""
+    """Return the flights that the options ask for, sorted by fault and set-up; each seed has its own wind."""
     plans = []
     px4 = "px4" in arguments.binary.name
     if any((set_up == "px4") is not px4 for set_up in arguments.set_up):

@@ -74,8 +74,8 @@ class Figures:
     estimate_m: float
     """Largest horizontal error of the estimated place, less its error before."""
     spot_m: float
-    """Largest true horizontal distance from the place at the fault; on a circle: from the circle, less the largest distance
-    before.
+    """Largest true horizontal distance from the place at the fault; on a circle: from the circle, less
+    the largest distance before.
     """
     sets: int
     """Changes of the source set."""

@@ -1,1 +1,1 @@
-"""The parts of the PX4 double; `sim.px4.double.Board` puts them together."""
+"""Parts of the PX4 double; `sim.px4.double.Board` combines them."""

@@ -1,7 +1,7 @@
-"""What stands before arming: PX4's checks and when it says what they find; the authorisation that it asks for.
+"""PX4's checks before arming and their reports; its request for authorisation.
 
-Facts: PX4 `HealthAndArmingChecks`, `ArmAuthorization.cpp`, `mavlink_command_sender.cpp` (2026-08), autopilots 4.4,
-5.2, 9.2, and runs of the firmware.
+Facts: PX4 `HealthAndArmingChecks`, `ArmAuthorization.cpp`, `mavlink_command_sender.cpp` (2026-08), autopilots 4.4, 5.2,
+9.2, and runs of the firmware.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ NOT_AUTHORIZED = ""
 """The failure that has no words of its own."""
 _SENSORS: tuple[tuple[Kind, str], ...] = (("ACC", "Accel"), ("GYRO", "Gyro"))
 _BIAS_ALARM = 0.75
-"""Part of the estimator's limits."""
+"""Alarm threshold over the estimator's limits."""
 
 
 class Checks:
-    """What stands against arming."""
+    """The checks before arming."""
 
     def __init__(self, double: Board) -> None:
         self._double = double
@@ -36,12 +36,12 @@ class Checks:
         self._reported_s = -math.inf
 
     def restart(self) -> None:
-        """A boot: from now on they run by themselves."""
+        """Handle a boot: from now on the checks run by themselves."""
         self._reported, self._reported_s = [], -math.inf
         self._double.later(WATCH_S, self._watch)
 
     def failures(self, loop_s: float) -> list[str]:
-        """In the firmware's words without the prefix; the authorisation apart."""
+        """Failures in the firmware's words without the prefix, without the authorisation."""
         double, store = self._double, self._double.parameters
         t_s = double.aircraft.time_at(loop_s)
         found = [
@@ -67,7 +67,7 @@ class Checks:
         return found
 
     def report(self, failures: list[str], now_s: float) -> bool:
-        """Say them, if they are others than the last ones said and those are 2 s old; whether it did.
+        """Report failures that differ from the last report, if that is 2 s old; return whether it did.
 
         The real one runs all its checks a second time for that, and in an arm request asks for authorisation again.
         """
@@ -109,16 +109,15 @@ class Request:
 
 
 class ArmAuthorization:
-    """The state that the checks before arming ask."""
+    """State of the authorisation for the checks before arming."""
 
     def __init__(self, double: Board) -> None:
         self._double = double
         self.requests = 0
-        """Requests sent since the start, repetitions not counted."""
+        """Requests sent since the start, without repetitions."""
         self.restart()
 
     def restart(self) -> None:
-        """A boot."""
         self._state: Literal["idle", "waiting", "approved"] = "idle"
         self._until_s = 0.0
         self._verdict: Verdict | None = None
@@ -131,7 +130,7 @@ class ArmAuthorization:
         return bool(self._double.parameters["COM_ARM_AUTH_REQ"])
 
     def check(self, verdict: Verdict) -> None:
-        """Say whether arming is authorised: at once in the two-step method, else with the answer or time-out."""
+        """Check the authorisation: at once in the two-step method, else with the answer or time-out."""
         double, now_s = self._double, self._double.now_s()
         if self._state == "approved" and now_s > self._until_s:
             self._state = "idle"
@@ -152,7 +151,7 @@ class ArmAuthorization:
             verdict(False)  # noqa: FBT003 - the verdict's only argument
 
     def acknowledged(self, message: mavlink.MAVLink_command_ack_message) -> None:
-        """A COMMAND_ACK that is addressed to this component or to all; anybody's counts."""
+        """Handle a COMMAND_ACK addressed to this component or to all; every sender counts."""
         if message.command != REQUEST:
             return
         for request in self._open:
@@ -208,7 +207,7 @@ class ArmAuthorization:
             )
 
     def _retry(self, request: Request) -> None:
-        """Every half second: the first port begins a round of repetitions, the other follows half a second later."""
+        """Repeat every half second: the first port begins a round of repetitions, the other follows 0.5 s later."""
         if request.answered or request.rounds > RETRIES:
             self._open.remove(request)
             return

@@ -1,4 +1,4 @@
-"""What PX4's parts have in common: ports, sensors with their estimators, parameters, and a voice."""
+"""The base of PX4's parts: ports, sensors with their estimators, parameters, and texts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Orders(Protocol):
     """It waits for an authorisation and does nothing else."""
 
     def receives_own_request(self, number: int) -> None:
-        """A command that it has sent itself comes back to it."""
+        """Handle a command that it sent itself."""
 
 
 class Board(AutopilotDouble):
@@ -33,17 +33,17 @@ class Board(AutopilotDouble):
 
     Args:
         aircraft: the truth.
-        imus: one to four models in the order of their uORB instances; the first is IMU 1. Their `mounting_deg` is how
-            the board is really turned, which SENS_BOARD_ROT (default none) or CAL_x_ROT is meant to undo.
+        imus: one to four models in the order of their uORB instances; the first is IMU 1. Their `mounting_deg` is the
+            true orientation of the board, which SENS_BOARD_ROT (default none) or CAL_x_ROT is meant to undo.
         version: "1.18": PARAM_ERROR. "1.16": silence instead.
         vehicle: "copter" or "plane".
         parameters: values that differ from the defaults, such as {"IMU_GYRO_CAL_EN": 0}; set before the first boot.
         slots: number n of the CAL_GYROn_/CAL_ACCn_ slot of each IMU, None for no slot; default 0, 1, 2, ...
         external: numbers (0..) of IMUs that are external: they turn with CAL_x_ROT.
-        imu_rate_hz: of the integrated samples; streams are quantised by it.
-        default_streams: False: nothing but heartbeats and TIMESYNC runs by itself (quick tests).
-        up_s: how long it has been running when the simulation begins.
-        console: whether `listener` is built, which some small boards leave out.
+        imu_rate_hz: rate of the integrated samples; streams are quantised by it.
+        default_streams: False: only heartbeats and TIMESYNC run by themselves (quick tests).
+        up_s: time since its boot at the beginning of the simulation.
+        console: `listener` is built, which some small boards leave out.
     """
 
     commander: Orders
@@ -99,17 +99,17 @@ class Board(AutopilotDouble):
             for n, model in enumerate(imus)
         ]
         self.primary_imu = 0
-        """Number of the IMU that flies, which HIGHRES_IMU shows."""
+        """Number of the flying IMU, which HIGHRES_IMU shows."""
         self._frozen: dict[int, Sample] = {}
 
     def residual(self, instance: int, loop_s: float) -> Bias:
-        """What is left in the output of IMU `instance` (1..) after offsets and scales: output minus truth, FRD."""
+        """Error left in the output of IMU `instance` (1..) after offsets and scales: output minus truth, FRD."""
         t_s = self.aircraft.time_at(loop_s)
         output, truth = self.vehicle_imus[instance - 1].corrected(t_s), self.aircraft.truth_at(t_s)
         return Bias(output[:3] - truth.rate_rad_s, output[3:] - truth.force_m_s2)
 
     def imu_output(self, index: int, loop_s: float) -> Sample:
-        """The newest corrected sample of IMU index 0.. in vehicle FRD."""
+        """Newest corrected sample of IMU index 0.. in vehicle FRD."""
         if self.faults.frozen_imu and index in self._frozen:
             return self._frozen[index]
         sample = self.vehicle_imus[index].sample(self.aircraft.time_at(loop_s))
@@ -117,7 +117,7 @@ class Board(AutopilotDouble):
         return sample
 
     def update_estimators(self, loop_s: float) -> None:
-        """Bring the estimators to this time; to be called before anything changes the output."""
+        """Bring the estimators to this time; call it before anything changes the output."""
         t_s = self.aircraft.time_at(loop_s)
         for imu in self.vehicle_imus:
             if imu.estimator.time_s == t_s:
@@ -127,11 +127,11 @@ class Board(AutopilotDouble):
 
     @abc.abstractmethod
     def parameters_changed(self, *, consumers: bool = True) -> None:
-        """Tell everyone: those who use parameters, every port, the storage."""
+        """Notify the users of parameters, every port, and the storage."""
 
     @abc.abstractmethod
     def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT on every port with a ground station; elsewhere it waits for one, for 5 s."""
+        """Send STATUSTEXT on every port with a ground station; elsewhere it waits for one, for 5 s."""
 
     def _new_store(
         self,

@@ -1,7 +1,6 @@
-"""One sensor's correction as PX4 keeps it in memory: which slot is its own, which offset is in use, what is refused.
+"""One sensor's correction in PX4's memory: its slot, the offset in use, rejected values.
 
-    corrected = R ((raw - OFF) o SCALE)
-    R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT), external: R(CAL_x_ROT)
+    corrected = R ((raw - OFF) o SCALE)    R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT), external: R(CAL_x_ROT)
 
 Every reader of the parameters in the firmware has such an object of its own (each IMU, the background gyro calibration,
 each commanded calibration), and so has the double. Facts: PX4 `src/lib/sensor_calibration`, autopilots 4.1, 4.2, 9.3.2.
@@ -20,57 +19,56 @@ from sim.px4.parameters import SLOTS, ParameterStore
 Kind = Literal["GYRO", "ACC"]
 _PRIORITY, _EXTERNAL_PRIORITY = 50, 75
 THRESHOLD = 0.01
-"""rad/s or m/s^2 (and the same for scales): a vector is only taken when it is farther than this from the one in use."""
+"""rad/s or m/s^2 (and the same for scales): a vector is used only if it is farther than this from the one in use."""
 
 
 class SensorCalibration:
-    """The correction of one triad.
+    """Correction of one triad.
 
     Args:
-        kind: which parameters.
-        device_id: of the sensor.
-        external: whether it turns with its own CAL_x_ROT instead of with the board.
-        store: where the parameters are.
+        kind: selects the parameters.
+        device_id: id of the sensor.
+        external: the sensor turns with its own CAL_x_ROT instead of with the board.
+        store: the parameters.
     """
 
     def __init__(self, kind: Kind, device_id: int, store: ParameterStore, *, external: bool = False) -> None:
         self.kind, self.device_id, self.external = kind, device_id, external
         self._store = store
         self.slot: int | None = None
-        """The slot that has its device id; None: uncalibrated."""
+        """Slot with its device id; None: uncalibrated."""
         self.offset = np.zeros(3)
-        """In use: rad/s or m/s^2, sensor axes."""
+        """Offset in use: rad/s or m/s^2, sensor axes."""
         self.scale = np.ones(3)
         self.rotation = np.eye(3)
         """Sensor to vehicle."""
         self.count = 0
-        """How often an offset or a scale was taken since the last reset."""
+        """Changes of offset or scale since the last reset."""
         self.reset()
         self.parameters_update()
 
     @property
     def calibrated(self) -> bool:
-        """Whether a slot has its device id."""
         return self.slot is not None
 
     @property
     def enabled(self) -> bool:
-        """CAL_x_PRIO 0 takes the sensor out of use."""
+        """CAL_x_PRIO 0 disables the sensor."""
         return self.slot is None or self._store[f"CAL_{self.kind}{self.slot}_PRIO"] != 0
 
     def correct(self, raw: Array) -> Array:
-        """A reading (3) in sensor axes, corrected and turned into the vehicle's."""
+        """Correct a reading (3) in sensor axes and turn it into the vehicle's."""
         result: Array = self.rotation @ ((raw - self.offset) * self.scale)
         return result
 
     def reset(self) -> None:
-        """No slot: no offset, the board's rotation."""
+        """Reset: no slot, no offset, the board's rotation."""
         self.slot = None
         self.offset, self.scale, self.count = np.zeros(3), np.ones(3), 0
         self._set_rotation(0 if self.external else int(self._store["SENS_BOARD_ROT"]))
 
     def parameters_update(self) -> None:
-        """Look for the slot and take from it what is far enough from what is in use."""
+        """Find the slot and use its values where they are far enough from those in use."""
         store = self._store
         self.slot = find_slot(store, self.kind, self.device_id)
         if self.slot is None:
@@ -86,9 +84,9 @@ class SensorCalibration:
                 self.count += 1
 
     def set_offset(self, offset: Array) -> bool:
-        """Take it if it is more than 0.01 (length of the difference) from the one in use.
+        """Use an offset if its difference to the one in use is longer than 0.01.
 
-        A gyro that has taken none yet takes any; an accelerometer does not: below 0.01 it never takes it.
+        A gyro without an offset uses any; an accelerometer does not: below 0.01 it never uses it.
         """
         first = self.kind == "GYRO" and self.count == 0
         if (first or _far(self.offset, offset)) and np.isfinite(offset).all():
@@ -98,7 +96,7 @@ class SensorCalibration:
         return False
 
     def save(self, preferred_slot: int) -> bool:
-        """Write what is in use into its slot, or the preferred, or the first free one; False when all are taken."""
+        """Write the values in use into its slot, or the preferred, or the first free one; False when all are taken."""
         store = self._store
         slot = find_slot(store, self.kind, self.device_id)
         if slot is None:
@@ -125,7 +123,7 @@ class SensorCalibration:
 
 
 def find_slot(store: ParameterStore, kind: Kind, device_id: int) -> int | None:
-    """The first slot whose CAL_x_ID is this device's."""
+    """Return the first slot whose CAL_x_ID is this device's."""
     return next((slot for slot in range(SLOTS) if store[f"CAL_{kind}{slot}_ID"] == device_id), None)
 
 

@@ -1,4 +1,4 @@
-"""The commands PX4 understands, with its results, and what stands before arming (autopilots 4.4, 4.6, 5.2, 9.2).
+"""PX4's commands and their results, and its requests to arm (autopilots 4.4, 4.6, 5.2, 9.2).
 
 Facts: PX4 `mavlink_receiver.cpp`, `Commander.cpp`, `HealthAndArmingChecks` (2026-08) and runs of the firmware.
 """
@@ -29,14 +29,14 @@ ACK_DELAY_S = (0.003, 0.010)
 REBOOT_DELAY_S = 0.4
 DOWN_S = 3.0
 QUEUE = 8
-"""Commands that wait while the commander waits for an authorisation; more are lost."""
+"""Queued commands while the commander waits for an authorisation; more are lost."""
 _UNANSWERED = {
     mavlink.MAV_CMD_PREFLIGHT_SET_SENSOR_OFFSETS,
     mavlink.MAV_CMD_PREFLIGHT_UAVCAN,
     mavlink.MAV_CMD_DO_MOUNT_CONTROL,
     mavlink.MAV_CMD_DO_SET_ROI,
 }
-"""Left to other parts of the firmware, which here do not exist: no acknowledgement at all."""
+"""Commands of other parts of the firmware, which do not exist here: no acknowledgement at all."""
 
 
 class Commander:
@@ -64,13 +64,12 @@ class Commander:
         self.restart()
 
     def restart(self) -> None:
-        """A boot."""
         self.blocked = False
-        """It waits for an authorisation and does nothing else."""
+        """Waiting for an authorisation, and doing nothing else."""
         self._waiting: deque[Command | int] = deque(maxlen=QUEUE)
 
     def handle(self, command: Command) -> None:
-        """Do it, and acknowledge; what is not the port's own business waits while the commander is blocked."""
+        """Carry out a command and acknowledge; commands for the commander wait while it is blocked."""
         at_port = self._at_the_port.get(command.number)
         if at_port is not None:
             self._acknowledge(command, at_port(command))
@@ -80,7 +79,7 @@ class Commander:
             self._carry_out(command)
 
     def receives_own_request(self, number: int) -> None:
-        """A command that the autopilot sent to its own system id comes back to it: UNSUPPORTED, to nobody (0/0)."""
+        """Answer a command that the autopilot sent to its own system id: UNSUPPORTED, to nobody (0/0)."""
         if self.blocked:
             self._waiting.append(number)
         else:
@@ -98,7 +97,7 @@ class Commander:
                 self._double.answer(port, answer)
 
     def _acknowledge(self, command: Command, result: int | None) -> None:
-        """On every port on which the requester was heard."""
+        """Acknowledge on every port on which the requester was heard."""
         if result is None:
             return
         double, target = self._double, (command.system_id, command.component_id)
@@ -157,7 +156,7 @@ class Commander:
         return None
 
     def _check(self, done: Callable[[list[str]], None]) -> None:
-        """All checks of an arm request: the failures, with the authorisation as the last."""
+        """Run all checks of an arm request: the failures, with the authorisation as the last."""
         failures = self._checks.failures(self._double.now_s())
         authorization = self._authorization
         if authorization.required:

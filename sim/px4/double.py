@@ -1,7 +1,7 @@
-"""A PX4 that fits in a test: parameters, telemetry and manners of the real one, on any event loop.
+"""A double of PX4: parameters, telemetry and behaviour of the real one, on any event loop.
 
-What is modelled follows what was read in PX4's sources and seen in runs of the real firmware (autopilots
-4, 5.1, 5.2, 5.4, 7.5, 8, 9.2 and 9.3.2); the class says what is not.
+The model follows PX4's sources and runs of the real firmware (autopilots 4, 5.1, 5.2, 5.4, 7.5, 8, 9.2 and 9.3.2); the
+class lists what is missing.
 """
 
 from __future__ import annotations
@@ -65,42 +65,39 @@ class PX4Double(Board):
     # What tests and people do to it.
 
     def parameter(self, name: str) -> float:
-        """What is read back; KeyError if there is none of that name."""
         return self.parameters[name]
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set without telling anyone, as if it had always been so: in use at once, whatever the threshold."""
+        """Set a value silently, as if it had always been so: in use at once, whatever the threshold."""
         self.parameters.preset(name, value)
         for imu in self.vehicle_imus:
             imu.restart()
         self._read_boot_parameters()
 
     def write_as_another_station(self, name: str, value: float) -> None:
-        """Another ground station sets a parameter: stored, and announced on every port."""
+        """Set a parameter as another ground station does: stored, and announced on every port."""
         if self.parameters.set(name, value):
             self.parameters_changed()
 
     def arm(self) -> None:
-        """It arms, whatever the checks say; send the command to have them run."""
+        """Arm, whatever the checks say; send the command to have them run."""
         if not self.armed:
             self.armed, self._armed_s = True, self.now_s()
             self.say(mavlink.MAV_SEVERITY_INFO, "Armed by external command\t")
 
     def disarm(self) -> None:
-        """The pilot disarms."""
         if self.armed:
             self.armed = False
             self.say(mavlink.MAV_SEVERITY_INFO, "Disarmed by external command\t")
             self.learned_offsets.disarmed(self.now_s(), self.now_s() - self._armed_s)
 
     def prearm_failures(self, loop_s: float) -> list[str]:
-        """Why it would not arm, in the firmware's words without the prefix; the authorisation apart."""
+        """Reasons against arming, in the firmware's words without the prefix, without the authorisation."""
         return self.checks.failures(loop_s)
 
     # What its parts use.
 
     def build(self, message_id: int, loop_s: float) -> Message | None:
-        """A message of `BUILDERS`."""
         return BUILDERS[message_id](self, loop_s)
 
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
@@ -113,7 +110,6 @@ class PX4Double(Board):
         return roll + roll_error, pitch + pitch_error, float((yaw + np.pi) % (2.0 * np.pi) - np.pi)
 
     def parameters_changed(self, *, consumers: bool = True) -> None:
-        """Tell everyone: those who use parameters, every port, the storage."""
         if consumers:
             for consumer in self._consumers:
                 consumer.notify()
@@ -124,7 +120,6 @@ class PX4Double(Board):
             self.later(max(AUTOSAVE_S, AUTOSAVE_EVERY_S - since_s), self._autosave)
 
     def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT on every port with a ground station; elsewhere it waits for one, for 5 s."""
         self._voice.say(severity, text)
 
     # The inside.
@@ -162,13 +157,13 @@ class PX4Double(Board):
             imu.estimator.reset(since_s, error.accel_m_s2)
 
     def _read_boot_parameters(self) -> None:
-        """What is looked at only at a boot."""
+        """Read the parameters that count only at a boot."""
         companion, ground = self.ports
         companion.forwards = bool(self.parameters["MAV_1_FORWARD"])
         ground.forwards = bool(self.parameters["MAV_0_FORWARD"])
 
     def _update_imus(self, now_s: float) -> None:
-        """The IMUs look at the parameters; an estimator forgets its bias when an offset or scale is taken."""
+        """Update the IMUs' parameters; an estimator forgets its bias when an offset or scale changes."""
         self.update_estimators(now_s)
         for imu in self.vehicle_imus:
             gyro, accel = imu.gyro.count, imu.accel.count
@@ -235,7 +230,7 @@ COMPONENT = 1
 
 
 def forward(system_id: int, ports: Sequence[PX4Port], came_by: PX4Port, message: Message, *, heartbeats: bool) -> None:
-    """Pass a packet on to the other ports that it concerns.
+    """Forward a packet to the other ports that it concerns.
 
     Autopilots 5.4: both ports need MAV_n_FORWARD = 1, and the target must have been heard there.
     """
@@ -262,7 +257,7 @@ _CHUNK = 50
 
 
 class Voice:
-    """Says texts on all ports, one at a time, where a ground station's HEARTBEAT is heard (autopilots 9.3.2).
+    """Sends texts on all ports, one at a time, where a ground station's HEARTBEAT is heard (autopilots 9.3.2).
 
     Elsewhere they wait, and are dropped when they are 5 s old.
     """
@@ -271,20 +266,20 @@ class Voice:
         self._double = double
 
     def say(self, severity: int, text: str) -> None:
-        """Queue on every port; of more than eight that wait the oldest is lost."""
+        """Queue a text on every port; of more than eight the oldest is lost."""
         now_s = self._double.now_s()
         for port in self._double.ports:
             port.texts.append((now_s, severity, text))
             self.go_on(port)
 
     def heard(self, port: PX4Port, message: mavlink.MAVLink_heartbeat_message, loop_s: float) -> None:
-        """Remember when a ground station's HEARTBEAT came, and go on."""
+        """Note the time of a ground station's HEARTBEAT, and continue."""
         if message.type == mavlink.MAV_TYPE_GCS:
             port.gcs_heard_s = loop_s
         self.go_on(port)
 
     def go_on(self, port: PX4Port) -> None:
-        """Send the next text if its time has come: 20 a second."""
+        """Send the next text if it is due: 20 a second."""
         now_s = self._double.now_s()
         while port.texts and now_s - port.texts[0][0] >= STALE_S:
             port.texts.popleft()

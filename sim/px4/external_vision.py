@@ -1,4 +1,4 @@
-"""What the double makes of an attitude from outside: external vision as EKF2 uses its yaw.
+"""External attitude in the double: external vision as EKF2 uses its yaw.
 
 Facts: PX4 `mavlink_receiver.cpp`, `EKF2.cpp` (UpdateExtVisionSample), `ev_control.cpp`, `ev_yaw_control.cpp`,
 `Timesync.cpp` (2026). Not modelled: position, velocity, ODOMETRY, the estimator's yaw covariance.
@@ -15,11 +15,11 @@ from sim.firmware.channel import Message
 from sim.px4.board import Board
 
 YAW_BIT = 8
-"""Of EKF2_EV_CTRL."""
+"""Bit of EKF2_EV_CTRL."""
 LONGEST_GAP_S = 0.2
 STOPS_AFTER_S = 0.4
 RESTARTS_AFTER_S = 1.0
-"""Since the last fusion, before it starts again."""
+"""Time since the last fusion until it starts again."""
 CONVERGED_AFTER = 500
 """Accepted TIMESYNC exchanges until stamps are used."""
 LONGEST_ROUND_TRIP_S = 0.010
@@ -28,7 +28,7 @@ GATE_SIGMAS = 2.6
 FAILS_AFTER_S = 1.0
 FUSED_S = 2.0
 COMPASS_FADES_S = 10.0
-"""So fast the magnetometer takes a wrong heading back, while no yaw comes from outside."""
+"""Time constant of the magnetometer correcting a wrong heading, without external yaw."""
 
 
 class ExternalVision:
@@ -37,17 +37,16 @@ class ExternalVision:
     def __init__(self, double: Board) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
-        """By reason."""
+        """Rejected messages by reason."""
         self.consumed = 0
-        """Messages whose orientation came through to EKF2."""
+        """Messages whose orientation reached EKF2."""
         self.sigma_rad = math.nan
-        """Of yaw, as EKF2 took it last."""
+        """Sigma of the yaw last used by EKF2."""
         self.late_s = math.nan
-        """How old the last sample was by its stamp."""
+        """Age of the last sample by its stamp."""
         self.restart()
 
     def restart(self) -> None:
-        """A boot."""
         self.active = False
         """cs_ev_yaw of its status flags."""
         self.yaw_error_rad = 0.0
@@ -59,11 +58,11 @@ class ExternalVision:
 
     @property
     def converged(self) -> bool:
-        """Whether stamps are used; before, what arrives is new."""
+        """Stamps are used; before, every sample counts as new."""
         return self.exchanges >= CONVERGED_AFTER
 
     def timesync(self, their_ns: int, sent_ns: int, loop_s: float) -> None:
-        """An answer to a request of our own."""
+        """Handle an answer to a request of our own."""
         now_s = self._double.boot_us(loop_s) * 1e-6
         if now_s - sent_ns * 1e-9 < LONGEST_ROUND_TRIP_S:
             self.exchanges += 1
@@ -81,7 +80,7 @@ class ExternalVision:
         self._updated_s = loop_s
 
     def take(self, message: Message, loop_s: float) -> None:
-        """A message that may be one."""
+        """Handle a message, if it is an attitude."""
         if isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
             angles = (message.roll, message.pitch, message.yaw)
             if not all(map(math.isfinite, angles)):
@@ -131,5 +130,5 @@ class ExternalVision:
         return math.remainder(yaw_rad - truth, 2.0 * math.pi)
 
     def _say(self, words: str) -> None:
-        """On its console only, as the real one."""
+        """Log on its console only, as the real one."""
         self.rejected[words] += 1

@@ -1,4 +1,4 @@
-"""What the PX4 double says of itself, message by message (autopilots 4.5, 9.2; PX4 `src/modules/mavlink/streams`)."""
+"""Messages of the PX4 double (autopilots 4.5, 9.2; PX4 `src/modules/mavlink/streams`)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sim.px4.board import Board
 Message = mavlink.MAVLink_message
 Builder = Callable[["Board", float], Message | None]
 _PUBLISHED_AFTER_S = 0.0008
-"""SCALED_IMU tells when a sample was published, HIGHRES_IMU when it was taken."""
+"""SCALED_IMU carries the time of publishing, HIGHRES_IMU that of sampling."""
 _HOLD_MODE = 4 << 16 | 3 << 24
 
 
@@ -81,7 +81,7 @@ def timesync(double: Board, loop_s: float) -> Message:
 
 
 def home_position(double: Board, loop_s: float) -> Message:
-    """HOME_POSITION: where it stands."""
+    """HOME_POSITION: its place."""
     site = double.aircraft.site
     return mavlink.MAVLink_home_position_message(
         round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7), round(site.height_m * 1000.0),
@@ -97,7 +97,7 @@ def extended_sys_state(double: Board, loop_s: float) -> Message:
 
 
 def estimator_status(double: Board, loop_s: float) -> Message:
-    """ESTIMATOR_STATUS: what it uses for its heading is not in it."""
+    """ESTIMATOR_STATUS: the source of its heading is not in it."""
     flags = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
     flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
     return mavlink.MAVLink_estimator_status_message(

@@ -1,4 +1,4 @@
-"""PX4's parameters: defaults, the store, and how a change reaches those who use it.
+"""PX4's parameters: defaults, the store, and the way of a change to its users.
 
 Facts: PX4 `src/lib/parameters/parameters.cpp`, `autosave.cpp`, `SubscriptionInterval.cpp` and its metadata (2026-08),
 autopilots 4, 5.2, 7.5 and 9.2.
@@ -17,7 +17,7 @@ from sim.firmware.numbers import float32
 
 SLOTS = 4
 SIMULATED_IDS = (1310988, 1310996, 1311004, 1311012)
-"""Device ids as PX4's own simulation has them: internal sensors."""
+"""Device ids in PX4's own simulation: internal sensors."""
 EXTERNAL_IDS = (1311243, 1311499, 1311755, 1312011)
 """Device ids on a CAN bus: external sensors."""
 LENGTH = 764
@@ -35,7 +35,7 @@ _FIXED: dict[str, float] = {
 
 
 def default_parameters() -> dict[str, float]:
-    """Name to default: an int is an INT32, a float a REAL32."""
+    """Defaults by name: an int is an INT32, a float a REAL32."""
     table = dict(_FIXED)
     for slot in range(SLOTS):
         for kind in ("GYRO", "ACC"):
@@ -52,23 +52,25 @@ def default_parameters() -> dict[str, float]:
 INT32 = mavlink.MAV_PARAM_TYPE_INT32
 REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 SMALLEST_CHANGE = 1.1920929e-07
-"""A float that changes by no more than this is stored, but nobody is told and it is not saved for that; one that
-differs from its default by no more is not saved at all."""
+"""A float that changes by no more than this is stored, but not announced and not saved for that.
+
+A value that differs from its default by no more is not saved at all.
+"""
 
 
 class ParameterStore:
-    """Name to value. A default that is an `int` makes an INT32, one that is a `float` a REAL32."""
+    """Values by name. A default that is an `int` makes an INT32, one that is a `float` a REAL32."""
 
     def __init__(self, defaults: Mapping[str, float]) -> None:
         self._defaults = {name: v if isinstance(v, int) else float32(v) for name, v in sorted(defaults.items())}
         self.values: dict[str, float] = dict(self._defaults)
-        """What is read back, and what the firmware reads when it looks."""
+        """Values in use, and read back."""
         self.saved: dict[str, float] = dict(self._defaults)
-        """What a boot finds."""
+        """Values that a boot loads."""
         self.unsaved: set[str] = set()
-        """Changed since the last save: what is announced on every port."""
+        """Names changed since the last save: announced on every port."""
         self.names = tuple(self.values)
-        """In the order of their indices: the alphabet's."""
+        """Names in the order of their indices, alphabetical."""
         self.index = {name: number for number, name in enumerate(self.names)}
 
     def __contains__(self, name: object) -> bool:
@@ -82,11 +84,10 @@ class ParameterStore:
         return isinstance(self._defaults[name], int)
 
     def type_of(self, name: str) -> int:
-        """MAV_PARAM_TYPE."""
         return INT32 if self.is_int(name) else REAL32
 
     def set(self, name: str, value: float) -> bool:
-        """Store, within no limits; says whether that is a change that counts."""
+        """Store, without limits; return whether the change counts."""
         new = int(value) if self.is_int(name) else float32(value)
         old = self.values[name]
         changed = new != old if self.is_int(name) else abs(new - old) > SMALLEST_CHANGE
@@ -99,7 +100,7 @@ class ParameterStore:
         return changed
 
     def save(self) -> None:
-        """Write everything to the storage that is not, or almost, its default."""
+        """Save every value that differs enough from its default."""
         self.saved = {name: self._stored(name, value) for name, value in self.values.items()}
         self.unsaved.clear()
 
@@ -108,32 +109,29 @@ class ParameterStore:
         return default if abs(value - default) <= SMALLEST_CHANGE and not self.is_int(name) else value
 
     def load(self) -> None:
-        """What a boot does: work with what has been saved."""
+        """Load the saved values, as at a boot."""
         self.values = dict(self.saved)
         self.unsaved.clear()
 
     def preset(self, name: str, value: float) -> None:
-        """Set and save without a word, as if it had always been so."""
+        """Set and save silently, as if it had always been so."""
         self.values[name] = self.saved[name] = int(value) if self.is_int(name) else float32(value)
 
     def on_the_wire(self, name: str) -> float:
-        """The value as PARAM_VALUE carries it: the bytes of an int32 in the place of a float."""
+        """Value as PARAM_VALUE carries it: the bytes of an int32 in the place of a float."""
         value = self.values[name]
         return bytes_as_float(int(value)) if self.is_int(name) else value
 
     def vector(self, slot: int, kind: str, suffix: str) -> tuple[float, float, float]:
-        """CAL_<kind><slot>_{X,Y,Z}<suffix>."""
         x, y, z = (self.values[f"CAL_{kind}{slot}_{axis}{suffix}"] for axis in "XYZ")
         return x, y, z
 
 
 def bytes_as_float(value: int) -> float:
-    """The float that has the bytes of this int32."""
     return float(struct.unpack("<f", struct.pack("<i", value))[0])
 
 
 def float_as_int(value: float) -> int:
-    """The int32 that has the bytes of this float."""
     return int(struct.unpack("<i", struct.pack("<f", value))[0])
 
 
@@ -143,7 +141,7 @@ INTERVAL_S = 1.0
 class Consumer:
     """One reader of parameters that looks every `period_s`, and at changes at most once a second.
 
-    After a quiet time it lets two looks pass, then it waits (autopilots 9.2: effect after 4 ms, or up to 1 s).
+    After a quiet time it skips two looks, then it waits (autopilots 9.2: effect after 4 ms, or up to 1 s).
     """
 
     def __init__(self, double: AutopilotDouble, period_s: float, action: Callable[[float], None]) -> None:
@@ -152,11 +150,9 @@ class Consumer:
         self._pending = False
 
     def restart(self) -> None:
-        """A boot."""
         self._last_s, self._pending = -math.inf, False
 
     def notify(self) -> None:
-        """Something has changed."""
         if self._pending:
             return
         self._pending = True

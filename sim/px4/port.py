@@ -1,4 +1,4 @@
-"""PX4's ports: streams looked at once per sensor sample, texts only for ground stations, routes learned per port.
+"""PX4's ports: streams checked once per sensor sample, texts only for ground stations, routes learned per port.
 
 Facts: PX4 `mavlink_stream.cpp`, `mavlink_main.cpp`, `STATUSTEXT.hpp` (2026-08), autopilots 4.5, 5.4, 9.2, 9.3.2.
 """
@@ -16,14 +16,14 @@ from sim.firmware.channel import Channel, Message, Stream
 
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 MAIN_LOOP_S = 0.0015
-"""The pause of a port's loop on a fast link."""
+"""Pause of a port's loop on a fast link."""
 GCS_TIMEOUT_S = 2.5
 TEXT_QUEUE = 8
 
 
 @dataclass(slots=True)
 class PacedStream(Stream):
-    """A stream, and when it was sent by its own reckoning."""
+    """A stream, and its nominal time of the last message."""
 
     last_s: float = 0.0
 
@@ -58,7 +58,7 @@ class PX4Port(Channel):
 
     Args:
         defaults: rates in Hz of the streams that run by themselves.
-        period_s: of the sensor samples: streams are looked at once per sample, so rates are quantised by it.
+        period_s: period of the sensor samples: streams are checked once per sample, so rates are quantised by it.
     """
 
     # PX4's documents, MAVLink Message Signing (main, 2026): its "unsigned message allowlist".
@@ -84,14 +84,14 @@ class PX4Port(Channel):
         self.seen: set[tuple[int, int]] = set()
         """System and component of every sender heard since the boot."""
         self.gcs_heard_s = -math.inf
-        """When a HEARTBEAT of type GCS came last."""
+        """Time of the last HEARTBEAT of type GCS."""
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=TEXT_QUEUE)
-        """Time, severity and text of what could not be said yet; the oldest is lost."""
+        """Time, severity and text of waiting texts; the oldest is lost."""
         self.text_number = 0
         self.text_next_s = 0.0
 
     def restart(self, now_s: float) -> None:
-        """A boot: default streams, nobody seen."""
+        """Handle a boot: default streams, nobody seen."""
         self.streams.clear()
         self.seen.clear()
         self.texts.clear()
@@ -107,7 +107,7 @@ class PX4Port(Channel):
         return any(s == system and component in (0, c) for s, c in self.seen)
 
     def has_ground_station(self, now_s: float) -> bool:
-        """Whether texts are sent here."""
+        """Texts are sent here."""
         return now_s - self.gcs_heard_s <= GCS_TIMEOUT_S
 
     def set_stream(self, message_id: int, interval_s: float | None, now_s: float) -> None:
@@ -122,7 +122,7 @@ class PX4Port(Channel):
             self._plan(stream)
 
     def due(self, now_s: float) -> list[int]:
-        """Message ids whose time has come."""
+        """Message ids that are due."""
         due = []
         for message_id, stream in self.streams.items():
             if stream.next_s <= now_s + 1e-9:
@@ -136,6 +136,6 @@ class PX4Port(Channel):
         return due
 
     def _plan(self, stream: PacedStream) -> None:
-        """The first sample at which it is due, that is 0.3 of a loop's pause before its interval is over."""
+        """Plan the first sample at which it is due: 0.3 of a loop's pause before its interval is over."""
         wanted_s = stream.last_s + stream.interval_s - 0.3 * MAIN_LOOP_S
         stream.next_s = (math.floor(wanted_s / self.period_s) + 1) * self.period_s

@@ -1,7 +1,7 @@
-"""What else writes offsets: the commanded gyro calibration, that in the background, and what was learned in the air.
+"""Other writers of offsets: the commanded gyro calibration, that in the background, and offsets learned in flight.
 
 Autopilots 4.3, 4.6, 9.2, 9.3.2; PX4 `commander`, `GyroCalibration.cpp`, `VehicleIMU.cpp`, `EKF2.cpp` (2026-08). The
-last two tell nobody but through the PARAM_VALUE that follows every change.
+last two show only in the PARAM_VALUE that follows every change.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _INFO, _CRITICAL = mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_CRITICAL
 class Calibrations:
     """PX4's own gyro calibration on command.
 
-    The command is acknowledged at the start; what came of it is only said in texts. It does not take the Earth's
-    rotation out, and changes nothing below the threshold of 0.01 rad/s.
+    The command is acknowledged at the start; the result is only sent as texts. It does not subtract the Earth's
+    rotation, and changes nothing below the threshold of 0.01 rad/s.
     """
 
     def __init__(self, double: Board) -> None:
         self._double = double
 
     def gyros(self) -> None:
-        """param1 = 1: mean of 250 samples of each gyro."""
+        """Run with param1 = 1: mean of 250 samples of each gyro."""
         self._double.calibrating = True
         self._double.say(_INFO, "[cal] calibration started: 2 gyro")
         for percent in range(0, 101, 10):
@@ -83,7 +83,7 @@ class Calibrations:
 
 POLL_S = 0.5
 SAMPLE_S = 0.02
-"""It looks at one sample of each sensor at 50 Hz."""
+"""Period of its samples."""
 QUIET_S = 5.0
 MIN_COUNT = 100
 MAX_VARIANCE = 0.001
@@ -95,24 +95,24 @@ ACCEL_WORTH_M_S2, GYRO_WORTH_RAD_S = 0.05, 0.01
 
 
 class BackgroundGyroCalibration:
-    """IMU_GYRO_CAL_EN: started at boot, or not; while disarmed and still it replaces offsets that are far wrong."""
+    """IMU_GYRO_CAL_EN: started at boot; while disarmed and still it replaces offsets that are far wrong."""
 
     def __init__(self, double: Board) -> None:
         self._double = double
         self.running = False
         self.commits = 0
-        """How often it wrote."""
+        """Number of its writes."""
         self._begin(0.0)
 
     def restart(self, loop_s: float) -> None:
-        """A boot: the parameter decides now, and not again before the next one."""
+        """Handle a boot: the parameter counts now, and not again before the next one."""
         self.running = bool(self._double.parameters["IMU_GYRO_CAL_EN"])
         self._begin(loop_s)
         if self.running:
             self._double.later(POLL_S, self._poll)
 
     def parameters_updated(self, loop_s: float) -> None:
-        """It reads them again, and starts anew; for 5 s it then writes nothing."""
+        """Read the parameters again and start anew; for 5 s it then writes nothing."""
         for calibration in self._own:
             calibration.parameters_update()
         self._changed_s = loop_s
@@ -158,7 +158,7 @@ class BackgroundGyroCalibration:
             self._reset(now_s)
 
     def _collect(self, now_s: float) -> bool:
-        """Samples since the last look; False when something moved or warmed."""
+        """Collect samples since the last call; False when something moved or warmed."""
         double = self._double
         times = np.arange(self._until_s + SAMPLE_S, now_s + SAMPLE_S / 2.0, SAMPLE_S)
         self._until_s = now_s
@@ -195,30 +195,30 @@ class BackgroundGyroCalibration:
 
 
 class LearnedOffsets:
-    """SENS_IMU_AUTOCAL: what the estimators took for bias while armed becomes the offset at disarming.
+    """SENS_IMU_AUTOCAL: biases estimated while armed become the offsets at disarming.
 
-    The same happens on the ground to a sensor that has no slot: it is given one.
+    A sensor without a slot gets one in the same way on the ground.
     """
 
     def __init__(self, double: Board) -> None:
         self._double = double
         self.commits = 0
-        """How often it wrote."""
+        """Number of its writes."""
         self._quiet_until_s = -math.inf
 
     def restart(self) -> None:
-        """A boot: a sensor without a slot gets one as soon as its estimator has settled."""
+        """Handle a boot: a sensor without a slot gets one as soon as its estimator has settled."""
         self._quiet_until_s = -math.inf
         self._double.later(_SETTLES_S + 1.0, self._claim)
 
     def calibration_changed(self, loop_s: float) -> None:
-        """An offset was taken: nothing is learned for half a minute; then a sensor without a slot gets one."""
+        """Handle a changed offset: nothing is learned for half a minute; then a sensor without a slot gets one."""
         self._quiet_until_s = loop_s + _QUIET_AFTER_CHANGE_S
         if not all(imu.calibrated for imu in self._double.vehicle_imus):
             self._double.later(_QUIET_AFTER_CHANGE_S + _SETTLES_S, self._claim)
 
     def disarmed(self, loop_s: float, armed_for_s: float) -> None:
-        """The pilot disarmed."""
+        """Handle a disarming by the pilot."""
         if armed_for_s > 1.0:
             self._commit(loop_s, self._double.vehicle_imus)
 

@@ -1,7 +1,7 @@
-"""PX4's console over MAVLink (SERIAL_CONTROL, device SHELL): `listener` of the topics that tell the EKF's bias.
+"""PX4's console over MAVLink (SERIAL_CONTROL, device SHELL): `listener` of the topics with the EKF's bias.
 
-As seen on the real one (1.19-alpha1): what is typed comes back, then the answer and a prompt, 70 bytes a message; a
-topic that nobody knows, and one that nobody publishes, are said so. PX4 `mavlink_shell.cpp`, `topic_listener`,
+As in the real one (1.19-alpha1): the input is echoed, then the answer and a prompt, 70 bytes a message; unknown topics
+and topics without publisher are reported as such. PX4 `mavlink_shell.cpp`, `topic_listener`,
 `orb_print_message_internal` (five decimals).
 """
 
@@ -22,11 +22,11 @@ _STEP_S = 0.01
 """A port's loop sends one message each time, if the line has room."""
 _PACKET = 93
 STATUS_S = 0.1
-"""From one `vehicle_imu_status` to the next."""
+"""Period of `vehicle_imu_status`."""
 
 
 class Shell:
-    """Answers on every port by itself; `typed` are the lines that came."""
+    """Answers on every port; `typed` has the received lines."""
 
     def __init__(self, double: Board) -> None:
         self._double = double
@@ -34,11 +34,10 @@ class Shell:
         self._waiting: dict[int, bytearray] = {}
 
     def restart(self) -> None:
-        """A boot."""
         self._waiting.clear()
 
     def take(self, port: Channel, message: mavlink.MAVLink_serial_control_message, loop_s: float) -> None:
-        """What somebody types."""
+        """Handle input."""
         if message.device != mavlink.SERIAL_CONTROL_DEV_SHELL or message.flags & mavlink.SERIAL_CONTROL_FLAG_REPLY:
             return
         text = ""
@@ -131,7 +130,7 @@ class Shell:
         ]
 
     def _statuses(self, loop_s: float) -> list[list[str]]:
-        """Means of 0.1 s of raw readings, turned into the vehicle's axes; the same until the next is published."""
+        """Means of 0.1 s of raw readings, turned into the vehicle's axes; constant until the next is published."""
         t_s = math.floor(self._double.aircraft.time_at(loop_s) / STATUS_S) * STATUS_S
         found = []
         for imu in self._double.vehicle_imus:

@@ -20,43 +20,44 @@ ACCEL_LIMIT_M_S2, GYRO_LIMIT_RAD_S = 0.4, 0.15
 """EKF2_ABL_LIM and EKF2_GYR_B_LIM."""
 _LEARNS_S = 1.05
 _SHARE_EARLY, _SHARE_LATE, _SETTLES_S = 0.3, 0.2, 60.0
-"""Part of a horizontal change that the tilt takes: about half soon after a start, a fifth later."""
+"""Part of a horizontal change that goes into the tilt: about half soon after a start, a fifth later."""
 _PUBLISHED_EVERY_S, _PUBLISHED_STEP = 1.0, 0.001
 _WANDER = np.array([0.4 * math.radians(1.0 / 3600.0)] * 3 + [5e-6 * STANDARD_GRAVITY_M_S2] * 3)
-"""From one publication to the next; what has gathered goes back by a fiftieth."""
+"""Wander from one publication to the next; the sum decays by a fiftieth."""
 _OBVIOUS_M_S2 = 0.5
-"""More than this cannot be a bias: it is taken for a tilt."""
+"""A larger error cannot be a bias: it counts as tilt."""
 
 
 class Ekf2:
-    """A coarse stand-in for EKF2: its bias estimates, and the tilt that has swallowed the accelerometer's bias.
+    """A coarse stand-in for EKF2: its bias estimates, and the tilt that has absorbed the accelerometer's bias.
 
-    States are in vehicle FRD; `update` wants the current errors of the corrected IMU output (output minus truth).
+    States are in vehicle FRD; `update` takes the current errors of the corrected IMU output (output minus truth).
 
     The gyro bias and the vertical accelerometer's are found within seconds, the Earth's rotation known. Of a horizontal
     one everything goes into the tilt at the start; a later change goes mostly into a bias estimate, so that after a
-    write the old tilt stays, for minutes, until a reboot. An offset that is taken clears the estimate (autopilots 9.2,
-    9.3.2). Biases are published once a second, or as soon as one has moved by 0.001 (rad/s, m/s^2), and stand still
-    between (`PublishSensorBias` of EKF2.cpp); at rest they wander by fractions of a deg/h (seen on the real one: 0.2 to
-    0.5 deg/h, up to 10 micro-g).
+    write the old tilt stays, for minutes, until a reboot. A new offset clears the estimate (autopilots 9.2, 9.3.2).
+
+    Biases are published once a second, or as soon as one has moved by 0.001 (rad/s, m/s^2), and stand still between
+    (`PublishSensorBias` of EKF2.cpp); at rest they wander by fractions of a deg/h (seen in the real one: 0.2 to 0.5
+    deg/h, up to 10 micro-g).
     """
 
     def __init__(self, seed: int = 0) -> None:
         self.published = np.zeros(6)
-        """Biases as the telemetry has them: rad/s, m/s^2."""
+        """Biases in the telemetry: rad/s, m/s^2."""
         self._published_s = 0.0
         self._random, self._wander = np.random.default_rng([seed, 11]), np.zeros(6)
         self.gyro_bias_rad_s = np.zeros(3)
         self.accel_bias_m_s2 = np.zeros(3)
         self._tilt_m_s2 = np.zeros(2)
-        """The horizontal specific force, x and y, that the tilt's error stands for."""
+        """Horizontal specific force, x and y, equivalent to the tilt's error."""
         self._started_s = 0.0
         self.time_s = 0.0
-        """Of the last update."""
+        """Time of the last update."""
         self.accel_steady_since_s = self.gyro_steady_since_s = 0.0
 
     def reset(self, t_s: float, accel_error: Array) -> None:
-        """A start at this time: level is what the accelerometer says."""
+        """Start at this time: the accelerometer defines level."""
         self.gyro_bias_rad_s, self.accel_bias_m_s2 = np.zeros(3), np.zeros(3)
         self.published, self._published_s = np.zeros(6), t_s
         self._tilt_m_s2 = accel_error[:2].copy()
@@ -64,12 +65,12 @@ class Ekf2:
         self.accel_steady_since_s = self.gyro_steady_since_s = t_s
 
     def forget_gyro_bias(self) -> None:
-        """A gyro offset was taken."""
+        """Handle a new gyro offset."""
         self.gyro_bias_rad_s = np.zeros(3)
         self.gyro_steady_since_s = self.time_s
 
     def forget_accel_bias(self) -> None:
-        """An accelerometer offset or scale was taken. The tilt stays."""
+        """Handle a new accelerometer offset or scale. The tilt stays."""
         self.accel_bias_m_s2 = np.zeros(3)
         self.accel_steady_since_s = self.time_s
 
@@ -80,7 +81,7 @@ class Ekf2:
         return -float(y), float(x)
 
     def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
-        """Go to this time, the errors having been these since the last update."""
+        """Advance to this time, with these errors since the last update."""
         span = max(t_s - self.time_s, 0.0)
         learnt = 1.0 - math.exp(-span / _LEARNS_S)
         self.gyro_bias_rad_s += learnt * (gyro_error - self.gyro_bias_rad_s)
@@ -107,7 +108,7 @@ RAW_RATE_HZ = 1000.0
 
 
 class Sample(NamedTuple):
-    """What `vehicle_imu` says."""
+    """A sample of `vehicle_imu`."""
 
     t_s: float
     """End of the interval, aircraft time."""
@@ -143,7 +144,7 @@ class VehicleImu:
         self.restart()
 
     def restart(self) -> None:
-        """A boot: everything is read anew."""
+        """Handle a boot: everything is read anew."""
         self.gyro = SensorCalibration("GYRO", self.device_id, self._store, external=self.external)
         self.accel = SensorCalibration("ACC", self.device_id, self._store, external=self.external)
         self._last = None
@@ -154,16 +155,15 @@ class VehicleImu:
         return self.gyro.calibrated and self.accel.calibrated
 
     def correct(self, raw: Array) -> Array:
-        """Six raw values, corrected."""
         result: Array = np.concatenate((self.gyro.correct(raw[:3]), self.accel.correct(raw[3:])))
         return result
 
     def corrected(self, t_s: float) -> Array:
-        """The output without noise (6): rates and specific forces in vehicle FRD."""
+        """Output without noise (6): rates and specific forces in vehicle FRD."""
         return self.correct(self.model.expected(t_s))
 
     def sample(self, t_s: float) -> Sample:
-        """The newest sample at this time; asked again within the interval it is the same."""
+        """Newest sample at this time; constant within the interval."""
         end_s = math.floor(t_s / self.interval_s + 1e-6) * self.interval_s
         if self._last is None or end_s > self._last.t_s + 1e-9:
             if not len(self._noise):
@@ -173,7 +173,7 @@ class VehicleImu:
         return self._last
 
     def raw_mean(self, t_s: float, over_s: float) -> Array:
-        """Mean (6) of the sensor until this time, turned into vehicle FRD and nothing else; asked again, the same."""
+        """Mean (6) of the sensor until this time, in vehicle FRD, uncorrected; a repeated call returns the same."""
         seed = [round(t_s / over_s), self.index, 7]
         noise = np.random.default_rng(seed).standard_normal(6) * (self.density / math.sqrt(over_s))
         raw = self.model.expected(t_s - over_s / 2.0) + noise

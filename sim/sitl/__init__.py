@@ -1,1 +1,1 @@
-"""Real autopilots on the virtual aircraft: physics for their binaries, which a path names, run as child processes."""
+"""Real autopilots on the virtual aircraft: physics for their binaries, run as child processes."""

@@ -1,4 +1,4 @@
-"""A real ArduPilot on the virtual aircraft: `--model JSON`, two MAVLink links, parameters fit for measuring."""
+"""A real ArduPilot on the virtual aircraft: `--model JSON`, two MAVLink links, parameters for measuring."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _TCP_PORTS = 10
 
 
 def measuring_parameters(scenario: Scenario, *, gyr_cal: bool) -> dict[str, float]:
-    """Defaults under which the simulated sensors have the aircraft's biases and no others (autopilots 9.3).
+    """Defaults that give the simulated sensors the aircraft's biases and no others (autopilots 9.3).
 
-    The second IMU hears the same physics; what its model has more than the first is added in the firmware.
+    The second IMU gets the same physics; the firmware adds the difference between its model and the first.
     """
     first, second = (model.true_bias(0.0) for model in scenario.flight_controller_imus[:2])
     table = {
@@ -51,16 +51,16 @@ def measuring_parameters(scenario: Scenario, *, gyr_cal: bool) -> dict[str, floa
 
 
 class ArduPilot(FirmwareVehicle):
-    """Its two links and its files. SERIAL0 goes to the ground station, SERIAL1 to the companion, both UDP.
+    """Links and files. SERIAL0 goes to the ground station, SERIAL1 to the companion, both UDP.
 
     The firmware speaks first.
 
     Args:
         binary: the firmware.
         scenario: see `FirmwareVehicle`.
-        folder: see `FirmwareVehicle`; `scripts/` in it is where Lua scripts go.
+        folder: see `FirmwareVehicle`; `scripts/` in it is for Lua scripts.
         parameters: defaults that outrank all others.
-        companion, ground: where the two links go; None: to a free port, see `url` and `ground_target`.
+        companion, ground: addresses of the two links; None: a free port, see `url` and `ground_target`.
     """
 
     firmware = "ardupilot"
@@ -83,7 +83,7 @@ class ArduPilot(FirmwareVehicle):
         self.url = f"udpin:{self._companion[0]}:{self._companion[1]}"
         self.ground_target = ground or (LOOPBACK, free_udp_port())
         self.scripts = folder / "scripts"
-        """Where Lua scripts go, before a start; scripting is on."""
+        """Folder for Lua scripts before a start; scripting is on."""
 
     def _process_of(self, *model: str) -> FirmwareProcess:
         """The binary with this physics, not started: place, date, parameters, free ports, two links."""
@@ -114,7 +114,7 @@ class ArduPilotSitl(ArduPilot, SitlVehicle):
     Args:
         binary, scenario, folder, links: see `ArduPilot`.
         parameters: defaults that outrank all others.
-        gyr_cal: INS_GYR_CAL, whether it calibrates its gyros at every boot; JSON's own default is not.
+        gyr_cal: INS_GYR_CAL, calibrate the gyros at every boot; off in JSON's own defaults.
     """
 
     backend: JsonBackend
@@ -136,11 +136,10 @@ class ArduPilotSitl(ArduPilot, SitlVehicle):
 
     @property
     def physics_s(self) -> float:
-        """The firmware's simulated time since its boot."""
         return self.backend.physics_s
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """IMU 1 is the model; IMU 2 is the same, moved by the difference of the two at the start."""
+        """True bias: IMU 1 is the model; IMU 2 is the same, moved by the difference of the two at the start."""
         first, second = self.scenario.flight_controller_imus[:2]
         bias = first.true_bias(t_s)
         if instance == 1:

@@ -39,7 +39,6 @@ COMPANION_UDP, GROUND_UDP = "127.0.0.1:14540", "127.0.0.1:14550"
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of the commands."""
     top = argparse.ArgumentParser(prog="python -m sim", description="A real firmware on the virtual aircraft.")
     commands = top.add_subparsers(dest="command", required=True)
     for name, text in FIRMWARE_COMMANDS.items():
@@ -88,7 +87,6 @@ def _add_aircraft(command: argparse.ArgumentParser) -> None:
 
 
 def scenario_of(arguments: argparse.Namespace) -> Scenario:
-    """The aircraft that the options describe."""
     pitch, roll, heading = arguments.pose
     return demo(
         pose=Pose(pitch, roll, heading),
@@ -109,7 +107,7 @@ def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) 
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run a command until it is done or interrupted; returns the exit code."""
+    """Run a command until it is done or interrupted; return the exit code."""
     arguments = parser().parse_args(argv)
     made_here = getattr(arguments, "dir", None) is None
     folder = Path(tempfile.mkdtemp(prefix="companion-sim-")) if made_here else arguments.dir.absolute()
@@ -148,7 +146,7 @@ def main(argv: Sequence[str]) -> int:
 async def _serve(
     vehicle: SitlVehicle, scenario: Scenario, folder: Path, started: asyncio.Event, hands: Hands | None
 ) -> None:
-    """Firmware and devices until cancelled."""
+    """Run firmware and devices until cancelled."""
     async with vehicle:
         await serve(scenario, directory=folder, started=started, hands=hands, beside=vehicle.process.wait())
 

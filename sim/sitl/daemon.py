@@ -1,4 +1,4 @@
-"""The real daemon on a real firmware: configuration, serial devices, process, and a UDP link that loses packets."""
+"""The real daemon on a real firmware: configuration, serial devices, process, and a lossy UDP link."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Message = mavlink.MAVLink_message
 
 
 class LossyLink:
-    """Stands where the firmware sends to, and passes on to where the companion listens; an async context manager.
+    """A UDP relay between firmware and companion; an async context manager.
 
     Args:
-        loss: share of the datagrams of either direction that get lost, 0..1; may be changed at any time.
-        seed: of the losses.
-        near_port: where the firmware sends to; None: any that is free.
+        loss: share of lost datagrams in either direction, 0..1; may be changed at any time.
+        seed: seed of the losses.
+        near_port: port to which the firmware sends; None: any free one.
     """
 
     def __init__(self, *, loss: float = 0.0, seed: int = 1, near_port: int | None = None) -> None:
         self.loss = loss
         self.near = (LOOPBACK, free_udp_port() if near_port is None else near_port)
-        """For the firmware's `udpclient`."""
+        """Address for the firmware's `udpclient`."""
         self.far = (LOOPBACK, free_udp_port())
-        """Where the companion listens."""
+        """Address at which the companion listens."""
         self.lost = self.passed = 0
         self._random = random.Random(seed)
         self._codec = mavlink.MAVLink(None)
@@ -46,11 +46,11 @@ class LossyLink:
 
     @property
     def url(self) -> str:
-        """For the companion's configuration."""
+        """URL for the companion's configuration."""
         return f"udpin:{self.far[0]}:{self.far[1]}"
 
     def sent(self, condition: Callable[[Message], bool]) -> asyncio.Future[Message]:
-        """The next message of the companion for which this is true, done at the instant it passes or gets lost."""
+        """Next message of the companion that meets the condition, done when it passes or gets lost."""
         future: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
         self._waiting.append((condition, future))
         return future
@@ -98,7 +98,7 @@ class _Face(asyncio.DatagramProtocol):
         self._take(data, addr)
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody listens at present."""
+        """Ignore: nobody listens at present."""
 
 
 READY_WITHIN_S = 40.0
@@ -107,7 +107,7 @@ _IMU = '[[imu]]\nname = "fc{0}"\nsource = "autopilot"\ninstance = {0}\nprofile =
 
 
 def daemon_configuration(vehicle: FirmwareVehicle, folder: Path, more: str = "", url: str | None = None) -> str:
-    """A companion.toml for the vehicle's IMUs with the ports in the folder; `more` is added at the end."""
+    """A companion.toml for the vehicle's IMUs with the ports in the folder; `more` is appended."""
     host, port = vehicle.url.removeprefix("udpin:").rsplit(":", 1)
     text = configuration(vehicle.scenario, directory=folder, udp=(host, int(port)))
     text = text.replace(vehicle.url, url or vehicle.url)
@@ -119,7 +119,7 @@ def daemon_configuration(vehicle: FirmwareVehicle, folder: Path, more: str = "",
 
 @contextlib.asynccontextmanager
 async def devices(scenario: Scenario, folder: Path) -> AsyncIterator[Path]:
-    """`imu`, `gradienter` and `compass` of the aircraft as ports in a folder, which exists."""
+    """Serve `imu`, `gradienter` and `compass` of the aircraft as ports in an existing folder."""
     up = asyncio.Event()
     serving = asyncio.create_task(serve(scenario, directory=folder, started=up), name="devices")
     try:
@@ -135,13 +135,13 @@ async def devices(scenario: Scenario, folder: Path) -> AsyncIterator[Path]:
 async def companion_daemon(
     vehicle: SitlVehicle, folder: Path, *, more: str = "", url: str | None = None
 ) -> AsyncIterator[CompanionProcess]:
-    """`companion run` with the aircraft's devices on the vehicle's companion link, once it knows the vehicle.
+    """Run `companion run` with the aircraft's devices on the vehicle's companion link, until it knows the vehicle.
 
     Args:
         vehicle: running; nobody else listens on its companion link.
-        folder: for the ports, the configuration, the log and the companion's storage; exists.
+        folder: existing folder for the ports, the configuration, the log and the companion's storage.
         more: further lines of its configuration.
-        url: of its link to the vehicle, where something lies between (None: the vehicle's own).
+        url: URL of its link to the vehicle (None: the vehicle's own).
     """
     (folder / "companion.toml").write_text(daemon_configuration(vehicle, folder, more, url), encoding="utf-8")
     async with devices(vehicle.scenario, folder), CompanionProcess(folder) as daemon:

@@ -1,4 +1,4 @@
-"""A ground station for tests and tables: a heartbeat of its own, parameters of both firmwares, means of telemetry."""
+"""A ground station for tests and tables: its own heartbeat, parameters of both firmwares, means of telemetry."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ _INTEGERS = (
 
 
 class GroundStation(Station):
-    """A `Station` that a firmware takes for a ground station (or, with `kind` 18, for a companion).
+    """A `Station` that a firmware accepts as a ground station (or, with `kind` 18, as a companion).
 
     Args:
-        firmware: how integers travel in PARAM_VALUE: as numbers (ArduPilot) or byte by byte (PX4); autopilots 7.5.
+        firmware: sets the encoding of integers in PARAM_VALUE: as numbers (ArduPilot) or byte by byte (PX4);
+            autopilots 7.5.
         kind: MAV_TYPE in its heartbeat; PX4 sends STATUSTEXT only where it hears MAV_TYPE_GCS (autopilots 9.3.2).
     """
 
@@ -55,7 +56,7 @@ class GroundStation(Station):
         return "".join(message.text for message in self.all(mavlink.MAVLink_statustext_message, since_s=since_s))
 
     async def run(self) -> None:
-        """A heartbeat a second until cancelled; forgets the oldest messages when there are too many."""
+        """Send a heartbeat a second until cancelled; drop the oldest messages when there are too many."""
         while True:
             self.heartbeat(self.kind)
             if len(self.heard) > KEPT_MESSAGES:
@@ -63,7 +64,6 @@ class GroundStation(Station):
             await asyncio.sleep(1.0)
 
     async def wait_for(self, condition: Callable[[], bool], within_s: float, what: str) -> None:
-        """Wait for something to become true."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
         while not condition():
@@ -72,12 +72,12 @@ class GroundStation(Station):
             await asyncio.sleep(0.01)
 
     async def wait_message(self, kind: type[M], within_s: float, *, since_s: float = 0.0) -> M:
-        """The newest message of a kind that came after `since_s` (loop time)."""
+        """Return the newest message of a kind after `since_s` (loop time), waiting for it."""
         await self.wait_for(lambda: bool(self.all(kind, since_s=since_s)), within_s, kind.__name__)
         return self.all(kind, since_s=since_s)[-1]
 
     def vehicle_heartbeats(self, since_s: float = 0.0) -> list[mavlink.MAVLink_heartbeat_message]:
-        """HEARTBEATs of the autopilot itself."""
+        """Heartbeats of the autopilot itself."""
         return [
             message
             for message in self.all(mavlink.MAVLink_heartbeat_message, since_s=since_s)
@@ -87,7 +87,6 @@ class GroundStation(Station):
     # Parameters.
 
     async def get(self, name: str) -> float:
-        """A parameter by name."""
         loop = asyncio.get_running_loop()
         for _ in range(TRIES):
             since_s = loop.time()
@@ -102,7 +101,7 @@ class GroundStation(Station):
         raise KeyError(name)
 
     async def put(self, name: str, value: float) -> float:
-        """Set a parameter and return what the firmware says it is now."""
+        """Set a parameter; return the firmware's value afterwards."""
         if name not in self._types:
             await self.get(name)
         loop = asyncio.get_running_loop()
@@ -117,19 +116,18 @@ class GroundStation(Station):
         raise KeyError(name)
 
     def send_put(self, name: str, value: float, kind: int | None = None) -> None:
-        """PARAM_SET in the firmware's encoding, of the type heard before (else REAL32); waits for nothing."""
+        """Send PARAM_SET in the firmware's encoding, of the type heard before (else REAL32), without waiting."""
         kind = self._types.get(name, mavlink.MAV_PARAM_TYPE_REAL32) if kind is None else kind
         if self.firmware == "px4" and kind in _INTEGERS:
             value = struct.unpack("<f", struct.pack("<i", round(value)))[0]
         self.send(mavlink.MAVLink_param_set_message(self.vehicle, 1, name.encode(), value, kind))
 
     async def put_all(self, values: dict[str, float]) -> None:
-        """`put` one after the other."""
         for name, value in values.items():
             await self.put(name, value)
 
     async def whole_list(self, within_s: float = 60.0) -> dict[str, float]:
-        """Every parameter that the autopilot lists; what gets lost on the way is asked for by its number."""
+        """Read every parameter that the autopilot lists; lost ones are requested by index."""
         loop = asyncio.get_running_loop()
         since_s, deadline_s = loop.time(), loop.time() + within_s
         self.send(mavlink.MAVLink_param_request_list_message(self.vehicle, 1))
@@ -159,7 +157,7 @@ class GroundStation(Station):
 
     @asynccontextmanager
     async def restored(self, *names: str) -> AsyncIterator[dict[str, float]]:
-        """Remember parameters, and set them back at the end, in the same order."""
+        """Remember parameters, and restore them at the end, in the same order."""
         before = {name: await self.get(name) for name in names}
         try:
             yield dict(before)
@@ -167,7 +165,6 @@ class GroundStation(Station):
             await self.put_all(before)
 
     def parameter_errors(self, name: str, since_s: float = 0.0) -> list[int]:
-        """The codes of PARAM_ERROR about a name."""
         return [
             int(message.error)
             for message in self.all(mavlink.MAVLink_param_error_message, since_s=since_s)
@@ -190,25 +187,24 @@ class GroundStation(Station):
     # Telemetry.
 
     async def stream(self, message_id: int, rate_hz: float) -> int:
-        """SET_MESSAGE_INTERVAL on this link; returns the result. Rate 0 stops the stream."""
+        """Send SET_MESSAGE_INTERVAL on this link; return the result. Rate 0 stops the stream."""
         interval_us = 1e6 / rate_hz if rate_hz > 0.0 else -1.0
         return await self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
 
     async def command(
         self, number: int, *params: float, target: tuple[int, int] | None = None, wait_s: float = 2.0
     ) -> int:
-        """As in `Station`; without a target it is for the autopilot."""
+        """Send a command; without a target, to the autopilot."""
         return await super().command(number, *params, target=target or (self.vehicle, 1), wait_s=wait_s)
 
     async def arm(self, *, arm: bool = True, force: bool = False, wait_s: float = 10.0) -> int:
-        """MAV_CMD_COMPONENT_ARM_DISARM; the result, -1 without an answer."""
+        """Send MAV_CMD_COMPONENT_ARM_DISARM; return the result, -1 without an answer."""
         return await self.command(
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM, float(arm), 21196.0 if force else 0.0,
             wait_s=wait_s,
         )  # fmt: skip
 
     async def collect(self, kind: type[M], seconds: float) -> list[M]:
-        """All messages of a kind in the next so many seconds."""
         loop = asyncio.get_running_loop()
         since_s = loop.time()
         await asyncio.sleep(seconds)

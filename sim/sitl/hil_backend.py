@@ -31,15 +31,15 @@ ARMED_FLAG = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
 FIFO_STEPS = (math.radians(2000.0 / 32768.0),) * 3 + (STANDARD_GRAVITY_M_S2 / 2048.0,) * 3
-"""What the firmware's simulator makes of sensor 0: 16-bit numbers, cut off towards zero."""
+"""The firmware's simulator truncates sensor 0 to 16-bit numbers."""
 _ABOVE = 1e-3
 
 
 def on_fifo_grid(reading: Sequence[float]) -> list[float]:
-    """A reading of sensor 0, in the firmware's steps already, put so that its cutting off changes nothing.
+    """Round a reading of sensor 0 to the firmware's steps, so that its truncation changes nothing.
 
-    A real sensor rounds. Left to the firmware, half a step (110 deg/h, 0.24 mg) would go missing on every axis, and
-    the sensor's bias would not be the model's.
+    A real sensor rounds. Left to the firmware, half a step (110 deg/h, 0.24 mg) would go missing on every axis, and the
+    sensor's bias would not be the model's.
     """
     steps = [round(value / step) for value, step in zip(reading, FIFO_STEPS, strict=True)]
     # A little beyond the number, or the conversion may fall back to the one before.
@@ -47,7 +47,7 @@ def on_fifo_grid(reading: Sequence[float]) -> list[float]:
 
 
 class Codec:
-    """Packs what a simulator says, and finds HIL_ACTUATOR_CONTROLS in what comes back; never raises on bytes."""
+    """Packs the simulator's messages, and finds HIL_ACTUATOR_CONTROLS in the answers; never raises on bytes."""
 
     def __init__(self) -> None:
         self._codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
@@ -62,14 +62,14 @@ class Codec:
         magnetic_gauss: Sequence[float] | None = None,
         barometer: tuple[float, float, float] | None = None,
     ) -> bytes:
-        """HIL_SENSOR of one IMU.
+        """Encode HIL_SENSOR of one IMU.
 
         Args:
-            time_us: since boot.
+            time_us: time since boot.
             number: 0 or 1.
             reading: three rates (rad/s), three specific forces (m/s^2).
-            magnetic_gauss: in body axes, when the magnetometer has something new.
-            barometer: pressure (hPa), pressure altitude (m), temperature (degC), when that has.
+            magnetic_gauss: field in body axes, when the magnetometer has a new one.
+            barometer: pressure (hPa), pressure altitude (m), temperature (degC), when new.
         """
         gx, gy, gz, ax, ay, az = reading
         fields = IMU_FIELDS
@@ -88,7 +88,7 @@ class Codec:
         )
 
     def gps(self, unix_us: int, latitude_e7: int, longitude_e7: int, height_mm: int) -> bytes:
-        """HIL_GPS: a good 3D fix at rest. The time is the date, unlike in HIL_SENSOR."""
+        """Encode HIL_GPS: a good 3D fix at rest. The time is the date, unlike in HIL_SENSOR."""
         return self._pack(
             mavlink.MAVLink_hil_gps_message(
                 unix_us, 3, latitude_e7, longitude_e7, height_mm, 30, 40, 0, 0, 0, 0, 65535, 14
@@ -96,7 +96,7 @@ class Codec:
         )
 
     def actuator_controls(self, data: bytes) -> list[tuple[int, bool]]:
-        """Of every HIL_ACTUATOR_CONTROLS in the bytes: its time in us, and whether the vehicle is armed."""
+        """Time in us and armed flag of every HIL_ACTUATOR_CONTROLS in the bytes."""
         try:
             messages = self._codec.parse_buffer(data) or ()
         except Exception:  # noqa: BLE001 - the generated parser's own faults on garbage
@@ -117,12 +117,12 @@ class Codec:
 
 FRAME_HZ = 250
 SLOW_EVERY = FRAME_HZ // 50
-"""Magnetometer and barometer: every so many frames."""
+"""Frames between readings of magnetometer and barometer."""
 GPS_EVERY = FRAME_HZ // 5
 LOCKSTEP_TIMEOUT_S = 0.2
-"""The firmware answers every frame once its outputs run; before that, and when it hangs, we go on by ourselves."""
+"""The firmware answers every frame once its outputs run; before that, and when it hangs, we continue alone."""
 MAX_BEHIND_S = 0.25
-"""Later than this, and the frames that were missed are not made up for."""
+"""Frames later than this are not made up for."""
 _MAGNETIC_NOISE_GAUSS = 0.0005
 _PRESSURE_NOISE_HPA = 0.01
 _POSITION_NOISE_E7 = 1.0
@@ -136,7 +136,7 @@ class HilBackend:
         imus: one or two models; the first becomes sensor 0, which the firmware reads through 16 bits.
         port: TCP port on 127.0.0.1 (the firmware wants 4560 plus its instance); 0 takes a free one, see `port`.
         field_gauss: horizontal (towards magnetic north) and vertical part of the Earth's field.
-        seed: of the noise of magnetometer, barometer and GNSS.
+        seed: seed of the noise of magnetometer, barometer and GNSS.
     """
 
     def __init__(
@@ -163,24 +163,22 @@ class HilBackend:
         self._driving: asyncio.Task[None] | None = None
         self._answered = asyncio.Event()
         self.locked = False
-        """Whether the firmware answers our frames."""
+        """The firmware answers our frames."""
         self.port = 0
         self.boots = 0
-        """Connections, that is firmware starts."""
+        """Connections: starts of the firmware."""
         self.frames = 0
         """Frames sent, since the last boot."""
         self.unanswered = 0
-        """Frames that got no answer in time although the firmware had answered before."""
+        """Frames without an answer in time although the firmware had answered before."""
         self.armed = False
-        """What the firmware's outputs say."""
+        """Armed, by the firmware's outputs."""
 
     @property
     def physics_s(self) -> float:
-        """The firmware's simulated time since its boot."""
         return self.frames / FRAME_HZ
 
     async def __aenter__(self) -> Self:
-        """Listen."""
         self._aircraft.begin(asyncio.get_running_loop().time())
         self._server = await asyncio.start_server(self._connected, "127.0.0.1", self._wanted_port)
         self.port = self._server.sockets[0].getsockname()[1]
@@ -198,7 +196,7 @@ class HilBackend:
             self._server = None
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """A firmware is there; the one before it, if any, is gone or hopeless."""
+        """Handle a connection; the firmware before it, if any, is gone."""
         if self._driving is not None:
             self._driving.cancel()
         cast("socket.socket", writer.get_extra_info("socket")).setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -250,7 +248,7 @@ class HilBackend:
             self.unanswered += 1
 
     def _frame(self, codec: Codec, sample: Sample) -> bytes:
-        """Everything that is new at this instant; sensor 0 first, since it moves the firmware's clock."""
+        """Encode everything that is new at this instant; sensor 0 first, since it moves the firmware's clock."""
         number = self.frames
         time_us = number * 1_000_000 // FRAME_HZ
         magnetic: list[float] | None = None

@@ -24,18 +24,18 @@ _CHANNELS = {MAGIC_16: struct.Struct("<16H"), MAGIC_32: struct.Struct("<32H")}
 
 
 class ServoPacket(NamedTuple):
-    """What the firmware sends every frame."""
+    """A frame of the firmware's servo outputs."""
 
     frame_rate_hz: int
-    """The step it wants is the inverse of this."""
+    """Inverse of the step."""
     frame_count: int
-    """Grows by one with every answered frame; starts anew with the firmware. Sent again: the answer was not heard."""
+    """Grows by one with every answered frame; starts anew with the firmware. Repeated: the answer was lost."""
     pwm_us: tuple[int, ...]
     """16 channels, or 32 with SERVO_32_ENABLE."""
 
 
 def decode_servos(data: bytes) -> ServoPacket | None:
-    """A servo packet, or None for anything else."""
+    """Decode a servo packet; None for anything else."""
     if len(data) < _HEAD.size:
         return None
     magic, rate, count = _HEAD.unpack_from(data)
@@ -46,7 +46,7 @@ def decode_servos(data: bytes) -> ServoPacket | None:
 
 
 def encode_frame(physics_s: float, sample: Sample) -> bytes:
-    """The answer: the first IMU of the sample, the true attitude, and a vehicle that stays at its home position."""
+    """Encode the answer: the first IMU of the sample, the true attitude, and a vehicle that stays at home."""
     return (
         b'\n{"timestamp":%.6f,"imu":{"gyro":[%.9g,%.9g,%.9g],"accel_body":[%.9g,%.9g,%.9g]},'
         b'"position":[0,0,0],"attitude":[%.8f,%.8f,%.8f],"velocity":[0,0,0]}\n'
@@ -60,14 +60,14 @@ _ASKS_AGAIN_S = 0.5
 
 
 class JsonBackend:
-    """One IMU's readings for one firmware; all its IMU instances are fed from it (autopilots 9.3).
+    """Readings of one IMU for one firmware; all its IMU instances use them (autopilots 9.3).
 
-    An async context manager on any real event loop. The firmware sets the pace: it keeps itself to the wall clock, so
-    here nothing waits. The reader is bare (no transport): at 1000 frames a second that halves the cost.
+    An async context manager on any real event loop. The firmware sets the pace by the wall clock, so nothing waits
+    here. The reader is bare (no transport): at 1000 frames a second that halves the cost.
 
     Args:
         aircraft: the truth.
-        imu: whose readings are sent.
+        imu: the model.
         port: UDP port on 127.0.0.1; 0 takes a free one, see `port`.
     """
 
@@ -80,7 +80,6 @@ class JsonBackend:
         self._peer: tuple[str, int] | None = None
         self._count = -1
         self.physics_s = 0.0
-        """The firmware's simulated time since its boot."""
         self._last = b""
         self._last_s = 0.0
         self.port = 0
@@ -90,7 +89,6 @@ class JsonBackend:
         """Frames sent, since the last boot."""
 
     async def __aenter__(self) -> Self:
-        """Bind the port."""
         self._loop = asyncio.get_running_loop()
         self._aircraft.begin(self._loop.time())
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -123,7 +121,7 @@ class JsonBackend:
                 self._socket.sendto(answer, peer)
 
     def answer(self, data: bytes, peer: tuple[str, int]) -> bytes:
-        """The answer to a packet, empty if it deserves none; never raises."""
+        """Answer a packet; empty for an invalid one; never raises."""
         packet = decode_servos(data)
         if packet is None:
             return b""
@@ -134,14 +132,14 @@ class JsonBackend:
         return self._frame(packet)
 
     def _begin(self, peer: tuple[str, int]) -> None:
-        """A firmware has started: its time starts from zero, and so must ours, or it would leap."""
+        """Handle a start of the firmware: its time starts from zero, and so must ours, or it would leap."""
         self._peer, self._count, self.physics_s = peer, -1, 0.0
         self.blocks.restart()
         self.boots += 1
         self.frames = 0
 
     def _again(self) -> bytes:
-        """The same frame once more, if the first was lost; a second answer to one packet would stay in its queue."""
+        """Repeat the frame if the first was lost; a second answer to one packet would stay in its queue."""
         assert self._loop is not None
         now_s = self._loop.time()
         if now_s - self._last_s < _ASKS_AGAIN_S:

@@ -1,4 +1,4 @@
-"""A firmware binary as a child: its own folder, process group, log and ports, and an end that leaves nothing."""
+"""A firmware binary as a child process: its own folder, process group, log and ports, and a clean end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOPBACK = "127.0.0.1"
 
 
 def free_udp_port() -> int:
-    """A UDP port nobody has on the loopback address."""
+    """A free UDP port of the loopback address."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
@@ -35,7 +35,6 @@ def free_tcp_window(size: int) -> int:
 
 
 def port_free(port: int, kind: socket.SocketKind) -> bool:
-    """Whether one could bind it."""
     with socket.socket(socket.AF_INET, kind) as probe:
         if kind == socket.SOCK_STREAM:  # as servers do: connections in their last wait do not count
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -47,7 +46,6 @@ def port_free(port: int, kind: socket.SocketKind) -> bool:
 
 
 def ports_free(ports: Iterable[tuple[int, socket.SocketKind]]) -> bool:
-    """Whether all of them are."""
     return all(port_free(port, kind) for port, kind in ports)
 
 
@@ -65,18 +63,18 @@ def unlocked(path: Path) -> bool:
 
 
 GOODBYE_S = 2.0
-"""From SIGTERM to SIGKILL."""
+"""Time from SIGTERM to SIGKILL."""
 LOG_LINES = 12
 _PR_SET_PDEATHSIG = 1
 _LOG_TAIL_BYTES = 8192
 
 
 class BinaryError(RuntimeError):
-    """A binary that is missing, cannot run, or has died; the message is one for people."""
+    """A binary that is missing, cannot run, or has died; the message is for people."""
 
 
 def check_binary(path: Path, option: str = "--binary") -> Path:
-    """The absolute path of something that can be executed."""
+    """Return the absolute path of an executable."""
     path = path.expanduser()
     found = path if path.parent != Path() or path.exists() else Path(shutil.which(str(path)) or path)
     if not found.is_file():
@@ -87,11 +85,11 @@ def check_binary(path: Path, option: str = "--binary") -> Path:
 
 
 class FirmwareProcess:
-    """One run of a binary; `start` again for a power cycle, the folder keeps what it stored.
+    """One run of a binary; `start` again for a power cycle: the folder keeps the stored state.
 
     Args:
         command: the binary and its arguments.
-        folder: its working directory; exists. Output goes to `firmware.log` there, appended.
+        folder: its existing working directory. Output goes to `firmware.log` there, appended.
         environment: added to ours.
     """
 
@@ -104,16 +102,13 @@ class FirmwareProcess:
 
     @property
     def pid(self) -> int | None:
-        """Its process id while it runs."""
         return self._process.pid if self.running and self._process is not None else None
 
     @property
     def running(self) -> bool:
-        """Whether it lives."""
         return self._process is not None and self._process.returncode is None
 
     async def start(self) -> None:
-        """Start it."""
         if self.running:
             raise RuntimeError(f"{self.command[0]} runs already")
         with self.log.open("ab") as log:
@@ -132,7 +127,7 @@ class FirmwareProcess:
                 raise BinaryError(f"{self.command[0]}: cannot be run: {error.strerror}") from None
 
     async def stop(self) -> None:
-        """End it and all it started, as a power cut does: nothing is saved that was not saved before."""
+        """End it and all its children, as a power cut does: nothing more is saved."""
         process = self._process
         if process is None:
             return
@@ -151,7 +146,7 @@ class FirmwareProcess:
         raise BinaryError(self._obituary(code))
 
     async def until(self, condition: Callable[[], bool], within_s: float, what: str) -> None:
-        """Wait for something; a BinaryError if it dies before, or `within_s` passes."""
+        """Wait for a condition; raise BinaryError if the process dies before, or after `within_s`."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
         while not condition():
@@ -165,7 +160,7 @@ class FirmwareProcess:
             await asyncio.sleep(0.02)
 
     def log_tail(self, lines: int = LOG_LINES) -> list[str]:
-        """The last lines of its log, without blank ones."""
+        """Last lines of its log, without blank ones."""
         try:
             with self.log.open("rb") as log:
                 log.seek(max(0, self.log.stat().st_size - _LOG_TAIL_BYTES))
@@ -185,11 +180,11 @@ class FirmwareProcess:
         return "" if not tail else " Its last words:\n  " + "\n  ".join(tail)
 
     def _signal(self, number: signal.Signals) -> None:
-        """To its group, whose id is the leader's process id."""
+        """Signal its group, whose id is the leader's process id."""
         assert self._process is not None
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, number)
 
     def _die_with_us(self) -> None:
-        """In the child: be ended when the simulator is killed and cannot do it itself (Linux)."""
+        """Run in the child: end it when the simulator is killed (Linux)."""
         self._libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -30,11 +30,11 @@ MEASURING_PARAMETERS: dict[str, float] = {
     "CBRK_SUPPLY_CHK": 894281,
     "COM_ARM_WO_GPS": 1,
 }
-"""Set at the first boot only; what is stored afterwards is the firmware's own business."""
+"""Set at the first boot only; later stored values are the firmware's own."""
 
 
 def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
-    """All ports an instance or its peers bind, except the ground station's 14550, which all instances share."""
+    """All ports of an instance or its peers, except the ground station's 14550, which all instances share."""
     udp = (UDP_COMPANION, _UDP_COMPANION_LOCAL, UDP_GROUND_LOCAL, _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL)
     return [(_TCP_SIMULATOR + instance, socket.SOCK_STREAM)] + [(p + instance, socket.SOCK_DGRAM) for p in udp]
 
@@ -50,8 +50,8 @@ def free_instance() -> int:
 class Px4(FirmwareVehicle):
     """An instance of PX4: its ports, its files and its start.
 
-    Links: the firmware sends to 127.0.0.1 port 14540 plus its instance (companion), and to 14550 until a ground
-    station has spoken to `ground_target`, then to that one.
+    Links: the firmware sends to 127.0.0.1 port 14540 plus its instance (companion), and to 14550 until a ground station
+    has spoken to `ground_target`, then to that one.
 
     Args:
         binary: the firmware.
@@ -59,7 +59,7 @@ class Px4(FirmwareVehicle):
         scenario: see `FirmwareVehicle`.
         folder: see `FirmwareVehicle`.
         parameters: set at the first boot, besides `MEASURING_PARAMETERS`.
-        instance: of the firmware; None: the first that is free.
+        instance: instance of the firmware; None: the first that is free.
     """
 
     firmware = "px4"
@@ -94,7 +94,7 @@ class Px4(FirmwareVehicle):
         return FirmwareProcess(command, self.folder)
 
     async def power_on(self) -> None:
-        """Start the binary with what it has stored; when that is nothing, with our parameters."""
+        """Start the binary with its stored parameters; without any, with ours."""
         first: dict[str, str] = {}
         if not (self.folder / self.stored[0]).exists():
             first = {f"PX4_PARAM_{name}": f"{value:g}" for name, value in self._parameters.items()}
@@ -117,11 +117,10 @@ class Px4Sitl(Px4, SitlVehicle):
 
     @property
     def physics_s(self) -> float:
-        """The firmware's simulated time since its boot."""
         return self.backend.physics_s if self.backend.locked else 0.0
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """Each sensor has its own model."""
+        """True bias; each sensor has its own model."""
         return self.imus[instance - 1].true_bias(t_s)
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:

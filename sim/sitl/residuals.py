@@ -1,4 +1,4 @@
-"""What each calibration leaves in a real autopilot: its telemetry beside the truth, as a table (autopilots 9.3)."""
+"""Error that each calibration leaves in a real autopilot: telemetry beside the truth, as a table (autopilots 9.3)."""
 
 from __future__ import annotations
 
@@ -24,23 +24,22 @@ from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 from sim.station import open_udp
 
 STEP = np.array([1e-3] * 3 + [1e-3 * STANDARD_GRAVITY_M_S2] * 3)
-"""Of the SCALED_IMU messages: mrad/s and mG."""
+"""Steps of the SCALED_IMU messages: mrad/s and mG."""
 SWAYS_STEPS = 10.0
-"""An aircraft that moves by more has all digits in its integers."""
+"""An aircraft that moves by more shows all digits in its integers."""
 _NEAR_S = 0.005
 _STEADY_SIGMA = 1.0 / math.sqrt(2.0)
-"""PX4 integrates by the trapezoid rule: an output is the mean of two samples (the figure of autopilots 9.3.2)."""
+"""PX4 integrates by the trapezoid rule: an output is the mean of two samples (autopilots 9.3.2)."""
 PX4_RATE_HZ = 250.0
 GRID = np.array(FIFO_STEPS)
-"""Of PX4's sensor 0."""
+"""Steps of PX4's sensor 0."""
 
 
 async def mean_reading(vehicle: SitlVehicle, ground: GroundStation, instance: int, seconds: float) -> Array:
-    """Mean of IMU `instance` as its telemetry tells it: three rates (rad/s), three specific forces (m/s^2), FRD.
+    """Mean of IMU `instance` from its telemetry: three rates (rad/s), three specific forces (m/s^2), FRD.
 
-    ArduPilot's first IMU comes in floats (HIGHRES_IMU). Everything else comes in integers cut off towards zero; of
-    those the most likely mean under Gaussian noise is taken. PX4's HIGHRES_IMU is not used: it has the estimator's
-    bias taken out.
+    ArduPilot's first IMU comes in floats (HIGHRES_IMU). Everything else comes in truncated integers; the result is the
+    most likely mean under Gaussian noise. PX4's HIGHRES_IMU is not used: the estimator's bias is subtracted from it.
     """
     if vehicle.firmware == "ardupilot" and instance == 1:
         rows = await ground.imu(mavlink.MAVLink_highres_imu_message, seconds)
@@ -65,7 +64,7 @@ async def mean_reading(vehicle: SitlVehicle, ground: GroundStation, instance: in
 
 
 async def residual(vehicle: SitlVehicle, ground: GroundStation, instance: int, seconds: float) -> Array:
-    """What an IMU reads more than the truth of the aircraft, after its offsets; the same six numbers."""
+    """Excess of an IMU's reading over the truth of the aircraft, after its offsets; as in `mean_reading`."""
     aircraft, begun_s = vehicle.aircraft, vehicle.now_s
     ahead = np.concatenate(aircraft.truth(begun_s + np.linspace(0.0, min(seconds, 30.0), 301)), axis=1)
     if (np.ptp(ahead, axis=0) > SWAYS_STEPS * STEP).any():
@@ -91,12 +90,12 @@ async def _residual_on_the_move(vehicle: SitlVehicle, ground: GroundStation, ins
 
 
 def excess(aircraft: VirtualAircraft, rows: Array, times: Array) -> Array:
-    """What readings of a swaying aircraft are too large by (6); how late they are is found beside it.
+    """Excess of readings of a swaying aircraft (6); their delay is fitted too.
 
     Args:
         aircraft: the truth.
         rows: readings (n, 6): rad/s, m/s^2.
-        times: when they were made, aircraft time, and the same for all too late (n).
+        times: their aircraft times, all late by the same delay (n).
     """
     found = []
     for sensor in range(2):
@@ -113,7 +112,7 @@ def excess(aircraft: VirtualAircraft, rows: Array, times: Array) -> Array:
 
 
 def _own_s(message: mavlink.MAVLink_message) -> float:
-    """The firmware's clock."""
+    """Time by the firmware's clock."""
     fields = message.to_dict()
     return float(fields["time_usec"]) * 1e-6 if "time_usec" in fields else float(fields["time_boot_ms"]) * 1e-3
 
@@ -125,14 +124,14 @@ async def _corrections(ground: GroundStation) -> tuple[list[float], list[float]]
 
 
 def gridded_mean(values: Array, sigma: float, grid: float, offset: float, scale: float = 1.0) -> float:
-    """The most likely mean of PX4's sensor 0: three rounded readings meaned 1 2 1, corrected, cut; in last digits.
+    """Most likely mean of PX4's sensor 0: three rounded readings averaged 1 2 1, corrected, truncated; in last digits.
 
     Args:
         values: the integers (n).
-        sigma: of one reading of the sensor.
+        sigma: sigma of one reading of the sensor.
         grid: its steps.
-        offset: what the firmware takes off.
-        scale: what it multiplies with afterwards.
+        offset: subtracted by the firmware.
+        scale: factor applied afterwards.
     """
     numbers, seen = np.unique(values, return_counts=True)
     middle = float(np.average(numbers + 0.5 * np.sign(numbers), weights=seen))
@@ -157,11 +156,11 @@ def gridded_mean(values: Array, sigma: float, grid: float, offset: float, scale:
 
 
 def truncated_mean(values: Array, sigma: float) -> float:
-    """The most likely mean of Gaussian readings that were cut off towards zero, in units of the last digit.
+    """Most likely mean of Gaussian readings truncated towards zero, in units of the last digit.
 
     Args:
         values: the integers (n).
-        sigma: standard deviation of the noise, believed where fewer than three values are seen; else found as well.
+        sigma: standard deviation of the noise, used where fewer than three values occur; else it is fitted.
     """
     numbers, seen = np.unique(values, return_counts=True)
     counts = seen.astype(np.float64)
@@ -189,7 +188,7 @@ def _log_likelihood(means: Array, sigmas: Array, below: Array, above: Array, cou
 
 
 def _phi(x: Array) -> Array:
-    """The normal distribution's integral; the table is fine enough for counting."""
+    """Integral of the normal distribution; the table is fine enough for counting."""
     result: Array = np.interp(x, _GRID, _PHI)
     return result
 
@@ -199,25 +198,26 @@ _PHI = np.array([0.5 * (1.0 + math.erf(value / math.sqrt(2.0))) for value in _GR
 
 
 OBSERVE_S = 60.0
-"""Length of each look."""
+"""Length of each observation."""
 SETTLE_S = 40.0
 """After a start: the estimator has its position and the first transients are over."""
 OWN_CALIBRATION_S = 60.0
 """ArduPilot's gyro calibration gives up after about 30 s; it must not be asked twice (autopilots 9.3.1)."""
 QUIET_S = 3.0
 GYROS, QUICK, LEVEL = (1.0,), (0.0, 0.0, 0.0, 0.0, 4.0), (0.0, 0.0, 0.0, 0.0, 2.0)
-"""Parameters of MAV_CMD_PREFLIGHT_CALIBRATION: gyros; accelerometers by one pose; what is level."""
+"""Parameters of MAV_CMD_PREFLIGHT_CALIBRATION: gyros; accelerometers by one pose; level."""
 _QUICK_NAME = {"ardupilot": "simple, param5 = 4", "px4": "quick, param5 = 4"}
 _LEVEL = {"ardupilot": ("AHRS_TRIM_X", "AHRS_TRIM_Y"), "px4": ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF")}
-"""What a level calibration sets: rad, degrees."""
+"""Parameters set by a level calibration: rad, degrees."""
 CALIBRATE_WITHIN_S = 420.0
-"""Two IMUs, on a busy machine."""
+"""Time limit for two IMUs on a busy machine."""
 OWN_TRIES = 3
-"""Of the firmware's own gyro calibration: its quarter second of averaging gives another result each time, and one
-may be good by chance."""
+"""Tries of the firmware's own gyro calibration: it averages 0.25 s, and one may be good by chance."""
 STILL = "[calibration]\nmin_still_s = 60\nmax_s = 60\n"
-"""A whole minute, as the figures of autopilots 9.3. By itself the companion stops where the part's flicker, which its
-profile knows, makes more averaging worthless; a part of white noise only has none."""
+"""Measure a whole minute, as the figures of autopilots 9.3. 
+
+By default the companion stops where the part's flicker, known from its profile, makes more averaging useless.
+"""
 DECK = """
 [vehicle]
 platform = "deck"
@@ -226,7 +226,7 @@ at_arm = "off"
 target_gyro_sigma_deg_h = 500
 target_accel_sigma_mg = 5
 """
-"""On a sea: when it is asked, not by itself, and as soon as it has heard a minute; for longer there is `--listen`."""
+"""On a sea: only on request, and as soon as a minute is heard; `--listen` makes it longer."""
 SLOW = 0.95
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 
@@ -257,7 +257,7 @@ HEADER = (
 
 @contextlib.asynccontextmanager
 async def ground_station(vehicle: FirmwareVehicle) -> AsyncIterator[GroundStation]:
-    """A ground station on the vehicle's ground link, with a heartbeat."""
+    """Run a ground station on the vehicle's ground link, with a heartbeat."""
     station = GroundStation(vehicle.firmware, vehicle=vehicle.system_id)
     if vehicle.firmware == "px4":
         end = await open_udp(station, target=vehicle.ground_target)
@@ -273,7 +273,7 @@ async def ground_station(vehicle: FirmwareVehicle) -> AsyncIterator[GroundStatio
 
 
 async def own_calibration(vehicle: FirmwareVehicle, ground: GroundStation, *params: float) -> str:
-    """MAV_CMD_PREFLIGHT_CALIBRATION until it is over; how it answered, and what it said."""
+    """Run MAV_CMD_PREFLIGHT_CALIBRATION to its end; return its answer and texts."""
     loop = asyncio.get_running_loop()
     since_s = loop.time()
     result = await ground.command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, *params, wait_s=OWN_CALIBRATION_S)
@@ -299,15 +299,15 @@ async def report(
     vehicle: SitlVehicle, folder: Path, more: str, *, listen_s: float = 0.0, own: bool = True,
     companion: bool = True,
 ) -> int:  # fmt: skip
-    """Start the firmware, calibrate it in every way, print the table; the exit code (1: the companion failed).
+    """Start the firmware, calibrate it in every way, print the table; return the exit code (1: the companion failed).
 
     Args:
         vehicle: not running yet.
-        folder: for the companion's files; exists.
+        folder: existing folder for the companion's files.
         more: further lines of the companion's configuration.
-        listen_s: how long the companion hears the sensors before it is asked.
-        own: whether the firmware's own calibrations are wanted in the table.
-        companion: whether ours is.
+        listen_s: time for which the companion hears the sensors before the request.
+        own: include the firmware's own calibrations.
+        companion: include ours.
     """
     async with vehicle, ground_station(vehicle) as ground:
         p = vehicle.aircraft.pose

@@ -1,7 +1,7 @@
 """Readings of an aircraft's IMUs for a firmware that asks frame by frame.
 
 Drawing noise sample by sample would cost more than everything else at 1000 frames a second, so readings are made some
-20 ms ahead, in one go. The price: a motion must be added to the aircraft at least that long before it starts.
+20 ms ahead, at once. Therefore a motion must be added to the aircraft at least that long before it starts.
 """
 
 from __future__ import annotations
@@ -17,20 +17,18 @@ from sim.earth import Array
 from sim.imu_model import ImuModel
 
 BLOCK_S = 0.02
-"""How far ahead readings are made."""
+"""Lead of the readings."""
 JUMP_S = 0.25
-"""Further behind the wall clock than this, and the aircraft's time is set anew instead of hurried."""
+"""Lag behind the wall clock at which the aircraft's time jumps instead of hurrying."""
 _SLOWEST, _FASTEST = 0.8, 1.25
 _BLOCKS_KEPT = 30_000
 
 
 class Sample(NamedTuple):
-    """One frame."""
-
     t_s: float
     """Aircraft time."""
     readings: tuple[list[float], ...]
-    """By IMU: three rates (rad/s) and three specific forces (m/s^2), in the sensor's axes."""
+    """Readings per IMU: three rates (rad/s) and three specific forces (m/s^2), in the sensor's axes."""
     angles_rad: tuple[float, float, float]
     """True roll, pitch, heading."""
 
@@ -38,9 +36,9 @@ class Sample(NamedTuple):
 class SampleBlocks:
     """Samples one frame apart, whose aircraft time follows the wall clock.
 
-    A firmware's simulated time runs beside the wall clock, a little behind it on a busy machine; the serial devices
-    of the same aircraft live on the wall clock. So that both see the same motions, aircraft time is stretched by at
-    most a fifth while it catches up, and jumps when it is `JUMP_S` late. On a still aircraft none of this shows.
+    A firmware's simulated time runs beside the wall clock, a little behind it on a busy machine; the serial devices of
+    the same aircraft live on the wall clock. So that both see the same motions, aircraft time is stretched by at most a
+    fifth while it catches up, and jumps when it is `JUMP_S` late. On a still aircraft none of this shows.
     """
 
     def __init__(self, aircraft: VirtualAircraft, imus: Sequence[ImuModel]) -> None:
@@ -49,12 +47,12 @@ class SampleBlocks:
         self._samples: list[Sample] = []
         self._at = 0
         self.jumps = 0
-        """How often the machine was too slow to keep up."""
+        """Number of times the machine was too slow to keep up."""
         self._track: deque[tuple[float, float]] = deque(maxlen=_BLOCKS_KEPT)
         self._own_s = 0.0
 
     def next(self, interval_s: float, now_s: float) -> Sample:
-        """The next sample, `interval_s` of the firmware's time after the last; `now_s` is aircraft time by the wall."""
+        """Return the next sample, `interval_s` (firmware's time) after the last; `now_s` is aircraft time by the wall."""
         if self._at == len(self._samples):
             self._fill(interval_s, now_s)
         sample = self._samples[self._at]
@@ -62,7 +60,7 @@ class SampleBlocks:
         return sample
 
     def restart(self) -> None:
-        """Forget what was made ahead: the firmware has started anew."""
+        """Drop the prepared samples: the firmware has started anew."""
         self._next_s, self._samples, self._at = None, [], 0
         self._track.clear()
         self._own_s = 0.0

@@ -1,4 +1,4 @@
-"""What a real ArduPilot and a real PX4 have in common: back end, process, power switch."""
+"""The base of real ArduPilot and PX4 vehicles: back end, process, power switch."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from sim.sitl.process import FirmwareProcess
 from sim.sitl.samples import SampleBlocks
 
 BOOT_S = 60.0
-"""A binary that does not ask for physics by then never will."""
+"""Limit of the boot: a binary that does not ask for physics by then never will."""
 
 SLOWEST = 10.0
-"""Seconds of the wall for one of the firmware's, at most."""
+"""Wall seconds per second of the firmware, at most."""
 
 
 class Backend(Protocol):
     """Gives a firmware its physics, or follows them."""
 
     boots: int
-    """Starts seen, also those that the firmware did by itself."""
+    """Starts of the firmware, including its own restarts."""
 
 
 class FirmwareVehicle(ABC):
-    """A firmware binary and a scenario's aircraft, whosever the physics. An async context manager on a real event loop.
+    """A firmware binary and a scenario's aircraft. An async context manager on a real event loop.
 
     Args:
         scenario: the aircraft and its sensors; its double is not used.
-        folder: for the binary's files; made if need be. What is stored there survives `power_cycle`.
+        folder: folder for the binary's files, made if missing. Stored files survive `power_cycle`.
     """
 
     firmware: Firmware
     instances: tuple[int, ...] = (1,)
-    """The IMUs to calibrate and look at: those whose telemetry lets one tell a mean to some deg/h."""
+    """IMUs to calibrate and observe: those whose telemetry resolves a mean to some deg/h."""
     process: FirmwareProcess
     backend: Backend
     system_id: int
     url: str
-    """Where the companion listens, in the words of its configuration."""
+    """URL at which the companion listens, for its configuration."""
     ground_target: tuple[str, int]
-    """Where the firmware sends what is for the ground station."""
+    """Address to which the firmware sends for the ground station."""
     stored: tuple[str, ...]
-    """Names of the files in which its parameters live."""
+    """Names of the files with its parameters."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         self.scenario, self.folder = scenario, folder
@@ -63,7 +63,7 @@ class FirmwareVehicle(ABC):
 
     @abstractmethod
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """What IMU `instance` (1..) of the firmware reads too much at an aircraft time."""
+        """Bias of IMU `instance` (1..) of the firmware at an aircraft time."""
 
     @abstractmethod
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
@@ -85,7 +85,7 @@ class FirmwareVehicle(ABC):
         await self._stack.aclose()
 
     async def power_on(self) -> None:
-        """Start the binary with what it has stored."""
+        """Start the binary with its stored state."""
         boots = self.backend.boots
         await self.process.start()
         await self.process.until(
@@ -93,24 +93,23 @@ class FirmwareVehicle(ABC):
         )
 
     async def power_off(self) -> None:
-        """Pull its plug."""
+        """Cut its power."""
         await self.process.stop()
 
     async def power_cycle(self, off_s: float = 0.5) -> None:
-        """Off and on again."""
         await self.power_off()
         await asyncio.sleep(off_s)
         await self.power_on()
 
     async def factory_reset(self) -> None:
-        """Off, all it has stored gone, and on again as at the very first start."""
+        """Cut its power, delete its stored state, and start it again."""
         await self.power_off()
         for name in self.stored:
             (self.folder / name).unlink(missing_ok=True)
         await self.power_on()
 
     async def sleep(self, seconds: float) -> None:
-        """Let so much time pass on the firmware's clock, which a busy machine lets run slower than the wall's."""
+        """Wait for so much time on the firmware's clock, which a busy machine slows down."""
         begun_s, starts = self.physics_s, self.backend.boots
         async with asyncio.timeout(SLOWEST * seconds + 1.0):
             while self.backend.boots == starts and self.physics_s - begun_s < seconds:
@@ -118,7 +117,6 @@ class FirmwareVehicle(ABC):
 
     @property
     def now_s(self) -> float:
-        """Aircraft time."""
         return self.aircraft.time_at(asyncio.get_running_loop().time())
 
 
@@ -126,11 +124,11 @@ class SitlVehicle(FirmwareVehicle):
     """A firmware on our physics: it lives on the scenario's aircraft, and its IMUs read what ours read."""
 
     samples: SampleBlocks
-    """What the back end sends."""
+    """Samples that the back end sends."""
     imus: tuple[ImuModel, ...]
-    """The models behind the back end."""
+    """Models behind the back end."""
 
     def move(self, motions: Sequence[Motion]) -> None:
-        """Let something happen to the aircraft; start at least 0.1 s from now (aircraft time, see `now_s`)."""
+        """Add motions to the aircraft; they start at least 0.1 s from now (aircraft time, see `now_s`)."""
         for motion in motions:
             self.aircraft.add(motion)
