@@ -214,7 +214,7 @@ CALIBRATE_WITHIN_S = 420.0
 OWN_TRIES = 3
 """Tries of the firmware's own gyro calibration: it averages 0.25 s, and one may be good by chance."""
 STILL = "[calibration]\nmin_still_s = 60\nmax_s = 60\n"
-"""Measure a whole minute, as the figures of autopilots 9.3. 
+"""Measure a whole minute, as the figures of autopilots 9.3.
 
 By default the companion stops where the part's flicker, known from its profile, makes more averaging useless.
 """

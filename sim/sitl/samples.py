@@ -52,7 +52,7 @@ class SampleBlocks:
         self._own_s = 0.0
 
     def next(self, interval_s: float, now_s: float) -> Sample:
-        """Return the next sample, `interval_s` (firmware's time) after the last; `now_s` is aircraft time by the wall."""
+        """Return the next sample, `interval_s` (firmware time) after the last; `now_s` is aircraft time by the wall."""
         if self._at == len(self._samples):
             self._fill(interval_s, now_s)
         sample = self._samples[self._at]
