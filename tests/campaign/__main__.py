@@ -35,7 +35,7 @@ def play(cells: list[tuple[str, Phase, int]], jobs: int) -> Iterator[Outcome]:
 
 
 def slice_of(seed: int, faults: int) -> list[tuple[str, Phase, int]]:
-    """So many faults, of every room its share, each in one phase in which it can strike; all by the seed."""
+    """Draw so many faults by the seed, a share of each group, each in one phase in which it can strike."""
     chance, names = random.Random(seed), list(FAULTS)
     faults = min(faults, len(names))
     start = chance.random()

@@ -29,7 +29,7 @@ SHORTEST_S: dict[str, dict[Phase, float]] = {
     "ArduPilot 4.6": {"waiting": 7.0, "collecting": 1.9, "solving": 0.6, "writing": 3.8, "verifying": 4.8},
     "PX4": {"waiting": 7.0, "collecting": 1.9, "solving": 0.12, "writing": 4.0, "verifying": 4.0},
 }
-"""So long each phase lasts at least when nothing disturbs it: the instant of the fault is drawn from that."""
+"""Shortest undisturbed duration of each phase: the instant of the fault is drawn from it."""
 RECOVERED_WITHIN_S = 240.0
 MOST_VIRTUAL_S = 1500.0
 DRAWS = 4
@@ -41,7 +41,7 @@ nothing but "disarmed" (docs/security.md)."""
 
 @dataclasses.dataclass
 class Outcome:
-    """What became of a cell."""
+    """Outcome of a cell."""
 
     fault: str
     phase: Phase
@@ -124,7 +124,7 @@ def _play(fault: Fault, phase: Phase, seed: int, draw: int, sabotage: Sabotage |
 
 
 class _Course:
-    """From a healthy daemon into the phase, through the fault, and out again."""
+    """The course of a cell: from a healthy daemon into the phase, through the fault, and out again."""
 
     def __init__(
         self, fault: Fault, phase: Phase, stage: Stage, outcome: Outcome, sabotage: Sabotage | None = None

@@ -17,7 +17,7 @@ class WallClock:
         self.shift_s = 0.0
 
     def set_to(self, unix_s: float) -> None:
-        """Somebody sets the clock."""
+        """Set the clock."""
         self.shift_s = unix_s - _real_time()
 
     @contextlib.contextmanager

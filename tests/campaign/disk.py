@@ -96,7 +96,7 @@ class Disk:
     torn: tuple[str | None, float] = (None, 1.0)
 
     def snapshot(self, folder: Path, target: Path) -> None:
-        """What is found on `folder` after a power cut in this instant: of a file being synced only a part."""
+        """Copy the state of `folder` after a power cut at this instant: a file being synced is cut short."""
         if folder.is_dir():
             shutil.copytree(folder, target)
         torn, share = self.torn

@@ -1,4 +1,4 @@
-"""What a fault is, and in which phases it may strike."""
+"""A fault, and the phases in which it may strike."""
 
 from __future__ import annotations
 

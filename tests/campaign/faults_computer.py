@@ -1,4 +1,4 @@
-"""What the companion computer does: its disk, clock and power; its files and people."""
+"""Faults of the companion computer: its disk, clock and power; its files and people."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What our own sensors do: pulled out, silent, lying, moved."""
+"""Faults of our own sensors: unplugged, silent, wrong, moved."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Mangle = Callable[[list[Frame]], bytes]
 
 
 def mangled(name: str, make: Callable[[Scene], Mangle]) -> tuple[Act, Act]:
-    """What a device says is made into something else."""
+    """Change the bytes of a device."""
 
     async def strike(scene: Scene) -> None:
         scene.stage.mangle[name] = make(scene)
@@ -168,7 +168,7 @@ async def set_down(scene: Scene) -> None:
 
 
 async def restart_imu(scene: Scene) -> None:
-    """Its clock begins at zero again after a moment without power."""
+    """Restart the clock of the IMU at zero after a moment without power."""
     stage = scene.stage
     stage.devices[IMU].power_on(stage.aircraft.time_at(stage.now_s) + 0.4)
 

@@ -1,4 +1,4 @@
-"""What the wire, the autopilot, and strangers on the network do."""
+"""Faults of the wire, the autopilot, and strangers on the network."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def switched(**what: Any) -> tuple[Act, Act]:
 
 
 def every(period_s: float, do: Any) -> tuple[Act, Act]:
-    """Somebody does something again and again."""
+    """Repeat an action."""
 
     async def strike(scene: Scene) -> None:
         async def work() -> None:
@@ -70,7 +70,7 @@ def every(period_s: float, do: Any) -> tuple[Act, Act]:
 
 
 def stranger(scene: Scene, system: int, component: int) -> Stranger:
-    """The same one every time, as its sequence numbers go on."""
+    """Return the same stranger every time, as its sequence numbers continue."""
     key = ("stranger", system, component)
     if key not in scene.notes:  # type: ignore[comparison-overlap]
         scene.notes[key] = Stranger(lambda: scene.stage.wire, system, component)  # type: ignore[index]
@@ -140,7 +140,7 @@ async def echo_only(scene: Scene) -> None:
 
 
 async def restart_whole(scene: Scene) -> None:
-    """What is stored comes into use at a restart only."""
+    """Restart the autopilot: stored values come into use."""
     scene.stage.autopilot.faults.echo_without_effect = False
     scene.stage.autopilot.reboot(down_s=1.0)
     await asyncio.sleep(2.0)
@@ -173,7 +173,7 @@ def _gyro_x(scene: Scene) -> str:
 
 
 async def foreign_write(scene: Scene) -> None:
-    """Somebody at another station sets an offset, and sets it back later."""
+    """Set an offset from another station, and restore it later."""
     stage, name = scene.stage, _gyro_x(scene)
     scene.notes["somebody else"] = name
     scene.notes["value"] = stage.autopilot.parameter(name)
@@ -204,7 +204,7 @@ def _second(scene: Scene) -> None:
 
 
 async def change_id(scene: Scene) -> None:
-    """Somebody has set SYSID_THISMAV and restarted."""
+    """Set SYSID_THISMAV and restart."""
     _set_id(scene, 7)
 
 
@@ -407,7 +407,7 @@ _FORGES, _FORGES_NO_LONGER = every(0.02, _says_disarmed)
 
 
 async def forge_and_arm(scene: Scene) -> None:
-    """Somebody says "disarmed" all the time, and the pilot arms."""
+    """Forge "disarmed" all the time while the pilot arms."""
     await _FORGES(scene)
     await asyncio.sleep(scene.chance.uniform(0.0, 2.0))
     scene.stage.autopilot.arm()

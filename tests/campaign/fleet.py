@@ -43,7 +43,7 @@ from tests.support.postgres import Postgres, postgres
 Kind = Literal["sqlite", "postgresql"]
 KINDS: tuple[Kind, ...] = ("sqlite", "postgresql")
 ROOM_MB: dict[Kind, int] = {"sqlite": 2, "postgresql": 24}
-"""Of the small disk; PostgreSQL copies its catalogue into each database."""
+"""Size of the small disk; PostgreSQL copies its catalogue into each database."""
 NO_MOUNTS = "this user may not mount a small file system"
 
 
@@ -60,7 +60,7 @@ class Scene:
         self.collectors: list[CollectorProcess] = []
         self.broker: Broker
         self.small_disk = folder
-        """Where the database is, where it is on one."""
+        """Folder of the database on a small disk; None: elsewhere."""
         self._started = 0
         quick(self.fleet, 0.5)
 
@@ -86,7 +86,7 @@ class Scene:
                 await asyncio.sleep(0.05)
 
     def not_there_but_confirmed(self) -> set[tuple[str, int]]:
-        """What an aircraft takes for kept, and the database has not: must be nothing at any time."""
+        """Items that an aircraft holds for confirmed and the database lacks: must be empty at any time."""
         confirmed = {(one.id, number) for one in self.fleet for number in one.confirmed}
         return confirmed - {(row[0], row[2]) for row in items_in(self.database)}
 
@@ -144,12 +144,12 @@ async def disk_full(scene: Scene) -> None:
 
 
 async def clock_wrong(scene: Scene) -> None:
-    """By a year, either way, from flight to flight."""
+    """Set the clock wrong by a year, either way, from flight to flight."""
     scene.live(10, wrong_by=365.0)
 
 
 async def doubled_and_reordered(scene: Scene) -> None:
-    """Somebody plays back what was said, in any order and many times over."""
+    """Replay messages, in any order and repeatedly."""
     async with aiomqtt.Client("127.0.0.1", scene.broker.port) as client:
         for _ in range(4):
             for one in scene.fleet:

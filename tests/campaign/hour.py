@@ -25,12 +25,12 @@ from tests.campaign.witness import Witness
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, UNDO
 
 MEMORY_TOLERANCE: Final = 0.02
-"""Of the resident memory: so much the last third of the hour may have above the middle third, in the mean."""
+"""Allowed growth of the mean resident memory from the middle third of the hour to the last."""
 OBJECTS_TOLERANCE: Final = 0.02
-"""The same of the number of objects that Python's collector knows."""
+"""Allowed growth of the number of objects that Python's collector knows."""
 NAMES: Final = 60_000
 REMEMBERED_S: Final = 300.0
-"""So much of the true biases' past the simulator keeps: a calibration is judged by them right after it."""
+"""Length of the true biases' past that the simulator keeps: a calibration is judged by it right after."""
 
 
 class Sample(NamedTuple):
@@ -45,7 +45,7 @@ class Sample(NamedTuple):
 
 @dataclasses.dataclass
 class Hour:
-    """What was seen."""
+    """Observations of an hour."""
 
     seed: int
     variant: str
@@ -60,7 +60,7 @@ class Hour:
 
 
 def _pool(variant: str) -> list[Fault]:
-    """What a daemon lives through without a restart or a person's help."""
+    """Faults that a daemon survives without a restart or a person's help."""
     return [
         fault
         for fault in FAULTS.values()
@@ -177,7 +177,7 @@ def _sample(stage: Stage, minute: int, fault: str) -> Sample:
 
 
 async def _looks(stage: Stage) -> None:
-    """Somebody who looks all the time, and comes back when thrown out."""
+    """Watch the page all the time, and reconnect."""
     while True:
         with contextlib.suppress(OSError, TimeoutError):
             reader, writer = await _control(stage)
@@ -196,7 +196,7 @@ async def _control(stage: Stage) -> tuple[asyncio.StreamReader, asyncio.StreamWr
 
 
 def _growth(samples: list[Sample]) -> list[str]:
-    """What the last third has more of than the middle one."""
+    """Growth from the middle third to the last."""
     third = len(samples) // 3
     if not third:
         return ["too short to judge"]

@@ -40,7 +40,7 @@ class CampaignLoop(VirtualTimeLoop):
         return future
 
     async def sock_connect(self, sock: socket.socket, address: Any) -> None:
-        """As asyncio's, but ports of `loopback` are within this process."""
+        """Connect as asyncio does; ports of `loopback` are within this process."""
         if not loopback.leads_here(address):
             await super().sock_connect(sock, address)
             return
@@ -56,7 +56,7 @@ def _owned(loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asynci
 
 
 def tasks_of(owner: str) -> list[asyncio.Task[Any]]:
-    """What of an owner still runs."""
+    """Running tasks of an owner."""
     return [task for task in asyncio.all_tasks() if _owners.get(task) == owner]
 
 

@@ -19,7 +19,7 @@ _open: set[int] = set()
 
 
 def new_port() -> int:
-    """One that nobody has; nobody listens there yet."""
+    """Return a free port on which nobody listens yet."""
     port = _FIRST + next(_numbers) % _PORTS
     _open.add(port)
     return port
@@ -34,7 +34,6 @@ def listen(port: int) -> socket.socket:
 
 
 def leads_here(address: Any) -> bool:
-    """Whether it is an address of ours."""
     return isinstance(address, tuple) and len(address) >= 2 and address[1] in _open
 
 

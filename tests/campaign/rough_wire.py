@@ -16,7 +16,7 @@ Packet = mavlink.MAVLink_message
 
 
 class RoughWire(Wire):
-    """As `Wire`, and worse on request: every field may be changed at any time."""
+    """A `Wire` that gets worse on request: every field may be changed at any time."""
 
     def __init__(self, one: End, other: End, *, seed: int = 0) -> None:
         super().__init__(one, other, seed=seed)
@@ -29,11 +29,11 @@ class RoughWire(Wire):
         self.late_s = 0.0
         """All packets are late by so much."""
         self.change: Callable[[bytes, bool], bytes | None] | None = None
-        """What becomes of a packet on its way (True: to the companion); None: lost."""
+        """Changes a packet under way (True: to the companion); None: lost."""
         self.context = contextvars.copy_context()
         """In which the companion's end gets its packets."""
         self.seen: Callable[[bytes, bool, float], None] = lambda data, inbound, t_s: None
-        """Told of what the companion sends and of what it gets."""
+        """Called with everything the companion sends and receives."""
 
     def inject(self, data: bytes) -> None:
         """Put bytes on the wire towards the companion's end, now."""
@@ -72,7 +72,7 @@ class RoughWire(Wire):
 
 
 class Stranger:
-    """Somebody else on the network: packs messages under any ids."""
+    """Another station on the network: packs messages under any ids."""
 
     def __init__(self, wire: Callable[[], RoughWire], system: int, component: int) -> None:
         self._wire = wire

@@ -96,7 +96,7 @@ class Plug:
 
 
 class Census(NamedTuple):
-    """What must not grow."""
+    """Counts that must not grow."""
 
     tasks: int
     handlers: int
@@ -144,7 +144,7 @@ class Stage(Rig):
         self.disk = Disk(root, self.chance)
         self.wall = WallClock()
         self.mangle: dict[str, Callable[[list[Frame]], bytes]] = {}
-        """By device, what becomes of its frames on the way."""
+        """By device, a function that changes its frames under way."""
         self.slow_disk_s = 0.0
         self.offload = self._elsewhere
         self.incarnation = 0
@@ -162,7 +162,7 @@ class Stage(Rig):
         return f"tcp://127.0.0.1:{self.plugs[name].port}"
 
     async def _elsewhere(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """As a thread does it: not at once."""
+        """Run a function as in a thread: not at once."""
         await asyncio.sleep(self.chance.uniform(0.0002, 0.002) + self.slow_disk_s * self.chance.random())
         return function(*arguments)
 
@@ -247,7 +247,7 @@ class Stage(Rig):
         self.alive = False
 
     async def kill(self) -> None:
-        """As kill -9 and a power cut do: nothing more reaches the wire or the disk from this instant on."""
+        """Kill as kill -9 and a power cut do: nothing more reaches the wire or the disk."""
         self.die()
         await self.bury()
 
@@ -274,7 +274,7 @@ class Stage(Rig):
         shutil.rmtree(self.root / f"store{self._copies - 1}", ignore_errors=True)
 
     async def daemon_failed(self) -> BaseException | None:
-        """What has ended the daemon, if anything has."""
+        """Exception that has ended the daemon, if any."""
         if self._work is not None and self._work.done() and self.alive:
             return self._work.exception() or RuntimeError("the daemon has ended by itself")
         return None
@@ -282,12 +282,12 @@ class Stage(Rig):
     # --- looking at it
 
     def census(self) -> Census:
-        """Of the living daemon."""
+        """Count the living daemon's objects."""
         handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.core.vehicle.on_event)
         return Census(len(tasks_of(self.owner)), handlers, len(os.listdir("/proc/self/fd")))
 
     def words(self) -> Iterator[str]:
-        """Everything that it says of itself at this moment."""
+        """Yield every text that it shows at this moment."""
         status = self.service.status()
         yield from _strings(status)
 

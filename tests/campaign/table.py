@@ -32,7 +32,7 @@ def as_text(outcomes: Sequence[Outcome], seed: int) -> str:
 
 
 def summary(outcomes: Sequence[Outcome], seed: int) -> str:
-    """How many of each."""
+    """Count the outcomes of each kind."""
     verdicts = [outcome.verdict for outcome in outcomes]
     faults = len({outcome.fault for outcome in outcomes})
     return (

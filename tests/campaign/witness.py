@@ -120,7 +120,7 @@ class Witness:
             self.faults.append(f"PARAM_SET of {name} to {value:.6g}, which it never had: {self._held.get(name)}")
 
     def _look(self) -> None:
-        """What the autopilot truly holds, as often as its heartbeat comes."""
+        """Record the autopilot's true values at every heartbeat."""
         for name in WATCHED[self._stage.variant.name == "PX4"]:
             self._held.setdefault(name, set()).add(self._stage.autopilot.parameter(name))
 
@@ -136,8 +136,9 @@ class Witness:
 
 
 MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)0_[XYZ]OFF"
-"""Of IMU 1, which is the one that is calibrated, at every instant. Its slot on PX4 is the first, as on a board whose
-drivers start in the order of the slots: docs/faults.md tells of the others."""
+"""Parameters of IMU 1, the calibrated one. Its slot on PX4 is the first, as on a board whose drivers start in the order of
+the slots: docs/faults.md describes the others.
+"""
 WATCHED = {
     True: [f"CAL_{sensor}1_{axis}OFF" for sensor in ("ACC", "GYRO") for axis in "XYZ"],
     False: [
@@ -146,11 +147,11 @@ WATCHED = {
         *(f"INS_TCAL{n}_ENABLE" for n in "12"),
     ],
 }
-"""By whether it is PX4."""
+"""Key: is it PX4."""
 
 
 def same(one: float, other: float) -> bool:
-    """As far as a float32 tells."""
+    """Equal as float32."""
     return bool(np.float32(one) == np.float32(other))
 
 
@@ -204,7 +205,7 @@ def half_written(now: Values, *known: Values) -> list[str]:
 
 
 def undoable(stage: Stage) -> list[Values]:
-    """What finished writes have left, as the values for undo tell: a power cut may have come before their record."""
+    """Values left by finished writes, according to the values for undo: a power cut may have come before their record."""
     found = []
     for path in stage.store.glob("undo-*.json"):
         with contextlib.suppress(ValueError, KeyError, TypeError):
@@ -214,7 +215,7 @@ def undoable(stage: Stage) -> list[Values]:
 
 
 def off_truth(stage: Stage, record: Any) -> list[str]:
-    """What is in force, and what the record says of the own IMU, compared with the simulator's truth."""
+    """Compare the active calibration, and the own IMU's in the record, with the simulator's truth."""
     found = []
     left = stage.autopilot.residual(1, stage.now_s)
     true = stage.own_model.true_bias(stage.aircraft.time_at(stage.now_s))

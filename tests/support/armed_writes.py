@@ -130,7 +130,7 @@ class Stage:
 
     @property
     def beyond_s(self) -> list[float]:
-        """How long after the arming each PARAM_SET left that left although the arming could have been known."""
+        """Delay after the arming of each PARAM_SET sent although the arming could have been known."""
         return [t_s - self.armed_at for t_s in self.sets if t_s > self.armed_at + RACE_S]
 
     def _read(self) -> None:

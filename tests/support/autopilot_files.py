@@ -59,7 +59,7 @@ _TOPICS = {
 
 
 def write_ulog(path: Path, topics: Mapping[tuple[str, int], tuple[Floats, Floats]]) -> Path:
-    """By topic and instance, (n,) times in s and the numbers after it."""
+    """Write topics: key is topic and instance, value times (n,) in s and the numbers."""
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog_message(b"B", bytes(40))]
     parts += [ulog_message(b"F", f"{name}:{fields}".encode()) for name, fields in _TOPICS.items()]
     rows = []

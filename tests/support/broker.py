@@ -137,7 +137,7 @@ class Broker:
         return self._process.pid
 
     def kill(self) -> None:
-        """As a power cut does."""
+        """Kill as a power cut does."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -235,7 +235,7 @@ class Peer:
         return [heard.json for heard in self.heard if heard.topic == f"{base}/response/{command}"]
 
     def forget(self) -> None:
-        """What was heard so far counts no longer."""
+        """Drop everything heard so far."""
         self.heard.clear()
 
 

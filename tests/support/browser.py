@@ -80,7 +80,7 @@ class Tab:
         return value
 
     async def middle(self, selector: str) -> tuple[float, float]:
-        """Where to press."""
+        """Return the middle of an element, to press it."""
         box = await self.value(
             f"(() => {{ const r = document.querySelector({selector!r}).getBoundingClientRect();"
             " return [r.x + r.width / 2, r.y + r.height / 2]; })()"

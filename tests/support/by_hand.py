@@ -17,7 +17,7 @@ from tests.support.rig import Rig
 ASKED_AGAIN_S = 8.0
 """A movement takes 6 s, and is seen some seconds after it has begun."""
 Meddle = Callable[[int, float], object]
-"""What is done at the stand of that number, from that aircraft time on; true where that is all that is done."""
+"""Called at the stand of that number with the aircraft time; true: the stand is skipped."""
 NOTHING: Meddle = lambda _number, _t_s: None  # noqa: E731
 
 

@@ -22,7 +22,7 @@ from sim.pty_device import Setting, heard, reader_setting
 from tests.support.still_aircraft import HEADING, TILT, imu, settings
 
 RECOVERY_S = 3.0
-"""So soon after a cause has ended there must be data again."""
+"""Time limit for new data after the cause has ended."""
 
 
 def tilt_frame(number: int) -> bytes:

@@ -97,7 +97,7 @@ def rows_of(database: str, query: sa.Executable) -> Sequence[Any]:
 
 
 def told_by(fleet: Sequence[Aircraft]) -> list[tuple[str, str, int, str]]:
-    """Likewise, of what was told."""
+    """Items told by the aircraft, in the form of the stored ones."""
     return sorted(
         (each.id, each.epoch, sequence, payload.decode()) for each in fleet for sequence, payload in each.told.items()
     )

@@ -85,7 +85,7 @@ class Ground:
         return [result for result in self.acks(command) if result != IN_PROGRESS]
 
     def texts(self) -> list[str]:
-        """What was said; a line that goes on is part of the one before it."""
+        """Received texts, chunks joined."""
         found: list[str] = []
         for _, message in self.received:
             if isinstance(message, mavlink.MAVLink_statustext_message):
@@ -139,7 +139,7 @@ class ScriptedService:
         self.progress_percent = 100
         self.started: list[Started] = []
         self.reboots: list[bool] = []
-        """Of every calibration that was asked for, whether with a restart of the autopilot."""
+        """For each requested calibration: with a restart of the autopilot."""
         self.refusal: Refusal | None = None
         self.error: Exception | None = None
         self.takes_s: float | None = None

@@ -1,4 +1,4 @@
-"""How much a test does: a slice of it in `make test`, the whole of it in `make long`."""
+"""Size of a test: a slice in `make test`, the whole in `make long`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Somebody with a phone who answers the questions of the first run's page."""
+"""A person with a phone who answers the questions of the first run's page."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ CRANE = "00210045510d31313536353600" + 10 * "0"
 
 @functools.cache
 def judge(message: str) -> jsonschema.Draft202012Validator:
-    """Of the payload of one of the contract's messages, with what it refers to."""
+    """Return the validator for the payload of one of the contract's messages, references resolved."""
     schema = {**CONTRACT["components"]["messages"][message]["payload"], "components": CONTRACT["components"]}
     jsonschema.Draft202012Validator.check_schema(schema)
     return jsonschema.Draft202012Validator(schema)
@@ -77,7 +77,7 @@ class Collector:
         self._publish(f"fleet/{aircraft}/{what}", payload)
 
     def of(self, aircraft: str) -> list[Any]:
-        """Its items, by their numbers."""
+        """Items of an aircraft, by number."""
         return [item for (of, _, _), item in sorted(self.database.items()) if of == aircraft]
 
     def kinds(self, aircraft: str = HERON) -> list[str]:

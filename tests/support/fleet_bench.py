@@ -1,4 +1,4 @@
-"""What the fleet's benches share: what aircraft tell, where it is measured, and what it costs."""
+"""Parts shared by the fleet's benches: items of aircraft, places, and costs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TICK_S: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 class Place(NamedTuple):
-    """Where collectors work."""
+    """Place where collectors work."""
 
     folder: Path
     one: Broker
@@ -54,7 +54,7 @@ async def _record(folder: Path) -> dict[str, Any]:
 
 
 class Sessions:
-    """What aircraft tell after a power-up: a calibration with their own biases, and an arming."""
+    """Items of aircraft after a power-up: a calibration with their own biases, and an arming."""
 
     def __init__(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -62,7 +62,7 @@ class Sessions:
         self._record["imus"] = [{**imu, "held_back": []} for imu in self._record["imus"]]
 
     def add(self, one: Aircraft, at: datetime.datetime) -> list[int]:
-        """Its sequences."""
+        """Add a session and return its sequences."""
         told = one.calibrate(at)
         item = msgspec.json.decode(one.told[told])
         for number, imu in enumerate(item["body"]["imus"]):
@@ -88,7 +88,7 @@ def _stat(process_id: int) -> list[str]:
 
 
 def processor_s(process_id: int) -> float:
-    """Of a process, of its children now, and of those that it has seen end."""
+    """Processor time of a process, of its living children, and of its ended ones."""
     spent = sum(map(int, _stat(process_id)[11:15]))
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -98,7 +98,7 @@ def processor_s(process_id: int) -> float:
 
 
 class Cost(NamedTuple):
-    """Of so many items: seconds by the clock, of the processor in the process itself, and in the database."""
+    """Cost of so many items: wall time, processor time of the process, and of the database."""
 
     items: int
     clock_s: float

@@ -19,7 +19,7 @@ LEFT = (12.0, -30.0, 8.0, 0.5)
 """Before the motors; deg/h and mg."""
 STEP = (-5.0, 4.0, 30.0, 5.1)
 SIGMA = (12.0, 12.0, 12.0, 0.6)
-"""Of the step."""
+"""Sigma of the step."""
 DRIFTS = {"flown": (0.4, 2.1, 9.5), "before": (6.0, 31.0, 160.0)}
 
 

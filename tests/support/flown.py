@@ -37,10 +37,10 @@ class Flown:
     """60 s on the ground, then in the air; times in s since the autopilot's start."""
 
     t_s: Floats
-    """Of the readings: the mean since the one before."""
+    """Times of the readings; each is the mean since the one before."""
     readings: Floats
     at_s: Floats
-    """Of the states."""
+    """Times of the states."""
     quaternions: Floats
     velocity: Floats
     position: Floats
@@ -117,11 +117,11 @@ _MESSAGES: dict[str, tuple[str, str]] = {
     "GPS": ("QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
     "RCOU": ("QHHHHHHHHHHHHHH", "TimeUS,C1,C2,C3,C4,C5,C6,C7,C8,C9,C10,C11,C12,C13,C14"),
 }  # fmt: skip
-"""As ArduPilot's LogStructure.h has them; its type C is of 16 bits without a sign."""
+"""Formats of ArduPilot's LogStructure.h; its type C is 16 bits, unsigned."""
 
 
 def dataflash(path: Path, messages: Iterable[tuple[str, tuple[Any, ...]]]) -> Path:
-    """Of messages, in the order in which they come; numbers as they stand in the file."""
+    """Write messages in this order; numbers as they stand in the file."""
     numbers = {name: 0x81 + k for k, name in enumerate(_MESSAGES)}
     sizes = {**_SIZES, "C": "H"}
     packers = {
@@ -141,7 +141,7 @@ def dataflash(path: Path, messages: Iterable[tuple[str, tuple[Any, ...]]]) -> Pa
 
 
 def parameters(**others: float) -> dict[str, float]:
-    """What tells of IMU 1, and of the motors."""
+    """Parameters of IMU 1 and of the motors."""
     found = {"AHRS_ORIENTATION": 0.0, "INS_GYR_ID": 2752772.0, "INS_ACC_ID": 2753028.0, "INS_USE": 1.0}
     for axis in "XYZ":
         found |= {f"INS_GYROFFS_{axis}": 0.001, f"INS_ACCOFFS_{axis}": 0.02, f"INS_ACCSCAL_{axis}": 1.0}

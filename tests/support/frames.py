@@ -128,7 +128,7 @@ def wit_imu(accel: tuple[int, int, int] = (0, 0, 2048), gyro: tuple[int, int, in
 
 
 def right_rion_sums(data: bytes) -> list[Found]:
-    """Whatever has a RION device's first byte, a length and the right sum, be it a frame or chance."""
+    """Find every RION frame by first byte, length and sum, intended or by chance."""
     ends = [(at, at + 1 + data[at + 1]) for at in range(len(data) - 1) if data[at] == 0x68 and data[at + 1] >= 4]
     return [Found(at, end) for at, end in ends if end <= len(data) and sum8(data[at + 1 : end - 1]) == data[end - 1]]
 

@@ -23,7 +23,7 @@ from sim.station import open_udp
 
 
 class Said(NamedTuple):
-    """What a command printed, and its exit code."""
+    """Output of a command, and its exit code."""
 
     code: int
     out: str
@@ -49,7 +49,7 @@ class GroundLine(NamedTuple):
         return await finish(await self.start(command, *words, chosen=chosen), within_s)
 
     async def start(self, command: str, *words: str, chosen: bool = True) -> asyncio.subprocess.Process:
-        """The same, not waited for."""
+        """Start a command without waiting for it."""
         system = ("--system", "1") if chosen else ()
         process = await ground(command, "--url", f"udpout:127.0.0.1:{self.port}", *system, *words)
         self.started.append(process)

@@ -14,7 +14,6 @@ COMPANION = Address(1, 191)
 
 
 def is_final(message: mavlink.MAVLink_message) -> bool:
-    """Whether it is the one final answer to a command."""
     return isinstance(message, mavlink.MAVLink_command_ack_message) and message.result != mavlink.MAV_RESULT_IN_PROGRESS
 
 

@@ -32,7 +32,7 @@ ACCEL_MG = (2.4125, -2.1596, 0.89809)
 PER_K_DEG_H = (1.5, -0.8, 0.3)
 SLOPES_DEG_H_K = (30.0, -12.0, 0.0)
 OFFSET_DEG_H = 5.0
-"""Of a power-up, one sigma."""
+"""Offset of a power-up, one sigma."""
 
 
 def _axes(values: object) -> Vector:
@@ -158,7 +158,7 @@ def a_season(directory: Path, number: int = 30) -> list[Record]:
 
 
 def gyro_deg_h_at(degc: float) -> Array:
-    """What the gyros of `windows_of_days` have at a temperature, but for what each power-up adds, (3,)."""
+    """Gyro biases of `windows_of_days` at a temperature without the offset of each power-up, (3,)."""
     return np.array([100.0, -50.0, 0.0]) + np.array(SLOPES_DEG_H_K) * (degc - 20.0)
 
 
@@ -219,7 +219,7 @@ def _day(number: int, dice: random.Random) -> list[Point]:
 
 
 def two_years() -> tuple[Point, ...]:
-    """What is kept of one IMU after daily sessions."""
+    """Points of one IMU after two years of daily sessions."""
     dice = random.Random(1)
     points: tuple[Point, ...] = ()
     for first in range(0, 730, 73):

@@ -165,7 +165,7 @@ class Fleet:
                     light.close()
 
     def begin_anew(self, number: int) -> None:
-        """As with another memory card: nothing is kept of what was told, nothing was confirmed."""
+        """Start anew as with another memory card: no items, no confirmations."""
         self.confirmed, self.deliveries = [], 0
         for light in self.lights:
             light.under_way.clear()
@@ -175,7 +175,7 @@ class Fleet:
 
     @property
     def under_way(self) -> int:
-        """How many aircraft have something unconfirmed."""
+        """Number of aircraft with unconfirmed items."""
         return sum(bool(light.under_way) for light in self.lights)
 
     async def tell(self, sessions: Iterable[tuple[Light, list[int]]], at_once: int) -> None:
@@ -197,7 +197,7 @@ class Fleet:
             repeating.cancel()
 
     async def tell_at(self, sessions: Sequence[tuple[Light, list[int]]], a_second: float) -> None:
-        """So many sessions a second, whatever becomes of them; until all is confirmed."""
+        """Publish so many sessions a second until all are confirmed."""
         repeating, begun_s = asyncio.create_task(self._repeat()), time.monotonic()
         try:
             for number, (light, sequences) in enumerate(sessions):
@@ -210,7 +210,7 @@ class Fleet:
             repeating.cancel()
 
     async def _repeat(self) -> None:
-        """What is not confirmed is told again."""
+        """Repeat unconfirmed items."""
         while True:
             await asyncio.sleep(1.0)
             before_s = time.monotonic() - AGAIN_S

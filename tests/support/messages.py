@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 FILLED = "\0"
 
 SPEAKERS = {"say", "_say", "prompt", "up", "_fault", "_words", "reset", "_void"}
-"""What is handed to these is said as it is, even if it is one word."""
+"""Functions whose text arguments are messages, even of one word."""
 
 NOT_FOR_PEOPLE = {
     # Mistakes of the program itself: they end in the row "internal error".
@@ -93,17 +93,17 @@ class Message:
         return re.compile(".*?".join(map(re.escape, self._parts)))
 
     def is_in(self, line: str) -> bool:
-        """Whether a line shows this message, with anything filled in."""
+        """Whether a line shows this message, with any values."""
         # Most lines lack most parts: finding that out first is 20 times as fast.
         return all(part in line for part in self._parts) and self._pattern.search(line) is not None
 
     def has(self, words: str) -> bool:
-        """Whether this message contains words of a document, where … is anything."""
+        """Whether this message contains words of a document, in which … is a wildcard."""
         parts, shown = [part.strip() for part in words.split("…")], self.shown()
         return all(part in shown for part in parts) and re.search(".*?".join(map(re.escape, parts)), shown) is not None
 
     def explains_itself(self) -> bool:
-        """Whether the text says what to do, what is allowed, or what is being done, so that it needs no row."""
+        """Whether the text names a remedy, the allowed values or the action, so that it needs no row."""
         return _REMEDY.search(self.template) is not None or _PROGRESS.match(self.template) is not None
 
     def shown(self) -> str:
@@ -187,7 +187,7 @@ def in_lua(source: str, where: str) -> list[Message]:
 
 
 def all_messages() -> list[Message]:
-    """Everything that may be said, in the order of the files."""
+    """All messages, in the order of the files."""
     found: list[Message] = []
     for path in sorted((ROOT / "companion").rglob("*.py")):
         where = path.relative_to(ROOT).as_posix()

@@ -11,10 +11,10 @@ from typing import Self
 
 
 class NotifySocket:
-    """What systemd binds for a Type=notify service; a context manager inside a running loop.
+    """The socket of systemd for a Type=notify service; a context manager inside a running loop.
 
     Args:
-        path: of the socket; None: an abstract name.
+        path: path of the socket; None: an abstract name.
     """
 
     def __init__(self, path: Path | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Somebody at the page: requests over real sockets, the events unpacked, and what the page's companion answers."""
+"""A visitor of the page: requests over real sockets, unpacked events, and the answers of the page's companion."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Visit:
 
 
 class Viewer:
-    """Somebody who looks: the events, unpacked from their chunks."""
+    """A visitor that watches: the events, unpacked from their chunks."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader, self.writer = reader, writer
@@ -147,7 +147,7 @@ class Viewer:
         return hello
 
     async def is_ended(self) -> bool:
-        """Whether the other side ends it, after whatever it still says."""
+        """Whether the other side closes the connection, after any rest of its output."""
         with contextlib.suppress(ConnectionError):
             async with asyncio.timeout(30.0):
                 await self.reader.read()
@@ -184,7 +184,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 async def press(ask: Ask, button: str, **body: Any) -> tuple[int, str]:
-    """What somebody is told who presses a button, without a server: on virtual time too."""
+    """Press a button and return the answer, without a server: on virtual time too."""
     site = Page("127.0.0.1:0", Path(), ask)
     headers = {"host": "127.0.0.1", "content-type": "application/json", "x-companion-token": site.access.token}
     scope = {

@@ -20,7 +20,7 @@ _HOMES = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
 INITDB = shutil.which("initdb", path=os.pathsep.join([*map(str, _HOMES), os.environ.get("PATH", "")]))
 _ROOT = os.geteuid() == 0
 _USER = "postgres" if _ROOT else None
-"""Whom it runs as: root it refuses."""
+"""User of the server: root is refused."""
 
 
 class Postgres:
@@ -70,7 +70,7 @@ class Postgres:
 
     @property
     def process_id(self) -> int:
-        """Of the process that has started the others."""
+        """Process id of the server's first process."""
         assert self._process is not None
         return self._process.pid
 
@@ -82,7 +82,6 @@ class Postgres:
             self._process = None
 
     def url(self, name: str) -> str:
-        """Of one of its databases."""
         return f"postgresql://fleet@127.0.0.1:{self.port}/{name}"
 
     def create(self, name: str) -> str:

@@ -32,7 +32,7 @@ from tests.support.wire import Wire
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 GYRO_BIAS_DEG_H = (162.234, 169.563, -98.289)
 THERMOMETER_OFF_K = 0.13
-"""So that its last digits show: one that gives whole kelvins tells little of how steady they are."""
+"""Makes its last digits show: a thermometer in whole kelvins tells little of how steady they are."""
 ACCEL_BIAS_MG = (2.4125, -2.1596, 0.89809)
 
 CONFIG = """

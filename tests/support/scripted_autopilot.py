@@ -55,7 +55,7 @@ class ScriptedAutopilot:
         self.on_message: Callable[[Any], bool] = lambda message: True
         """Called first with every message; False: do as if it had not come."""
         self.on_set: Callable[[str, float], float | None] = lambda name, value: value
-        """What becomes of a value that is set; None: nothing at all, not even an answer."""
+        """Maps a set value to the stored one; None: no answer at all."""
         self.result_of: Callable[[Any], int] = lambda message: int(mavlink.MAV_RESULT_ACCEPTED)
         self.imu: dict[int, tuple[tuple[float, ...], tuple[float, ...]]] = {
             1: ((0.001, -0.002, 0.003), (0.1, -0.2, -9.8)),
@@ -106,7 +106,7 @@ class ScriptedAutopilot:
         self.send(mavlink.MAVLink_heartbeat_message(self.kind, self.autopilot, mode, 0, mavlink.MAV_STATE_STANDBY, 3))
 
     async def reboot(self, down_s: float = 3.0) -> None:
-        """What is streamed is forgotten; parameters persist."""
+        """Restart: streams are forgotten; parameters persist."""
         self.booting = True
         self.armed = False
         self.intervals.clear()

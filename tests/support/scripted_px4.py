@@ -152,7 +152,7 @@ class ScriptedPx4(ScriptedAutopilot):
         return np.eye(3)
 
     def output(self, instance: int) -> tuple[np.ndarray, np.ndarray]:
-        """What IMU `instance` shows, without noise."""
+        """Output of IMU `instance`, without noise."""
         device = self.devices[instance - 1]
         gyro, accel = self.raw[instance - 1]
         zero = np.zeros(3)

@@ -22,7 +22,7 @@ class Reads(NamedTuple):
     """One entry a sample."""
 
     taken_s: Floats
-    """By the host's clock: the truth."""
+    """Times by the host's clock: the truth."""
     device_s: Floats
     arrival_s: Floats
 

@@ -34,7 +34,7 @@ class Plain:
 
 
 class OneByteAtATime:
-    """What a slow port on a fast computer does."""
+    """Delivers single bytes, as a slow port on a fast computer."""
 
     harmless = True
 

@@ -80,14 +80,14 @@ class UsbTree:
         (self.root / f"dev/serial/by-path/{path}").symlink_to(f"../../{name}")
 
     def links(self, rules: Path, name: str) -> tuple[set[str], dict[str, str], str]:
-        """What udev makes of a port under the rules of a folder: links, properties, and all that it says."""
+        """Run udev with the rules of a folder for a port: links, properties, and all output."""
         (node,) = (self.root / "sys/devices").rglob(f"tty/{name}")
         said = self.judge(rules, "/" + str(node.relative_to(self.root)))
         properties = dict(line.partition("=")[::2] for line in said.splitlines() if re.match(r"[A-Z_.]+=", line))
         return set(properties.get("DEVLINKS", "").split()), properties, said
 
     def judge(self, rules: Path, node: str) -> str:
-        """What udev says to a node being added."""
+        """Return udev's output for a node being added."""
         command = [*OWN_MOUNTS, "sh", "-c", _TEST, "sh", str(self.root), str(rules), UDEVADM, node]
         return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
 

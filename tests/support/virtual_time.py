@@ -13,7 +13,10 @@ from typing import Any, Final, TypeVar
 T = TypeVar("T")
 
 MOST_TURNS_A_SECOND: Final = 50_000
-"""Of the loop, in one virtual second: far more than the busiest rig needs (under 2000). It is work without a pause."""
+"""Turns of the loop in one virtual second: far more than the busiest rig needs (under 2000).
+
+It is work without a pause.
+"""
 
 
 class JumpingSelector(selectors.EpollSelector):

@@ -1,4 +1,4 @@
-"""What really goes over the wire from the daemon to its autopilot, read by a parser of its own."""
+"""Independent record of the traffic from the daemon to its autopilot, by a parser of its own."""
 
 from __future__ import annotations
 
