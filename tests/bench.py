@@ -118,7 +118,7 @@ async def _one_calibration(folder: Path, recordings_mb: int = 0) -> float:
 
 
 def _replay_speed(path: Path) -> float:
-    """How many times faster than it was recorded a file is replayed, in processor time."""
+    """Ratio of recorded time to processor time of a replay."""
     best = 0.0
     for _ in range(ROUNDS):
         start_s = time.process_time()

@@ -1,4 +1,4 @@
-"""How long a question at arming waits for the daemon's answer: idle, busy, and with a crowd at the page.
+"""Delay of the daemon's answer to a question at arming: idle, busy, and with a crowd at the page.
 
 The daemon is a process of its own with two integer IMUs of a PX4 double, a serial IMU, gradienter and compass, in gate
 mode. Between the two sits a relay that puts MAV_CMD_ARM_AUTHORIZATION_REQUEST into the autopilot's bytes and takes the

@@ -1,4 +1,4 @@
-"""What the whole daemon costs the processor, beside a bare read loop and the script that one would write instead.
+"""Processor cost of the whole daemon, beside a bare read loop and the obvious script.
 
 The load (`tests.bench_daemon_load`, in processes of its own that are not counted): VectorNav binary at 1 kHz, a
 gradienter at 10 Hz and a compass at 8 Hz through pseudo-terminals, and 200 MAVLink messages a second through UDP, each
@@ -48,7 +48,7 @@ from tests.bench_daemon_load import MESSAGES_HZ, feed_imu, feed_rest, imu_device
 READ_BYTES: Final = 65536
 WARM_S: Final = 2.0
 SETTLED_S: Final = 5.0
-"""Of the daemon, from its first heading on."""
+"""Time after the daemon's first heading."""
 READY_S: Final = 120.0
 MORE: Final = """
 [push]
@@ -114,7 +114,7 @@ def bare_loop(ports: Ports, udp: tuple[str, int], imu: str, pipe: Connection) ->
 
 
 def bare_asyncio(ports: Ports, udp: tuple[str, int], imu: str, pipe: Connection) -> None:
-    """The same on asyncio's event loop."""
+    """Read in a bare loop on asyncio."""
     counts: Counter[str] = Counter()
     descriptors = _opened(ports)
 
@@ -188,7 +188,7 @@ class Worker:
 
 
 class Load:
-    """Everything that speaks, in its own processes."""
+    """All senders, in their own processes."""
 
     def __init__(self, folder: Path, imu: str, stack: contextlib.ExitStack) -> None:
         self.folder, self.imu = folder, imu

@@ -27,7 +27,7 @@ from sim.scenario import Scenario, demo
 from sim.station import open_udp
 
 SECONDS: Final = 180.0
-"""Of the IMU's frames, made beforehand."""
+"""Length of the prepared IMU frames."""
 SEED: Final = 7
 
 STREAMS_HZ: Final[dict[int, float]] = {
@@ -47,7 +47,7 @@ STREAMS_HZ: Final[dict[int, float]] = {
     mavlink.MAVLINK_MSG_ID_AHRS: 5.0,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2.0,
 }
-"""Of the double's own messages."""
+"""Rates of the double's own messages."""
 
 OTHERS_HZ: Final[tuple[tuple[mavlink.MAVLink_message, float], ...]] = (
     (mavlink.MAVLink_servo_output_raw_message(1, 0, *[1500] * 8), 10.0),
@@ -60,7 +60,7 @@ OTHERS_HZ: Final[tuple[tuple[mavlink.MAVLink_message, float], ...]] = (
     (mavlink.MAVLink_power_status_message(5000, 5000, 1), 2.0),
     (mavlink.MAVLink_meminfo_message(0, 60000, 120000), 1.0),
 )
-"""What the double has not, with their rates."""
+"""Messages that the double lacks, with their rates."""
 
 MESSAGES_HZ: Final = sum(STREAMS_HZ.values()) + sum(rate_hz for _, rate_hz in OTHERS_HZ)
 

@@ -1,4 +1,4 @@
-"""How much one collector takes, of ten thousand aircraft at a real Mosquitto, into a real PostgreSQL and into SQLite.
+"""Throughput of one collector with ten thousand aircraft at a real Mosquitto, into a real PostgreSQL and into SQLite.
 
 Each aircraft has a connection of its own and comes with a session: its hello, a calibration and an arming as companions
 send them. Rates are items a second: by the clock, by a core-second of the collector's process, and by one of process
@@ -77,7 +77,7 @@ def _spent(collectors: Sequence[CollectorProcess]) -> float:
 
 
 async def rate(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], url: str, number: int) -> str:
-    """Of so many collectors while there is always more."""
+    """Throughput of so many collectors with a permanent backlog."""
     async with collectors(place, url, number) as found:
         meter = Meter(lambda: _spent(found), lambda: processor_s(place.postgres.process_id))
         of_broker = Meter(lambda: processor_s(place.one.process_id))
@@ -94,7 +94,7 @@ def _check(url: str, fleet: Fleet) -> None:
 
 
 async def latency(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], url: str) -> str:
-    """From publishing to the confirmation, with one collector and less to do than it could."""
+    """Time from publishing to the confirmation, with one collector below its capacity."""
     async with collectors(place, url, 1):
         await asyncio.wait_for(fleet.tell_at(sessions, QUIET_A_SECOND), 600.0)
     took_ms = [1e3 * (heard_s - told_s) for told_s, heard_s in fleet.confirmed]
@@ -155,7 +155,6 @@ async def rates(place: Place, number: int, sessions: Sessions) -> None:
 
 
 def main() -> None:
-    """By the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", default=["rates", "pages"], help="rates, pages, seed (default: all)")
     parser.add_argument("--aircraft", type=int, default=AIRCRAFT, help=f"at the broker (default {AIRCRAFT})")

@@ -1,4 +1,4 @@
-"""How long the fleet's pages and judgements take with five years of a thousand aircraft, and what those weigh.
+"""Response time and size of the fleet's pages and judgements with five years of a thousand aircraft.
 
 Real requests, one after another, to the server of a `companion fleet run`.
 """
@@ -73,7 +73,7 @@ def _copy(engine: sa.Engine, value: Callable[[sa.Column[Any]], str], by: str, wh
 
 
 def sizes(url: str, aircraft: int) -> str:
-    """Of an aircraft and year."""
+    """Bytes of one aircraft and year."""
     engine, per = engine_of(url, reads_only=True), aircraft * YEARS
     with engine.connect() as connection:
         rows = {
@@ -92,7 +92,7 @@ def sizes(url: str, aircraft: int) -> str:
 
 
 def judging(url: str) -> None:
-    """Of all that nobody has judged yet, one after another."""
+    """Time the judgement of all items, one after another."""
     store, took_ms = Store(url), list[float]()
     meter, begun_s = Meter(time.process_time), time.perf_counter()
     while store.judge():
@@ -109,7 +109,7 @@ def judging(url: str) -> None:
 
 
 def _get(port: int, path: str) -> tuple[float, int]:
-    """How long a page takes, in ms, and its bytes."""
+    """Response time of a page, in ms, and its bytes."""
     begun_s = time.perf_counter()
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60.0)
     connection.request("GET", path)
@@ -121,7 +121,7 @@ def _get(port: int, path: str) -> tuple[float, int]:
 
 
 async def page_latency(place: Place, url: str, aircraft: int) -> None:
-    """By real requests to the real server, one after another."""
+    """Time real requests to the real server, one after another."""
     port, dice = free_port(), random.Random(7)
     page = f"127.0.0.1:{port}"
     one = CollectorProcess(place.folder, f"page-{port}", place.one, url, "--page", page)
@@ -147,7 +147,7 @@ async def page_latency(place: Place, url: str, aircraft: int) -> None:
 
 
 async def pages(place: Place, urls: Sequence[str], aircraft: int) -> None:
-    """Of databases with five years."""
+    """Measure databases with five years."""
     async with broker(place.folder, "mosquitto", more=MOSQUITTO) as one:
         for url in urls:
             print(f"\n{'SQLite' if '://' not in url else 'PostgreSQL'}: {sizes(url, aircraft)}")

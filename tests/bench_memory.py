@@ -1,4 +1,4 @@
-"""What the daemon keeps in memory, with everything on, after its start and after a calibration.
+"""Memory of the daemon with everything on, after its start and after a calibration.
 
 A process of its own on a live virtual aircraft (devices on pseudo-terminals, the autopilot on UDP), with a real broker,
 a phone at the page, and recording on. Beside it the obvious script with the same devices' libraries. Of the kernel's
@@ -84,7 +84,7 @@ class Memory(NamedTuple):
 
 
 def memory(process_id: int) -> Memory:
-    """Of one process now: RSS, PSS, USS, and the most RSS so far."""
+    """Memory of one process now: RSS, PSS, USS, and peak RSS."""
     kib = _kib(Path(f"/proc/{process_id}/smaps_rollup").read_text())
     own = kib["Private_Clean"] + kib["Private_Dirty"]
     most = _kib(Path(f"/proc/{process_id}/status").read_text())["VmHWM"]
@@ -143,7 +143,7 @@ async def status_when(control: Path, good: Callable[[dict[str, Any]], bool]) -> 
 
 @contextlib.asynccontextmanager
 async def visited(port: int) -> AsyncIterator[None]:
-    """Somebody looks at the page: the page itself once, and its stream of news all the time."""
+    """Visit the page: the page once, and its event stream throughout."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\n\r\n".encode())
     page = await reader.read()

@@ -1,4 +1,4 @@
-"""How long after the last sample the full record is there: solved, on the disk, and published on the control socket.
+"""Delay from the last sample to the full record: solved, on the disk, and published on the control socket.
 
 The last sample is the one with which every source has ended the last second that is needed: the serial IMU's, the
 gradienter's or the compass', whichever is the latest. It is timed where it is written, in the simulator; the record
@@ -79,7 +79,7 @@ def last_sample_s(times_s: dict[str, list[float]], end_s: float) -> float:
 
 
 async def delays(folder: Path, calibrations: int, *, autopilot_imu: bool) -> list[float]:
-    """Of each calibration, from its last sample to its record, in seconds."""
+    """Delay of each calibration from its last sample to its record, in seconds."""
     with noting() as times_s:
         async with live_aircraft(folder, SETTINGS) as scenario:
             if not autopilot_imu:
@@ -123,7 +123,7 @@ def disk_alone_s(folder: Path) -> float:
 
 
 async def _processor_s(folder: Path) -> dict[str, float]:
-    """Of what the daemon hands to a thread, from the last sample to the record: the least of some calibrations."""
+    """Processor time of the work in threads from the last sample to the record: the least of some calibrations."""
     rig, least = Rig(folder, own_imu=True, more="[push]\nparameters = false\n"), dict[str, float]()
     spent: dict[str, float] = {}
 

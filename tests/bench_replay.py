@@ -1,4 +1,4 @@
-"""How many IMU samples a second a replay takes, against what reading the same file alone costs.
+"""Replay speed in IMU samples a second, against the cost of reading the same file alone.
 
 Recordings of a still aircraft, as a daemon would have written them, and a log of somebody's own. Beside each, in the
 same run: the MCAP library that reads every message of the file and does nothing with it, or `numpy.loadtxt` for the

@@ -158,18 +158,18 @@ def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]
 
 
 def processor_s(process_id: int) -> float:
-    """What all threads of a process have used, in seconds."""
+    """Processor time of all threads of a process, in seconds."""
     return 1e-9 * sum(int(task.read_text().split()[0]) for task in Path(f"/proc/{process_id}/task").glob("*/schedstat"))
 
 
 class Start(NamedTuple):
-    """What is started, and in which surroundings."""
+    """A command and its environment."""
 
     words: str
     command: list[str]
     environment: dict[str, str]
     beats: bool = True
-    """Whether a heartbeat comes; else its end is waited for."""
+    """Wait for a heartbeat; else for the end of the process."""
 
 
 def starts(bench: Bench, folder: Path) -> list[Start]:
@@ -247,7 +247,7 @@ _IMPORT: Final = re.compile(r"import time:\s*(-?\d+) \|\s*-?\d+ \|\s*(\S+)")
 
 
 def import_costs(rounds: int) -> None:
-    """What the imports up to the first heartbeat cost, by package: the least of some rounds for each module."""
+    """Print the cost of the imports up to the first heartbeat, by package: the least of some rounds for each module."""
     least: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as text:
         bench = Bench(Path(text))

@@ -1,4 +1,4 @@
-"""How often the fleet's judgement is wrong, and how soon it is right: python -m tests.judgement_study.
+"""Error rate and delay of the fleet's judgement: python -m tests.judgement_study.
 
 Aircraft with two IMUs and a compass are drawn, each power-up of `FLIGHTS` a month; the draws are this module's own. A
 part scatters as Student's t with 5 degrees of freedom, by its own scale; its bias wanders, follows the temperature of
@@ -80,7 +80,7 @@ def bounds(dice: np.random.Generator, n: int, iron_since: int | None = None) -> 
 
 
 def alarms_of(parts: Sequence[Columns]) -> Iterator[tuple[int, Alarm]]:
-    """What counts, by part; all parts have as many power-ups."""
+    """Counted alarms by part; all parts have as many power-ups."""
     wide = parts[0].values.shape[1]
     joined = (np.concatenate([part[k] for part in parts], axis=-1) for k in range(len(Columns._fields)))
     columns = Columns(*joined)
@@ -92,7 +92,7 @@ def alarms_of(parts: Sequence[Columns]) -> Iterator[tuple[int, Alarm]]:
 
 
 def model_by(histories: Sequence[PartHistory]) -> Floats | None:
-    """Of all of them."""
+    """Fit the model to all histories."""
     return scatter_of_model([scatter_of_part(each.biases, each.temperature_degc) for each in histories])
 
 

@@ -1,4 +1,4 @@
-"""What earlier calibrations better or spoil, over many simulated histories: python -m tests.prior_study.
+"""Gain and loss from earlier calibrations, over many simulated histories: python -m tests.prior_study.
 
 Each trial draws a sensor with its run-to-run law, some earlier power-ups, and today; and compares the error of
 today's bias with and without what was known from before. The draws and the truth are this module's own.
@@ -29,7 +29,7 @@ MG = 9.80665e-3
 G = 9.8
 LEVEL = np.array([0.0, 0.0, -1.0])
 STEADY = AllanModel(0.0, 1e-9, 0.0)
-"""These biases do not wander within a power-up."""
+"""Biases that do not wander within a power-up."""
 # Right side down lowers the right side's share of gravity, nose up raises the front's; FRD, level, method 2.1.
 BY_READING = -G * np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
 _POSE = Pose(theta_deg=0.0, gamma_deg=0.0, psi_deg=0.0, sigma_deg=PoseSigma(theta=None, gamma=None, psi=None))
@@ -47,7 +47,7 @@ class Case:
     use: float
     """True sigma of a calibration as an estimate of the next minutes; `stat` is part of it."""
     claimed_use: float | None = None
-    """What the companion takes for it, where its profile is too cautious."""
+    """Wander that the companion assumes, where its profile is too cautious."""
     power_ups: int = 10
     triad: str = "gyro"
     slope_per_k: float = 0.0
@@ -63,7 +63,7 @@ class Case:
     zero_deg: float = 0.0
     """Sigma of the gradienter's zero in force today."""
     earlier_zero_deg: float | None = None
-    """Of another one with which all earlier calibrations were made; None: it was today's."""
+    """Zero of another gradienter used for all earlier calibrations; None: today's."""
 
     @property
     def unit(self) -> float:
@@ -77,17 +77,17 @@ class Outcome:
     rms_without: float
     rms_with: float
     coverage: float
-    """Of 2 sigma, with what was known."""
+    """Coverage of 2 sigma with earlier calibrations."""
     used: float
     """Share of the trials in which it took part in the estimate."""
     doubted: float
     """Share of the trials in which something contradicted."""
     foretold_rms: float
-    """Of what was expected of today before anything was measured."""
+    """Rms error of the prediction before any measurement."""
     foretold_coverage: float
-    """Of 2 sigma of that."""
+    """Coverage of 2 sigma of the prediction."""
     foretold_sigma: float = np.nan
-    """What it claims, root mean square."""
+    """Claimed sigma, root mean square."""
 
     @property
     def ratio(self) -> float:
@@ -95,7 +95,7 @@ class Outcome:
 
 
 def imu_solution(name: str, gyro: Array, accel: Array, stat: Array, covariance: Array) -> ImuSolution:
-    """By the readings alone; `stat` (6,), `covariance` (6, 6)."""
+    """Solution from the readings alone; `stat` (6,), `covariance` (6, 6)."""
     return ImuSolution(
         name=name,
         samples=1000,
@@ -109,7 +109,7 @@ def imu_solution(name: str, gyro: Array, accel: Array, stat: Array, covariance: 
 
 
 def solution(imus: Sequence[ImuSolution], shared: Shared) -> Solution:
-    """Of several IMUs."""
+    """Solution of several IMUs."""
     return Solution(pose=_POSE, site=_SITE, imus=tuple(imus), warnings=(), unknown=(), magnetic=None, shared=shared)
 
 

@@ -136,8 +136,9 @@ class Witness:
 
 
 MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)0_[XYZ]OFF"
-"""Parameters of IMU 1, the calibrated one. Its slot on PX4 is the first, as on a board whose drivers start in the order of
-the slots: docs/faults.md describes the others.
+"""Parameters of IMU 1, the calibrated one.
+
+Its slot on PX4 is the first, as on a board whose drivers start in the order of the slots: docs/faults.md has the others.
 """
 WATCHED = {
     True: [f"CAL_{sensor}1_{axis}OFF" for sensor in ("ACC", "GYRO") for axis in "XYZ"],
@@ -205,7 +206,7 @@ def half_written(now: Values, *known: Values) -> list[str]:
 
 
 def undoable(stage: Stage) -> list[Values]:
-    """Values left by finished writes, according to the values for undo: a power cut may have come before their record."""
+    """Values left by finished writes, by the values for undo: a power cut may have come before their record."""
     found = []
     for path in stage.store.glob("undo-*.json"):
         with contextlib.suppress(ValueError, KeyError, TypeError):

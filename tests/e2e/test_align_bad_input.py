@@ -26,7 +26,7 @@ ID = 0x3A0002 + (7 << 8)
 
 
 async def run(rig: Rig, hands: Hands, meddle: Meddle, **asked: object) -> tuple[JobResult, Job]:
-    """As the page asks for it."""
+    """Start an alignment as the page does."""
     status, reason = await press(rig, "align", **asked)
     assert status == 200, reason
     job = rig.service.calibrating.manager.running
@@ -39,11 +39,11 @@ def said(rig: Rig) -> str:
 
 
 class Clumsy:
-    """Whoever makes the stands: at each does one thing wrong, once; asked again, does it as the words say."""
+    """A person who makes one mistake at each stand; asked again, follows the instruction."""
 
     def __init__(self, rig: Rig, hands: Hands) -> None:
         self.wrong: dict[int, Callable[[float], object]] = {}
-        """By stand; from that aircraft time on."""
+        """Mistake of each stand; called with the aircraft time."""
         self._rig, self._hands = rig, hands
 
     def __call__(self, number: int, t_s: float) -> object:

@@ -31,7 +31,7 @@ SCALES = {"INS_ACCSCAL_X": 1.004, "INS_ACCSCAL_Y": 0.997, "INS_ACCSCAL_Z": 1.002
 
 
 def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
-    """Its scales are wrong, its offsets have never been measured."""
+    """An aircraft with wrong scales whose offsets have never been measured."""
     options: dict[str, Any] = {"imu_rate_hz": 10.0, "parameters": SCALES} | more
     return alone(folder, propped_deg=4.0, **options)
 

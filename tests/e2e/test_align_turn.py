@@ -44,7 +44,7 @@ def turn(rig: Rig, headings: int, *, write: bool) -> Job:
 
 
 async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: Meddle = NOTHING) -> TurnRecord:
-    """What came of it, all being well."""
+    """Run the alignment to its record."""
     job = turn(rig, headings, write=write)
     result = await follow(rig, hands, job, meddle)
     assert result.outcome == "done", result
@@ -53,12 +53,12 @@ async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: 
 
 
 def true_mg(rig: Rig) -> Any:
-    """Of the first IMU, whose board sits straight in the aircraft."""
+    """True biases of the first IMU, whose board is aligned with the aircraft."""
     return rig.model.true_bias(rig.aircraft.time_at(rig.now_s)).accel_m_s2 / MG
 
 
 def residual_mg(rig: Rig, record: TurnRecord) -> Any:
-    """What the output had left of the bias: an offset of 0.001 m/s^2 was in force."""
+    """Bias left in the output: an offset of 0.001 m/s^2 was active."""
     (imu,) = record.imus
     before = [one.before for one in imu.written.values()] if imu.written else [0.001] * 3
     return true_mg(rig) - np.array(before) / MG

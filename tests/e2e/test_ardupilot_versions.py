@@ -28,7 +28,7 @@ def slow(folder: Path, **more: Any) -> Rig:
 
 @dataclasses.dataclass
 class Traffic:
-    """What the autopilot is asked for, and what it is told to do: parameter names and command numbers."""
+    """Requests and commands to the autopilot: parameter names and command numbers."""
 
     rig: Rig
     names: set[str] = dataclasses.field(default_factory=set)

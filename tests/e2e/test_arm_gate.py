@@ -67,7 +67,7 @@ async def test_px4_arms_with_a_fresh_calibration_and_refuses_without_with_the_re
 
 
 async def test_after_a_large_accelerometer_step_px4_has_to_be_rebooted_before_the_gate_opens(tmp_path: Path) -> None:
-    """Its EKF2 keeps the tilt that the wrong offsets had given it (autopilots 9.3)."""
+    """EKF2 keeps the tilt from the wrong offsets (autopilots 9.3)."""
 
     async with px4(tmp_path, CAL_ACC0_XOFF=0.3).running() as rig:
         readiness = rig.service.arming.readiness
@@ -162,7 +162,7 @@ def tunnelled(rig: Rig, since_s: float) -> list[bytes]:
 
 
 def spied(rig: Rig) -> Ground:
-    """Everything that the companion sends, also what ArduPilot keeps to itself."""
+    """Observe everything that the companion sends, including what ArduPilot does not forward."""
     spy = Ground()
     carry = Wire._carry
 

@@ -27,7 +27,7 @@ USES_OURS: dict[str, dict[str, float]] = {
     "px4": {"EKF2_EV_CTRL": 8, "EKF2_EVA_NOISE": 0.05},
 }
 QUICK = {"min_still_s": 3.0, "max_s": 6.0}
-"""What comes before the push is as short as it may be: worse biases make it harder for the attitude, not easier."""
+"""Shortest calibration before the push: worse biases make it harder for the attitude, not easier."""
 
 
 class Flight:
@@ -46,7 +46,7 @@ class Flight:
         return self.rig.aircraft.angles_rad(self.rig.aircraft.time_at(self.rig.now_s))[2]
 
     def theirs_deg(self) -> float:
-        """What the autopilot's heading is off by."""
+        """Heading error of the autopilot."""
         yaw = self.rig.autopilot.estimated_angles_rad(self.rig.now_s)[2]
         return math.degrees(abs(math.remainder(yaw - self.true_yaw_rad, 2.0 * math.pi)))
 

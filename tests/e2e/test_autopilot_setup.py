@@ -49,7 +49,7 @@ async def ask(rig: Rig) -> dict[str, Any]:
 
 
 async def follow(rig: Rig) -> None:
-    """As somebody with a ground station does."""
+    """Follow the advice as a person with a ground station does."""
     for row in (await ask(rig))["parameters"]:
         rig.autopilot.write_as_another_station(row["parameter"], row["wanted"])
 

@@ -1,4 +1,4 @@
-"""From bytes to parameters: the daemon against the simulator's truth."""
+"""The whole chain from bytes to parameters: the daemon against the simulator's truth."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it, and what should have."""
+    """Result and truth of one family."""
 
     record: Record
     truth: dict[str, Bias]

@@ -26,7 +26,7 @@ FINE_DEG_H = 20.0
 
 @dataclasses.dataclass
 class Sent:
-    """What leaves the companion, in order: parameter names, and the number of the calibration command."""
+    """Messages of the companion, in order: parameter names, and the number of the calibration command."""
 
     rig: Rig
     log: list[str | int] = dataclasses.field(default_factory=list)

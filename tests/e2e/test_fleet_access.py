@@ -21,19 +21,19 @@ FLEETS = [pytest.param(NAMED, "heron", id="users by name"), pytest.param([], "id
 
 
 def may_say(user: str, which: str) -> set[str]:
-    """What an aircraft says."""
+    """Topics that an aircraft may publish."""
     face = ("status", "state", "calibration/state", "calibration/progress", "attitude", "response/undo")
     return {f"fleet/{which}/hello", f"fleet/{which}/item"} | {f"companion/{user}/{what}" for what in face}
 
 
 def may_hear(user: str, which: str) -> set[str]:
-    """What an aircraft hears."""
+    """Topics that an aircraft may receive."""
     of_it = {f"fleet/{which}/confirmed", f"fleet/{which}/wanted"}
     return of_it | {f"companion/{user}/{what}" for what in ("status", "request/calibrate", "request/undo")}
 
 
 def said_and_heard(users: tuple[str, str]) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
-    """By user: the truth that a broker with the access list is held to."""
+    """Expected topics published and received by each user under the access list."""
     each = list(zip(users, (HERON, CRANE), strict=True))
     says = {user: may_say(user, which) for user, which in each}
     hears = {user: may_hear(user, which) for user, which in each}

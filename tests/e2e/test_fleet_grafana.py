@@ -65,7 +65,7 @@ def answer(database: str, sql: str, aircraft: str = "nobody") -> tuple[list[psyc
 
 @pytest.fixture(scope="module")
 def somebody(database: str) -> str:
-    """What the variable gives for the first aircraft."""
+    """Value of the variable for the first aircraft."""
     (variable,) = (each for each in VARIABLES if each["type"] == "query")
     columns, rows = answer(database, variable["query"])
     assert [column.name for column in columns] == ["__text", "__value"]

@@ -1,4 +1,4 @@
-"""What a fleet can tell of the place from all that one aircraft says: nothing, a kilometre, or all, as configured."""
+"""Place information in all that one aircraft sends to a fleet: none, to a kilometre, or all, as configured."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ async def lived(folder: Path) -> None:
 
 
 async def told(folder: Path, location: Location) -> list[Any]:
-    """All that the fleet hears of what is in the folder."""
+    """Return all items that the fleet receives from the folder."""
     aircraft = Aircraft(folder, location=location)
     async with aircraft.running():
         aircraft.connection.connect()
@@ -75,7 +75,7 @@ def figures(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
 
 
 def telling(items: list[Any], relative: float) -> dict[str, str]:
-    """By where it stands: what of the place it is, to that share of itself; its sign does not matter."""
+    """Values that match the place to that relative accuracy, by path; the sign is ignored."""
     return {
         path: name
         for item in items

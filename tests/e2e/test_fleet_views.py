@@ -1,4 +1,4 @@
-"""What the views say of flights, calibrations and armings, against what was told, in both databases."""
+"""Views of flights, calibrations and armings against the sent items, in both databases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Somebody says "disarmed" under the autopilot's ids: nothing is written while the true autopilot is armed.
+"""A stranger sends "disarmed" under the autopilot's ids: nothing is written while the true autopilot is armed.
 
 Forged heartbeats of every rate on an unsigned link; on a signed one, where nothing can be forged, true ones that were
 held back and come late. Judged by what the simulated autopilot is, not by what anybody says of it.

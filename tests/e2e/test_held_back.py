@@ -1,4 +1,4 @@
-"""What contradicts earlier calibrations is not written by itself: it is said, the gate stays as it is, people may."""
+"""A result that contradicts earlier calibrations is reported, not written; the gate stays, people may write it."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ async def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
 async def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_end(
     tmp_path: Path, version: str, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Of another firmware, or of an IMU that is gone: nobody waits for it for ever, and what is there is put back."""
+    """A journal of another firmware, or of an IMU that is gone: recovery ends, and existing parameters are restored."""
     there = "INS_GYROFFS_X" if name.startswith("INS") else name
     found = ChangeSet(1, tuple(Changed(each, before=0.0, after=0.001) for each in dict.fromkeys((name, there))))
     ChangeLog(tmp_path).journal.write(found)

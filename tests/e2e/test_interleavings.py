@@ -102,7 +102,7 @@ async def people(rig: Rig, chance: random.Random) -> None:
 
 
 async def _fate(rig: Rig, chance: random.Random) -> None:
-    """What pilots, radios and power supplies do."""
+    """Draw an event of pilots, radios and power supplies."""
     double = rig.double
     for _ in range(chance.randint(1, 5)):
         await asyncio.sleep(chance.uniform(0.1, ACTS_S / 3))

@@ -16,7 +16,7 @@ WRONG = 'protocol = "vectornav"\nmounting = "ROTATION_ROLL_180"'
 
 
 def summary(rig: Rig, name: str) -> tuple[bool, str]:
-    """As `companion check` says it."""
+    """Return the line of `companion check`."""
     return next((each["good"], each["summary"]) for each in rig.service.status()["devices"] if each["name"] == name)
 
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.real_clock
 
 
 def access_list() -> str:
-    """As the document shows it."""
+    """Return the access list in the document."""
     text = (ROOT / "docs/mqtt.md").read_text(encoding="utf-8")
     begin = text.index(f"    user {USER}\n")
     lines = text[begin:].split("\n\n")[0].splitlines()

@@ -16,7 +16,7 @@ from tests.support.rig import Rig
 
 
 async def press(rig: Rig, button: str, /, **body: Any) -> tuple[int, str]:
-    """What somebody is told who presses a button."""
+    """Press a button and return the answer."""
 
     async def ask(request: dict[str, Any]) -> AsyncGenerator[dict[str, Any], None]:
         async for reply in rig.service.faces.answer(request | {"face": "page"}):

@@ -73,7 +73,7 @@ async def scene(
 
 
 async def pixels_needed(tab: Tab) -> int:
-    """How much wider than the screen the page is."""
+    """Excess width of the page over the screen."""
     return int(await tab.value("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
 
 

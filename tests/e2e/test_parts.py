@@ -1,4 +1,4 @@
-"""Whose noise figures an IMU's sigmas are made of, where nobody has configured any: the part's, by its device ids."""
+"""Source of an IMU's noise figures without a configured profile: the part's, by its device ids."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SPI_1 = 0x0A
 
 
 def device_id(kind: int, address: int = 1) -> int:
-    """As both firmwares make it."""
+    """Return the id that both firmwares make."""
     return kind << 16 | address << 8 | SPI_1
 
 
@@ -58,7 +58,7 @@ def test_a_part_is_known_by_the_device_type_of_its_firmware(
 
 
 class Found(NamedTuple):
-    """How a calibration of the gyros ended, and what was said of the profile."""
+    """End of a calibration of the gyros, and the message about the profile."""
 
     imu: ImuRecord
     warnings: tuple[str, ...]

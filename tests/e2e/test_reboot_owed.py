@@ -1,4 +1,4 @@
-"""What PX4 has to be restarted for is not forgotten by a companion that was off; what it was restarted for, is."""
+"""A pending restart of PX4 survives a restart of the companion; a done one is forgotten."""
 
 from __future__ import annotations
 

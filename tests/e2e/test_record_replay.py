@@ -125,7 +125,7 @@ def test_floats_of_px4_are_replayed_with_the_bias_that_its_console_told(tmp_path
 
 
 def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) -> None:
-    """What began a stretch anew is not recorded: a window begins where the recorded one did all the same."""
+    """The causes of new stretches are not recorded; the windows begin as recorded all the same."""
 
     async def during(rig: Rig) -> None:
         await asyncio.sleep(4.0)

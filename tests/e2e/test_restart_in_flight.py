@@ -22,7 +22,7 @@ from tests.e2e.test_attitude_push import Firmware, Flight, Vision, flight
 
 WITHIN_S = 3.0
 STARTS_S = 0.5
-"""What a process takes until its first heartbeat leaves, which virtual time does not show."""
+"""Start time of a process until its first heartbeat, which virtual time does not show."""
 DIFFERS = {f"heading differs by {off_deg} deg from the autopilot's" for off_deg in (39, 40, 41)}
 READING = (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE)
 
@@ -35,7 +35,7 @@ def in_air(flying: Flight, rate_deg_s: float = 12.0) -> None:
 
 
 def worst_deg(flying: Flight, since_s: float) -> float:
-    """What the headings that were sent were off by at their own instants."""
+    """Largest error of the sent headings at their own instants."""
     aircraft = flying.rig.aircraft
     sent = flying.witness.of(Vision, since_s)
     truth = [aircraft.angles_rad(message.usec * 1e-6 - aircraft.loop_time_of(0.0))[2] for message in sent]
@@ -44,7 +44,7 @@ def worst_deg(flying: Flight, since_s: float) -> float:
 
 
 def begun(flying: Flight, since_s: float) -> list[str]:
-    """What the new daemon has asked for besides reading."""
+    """Everything that the new daemon started besides reading."""
     return [
         message.get_type()
         for t_s, message in flying.witness.heard
@@ -56,7 +56,7 @@ def begun(flying: Flight, since_s: float) -> list[str]:
 
 @pytest.mark.parametrize(("firmware", "own_imu"), [("ardupilot", False), ("px4", True)])
 async def test_it_goes_on_within_three_seconds_in_a_turn(tmp_path: Path, firmware: Firmware, own_imu: bool) -> None:
-    """By the truth, and nothing else is begun: no calibration, no write, no word of an arming that nobody saw."""
+    """The heading is right, and nothing else starts: no calibration, no write, no message about arming."""
 
     options: dict[str, Any] = {"own_imu": own_imu, "imu_rate_hz": 50.0, "at_arm": "warn"}
     async with flight(tmp_path, firmware=firmware, **options) as flying:
@@ -81,7 +81,7 @@ async def test_it_goes_on_within_three_seconds_in_a_turn(tmp_path: Path, firmwar
 
 
 async def test_a_compass_that_lies_since_is_not_followed(tmp_path: Path) -> None:
-    """By 40 degrees: nothing is pushed, and everybody is told why, until it is right again."""
+    """A compass off by 40 degrees: nothing is pushed, and the reason is reported, until it is right again."""
 
     async with flight(tmp_path, firmware="px4") as flying:
         rig = flying.rig
@@ -179,7 +179,7 @@ async def test_biases_that_are_not_this_imus_now_are_not_used(
 
 
 async def test_an_autopilot_has_outlived_the_power_cut_of_our_board(tmp_path: Path) -> None:
-    """Its offsets are as they were, whatever our clock says now."""
+    """The offsets of the autopilot are unchanged, whatever our clock says."""
 
     async with flight(tmp_path, own_imu=False, imu_rate_hz=50.0) as flying:
         in_air(flying)

@@ -29,7 +29,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def said(caplog: pytest.LogCaptureFixture, name: str, words: str) -> list[str]:
-    """What was said at the level of a warning of a device, with these words."""
+    """Warnings about a device that contain these words."""
     lines = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     return [line for line in lines if line.startswith(f"{name}: ") and words in line]
 
@@ -115,7 +115,7 @@ def test_a_second_reader_takes_some_of_the_bytes(path: Path, caplog: pytest.LogC
 
 
 def test_a_flood_holds_nobody_up(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """As fast as a pty takes it: the loop goes on, what is decoded is bounded, and the sensor comes back."""
+    """A flood at the speed of the pty: the loop goes on, decoding is bounded, and the sensor recovers."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()

@@ -129,7 +129,7 @@ def test_where_the_whole_process_stands_still_is_in_the_log(tmp_path: Path) -> N
 
 
 def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_path: Path) -> None:
-    """Who waits for a device goes on; only who waits for ever is hung."""
+    """Waiting for a device keeps the watchdog alive; only an endless wait counts as hung."""
 
     async def main() -> None:
         entry = ("-c", HANGING.replace("{patch}", ""))
@@ -148,7 +148,7 @@ def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_pa
 
 
 def offsets(scenario: Scenario) -> dict[str, float]:
-    """What the autopilot subtracts."""
+    """Offsets in the autopilot."""
     return {
         name: scenario.autopilot.parameter(name)
         for instance in (1, 2)

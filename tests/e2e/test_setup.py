@@ -44,7 +44,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder, self.file, self.udp = folder, folder / "companion.toml", free_udp()
         self.told: list[bytes] = []
-        """All that the autopilot was sent."""
+        """Everything sent to the autopilot."""
 
     def words(self, *ports: str, silent: int = 0) -> list[str]:
         """Arguments: these ports, and the autopilot's UDP port or one where nobody is."""
@@ -52,7 +52,7 @@ class Bench:
         return ["-c", str(self.file), "setup", *paths, "--udp", str(silent or self.udp)]
 
     def configuration(self) -> dict[str, Any]:
-        """What the file says."""
+        """Content of the file."""
         return tomllib.loads(self.file.read_text())
 
     def left(self) -> set[str]:

@@ -1,4 +1,4 @@
-"""Somebody who speaks under the autopilot's ids: what a calibration makes of it, and what the pilot is told."""
+"""A stranger sends under the autopilot's ids: effect on a calibration, and the message to the pilot."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ QUICK: dict[str, Any] = {"min_still_s": 4.0, "max_s": 8.0}
 
 
 def contradictions(rig: Rig) -> list[str]:
-    """What the headline and the line about arming say of each other's opposite."""
+    """Contradictions between the headline and the line about arming."""
     status = rig.service.status()
     headline, arming, vehicle = status["headline"], status["arming"], status["vehicle"]
     found = []

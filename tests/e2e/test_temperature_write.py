@@ -29,7 +29,7 @@ OFFSETS = [f"INS_{kind}OFFS_{axis}" for kind in ("GYR", "ACC") for axis in "XYZ"
 
 
 class Warm(Rig):
-    """Its gyros follow the temperature by a known curve, and it knows that from other days."""
+    """Gyros that follow the temperature by a known curve, learned on other days."""
 
     def __init__(self, folder: Path, **more: Any) -> None:
         super().__init__(folder, **{**FEW, **more})
@@ -83,7 +83,7 @@ class Warm(Rig):
         return self.double.residual(1, self.now_s).gyro_rad_s / DEG_H
 
     def left_mg(self) -> Any:
-        """Likewise of the accelerometers."""
+        """Error left in the accelerometers."""
         return self.double.residual(1, self.now_s).accel_m_s2 / MG
 
 

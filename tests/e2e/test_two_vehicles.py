@@ -63,7 +63,7 @@ class Stage:
     other: AutopilotDouble
     network: Network
     to_other: list[mavlink.MAVLink_message] = dataclasses.field(default_factory=list)
-    """What left the companion with the other's address."""
+    """Messages of the companion to the other's address."""
     before: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def join(self) -> None:

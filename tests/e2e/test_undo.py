@@ -84,7 +84,7 @@ def test_each_undo_takes_one_step_back_to_the_bit_says_which_and_then_there_is_n
 
 
 class Cut(NamedTuple):
-    """What a power cut leaves."""
+    """State left by a power cut."""
 
     folder: Path
     parameters: Values

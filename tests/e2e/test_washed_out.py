@@ -1,4 +1,4 @@
-"""Somebody who asks and cancels, or arms and disarms, in a loop: what is kept stays, and people are still served."""
+"""A client that requests and cancels, or arms and disarms, in a loop: kept values stay, others are served."""
 
 from __future__ import annotations
 

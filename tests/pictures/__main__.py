@@ -19,7 +19,7 @@ from tests.support.browser import Tab, chromium
 PICTURES: Final = Path(__file__).parents[2] / "docs/pictures"
 PHONE, PAPER = (390, 780), (760, 900)
 COLOURS: Final = 64
-"""So many are enough for letters and bars, and make a quarter of the bytes."""
+"""Enough for letters and bars, at a quarter of the bytes."""
 NAMES: Final = ("demo", "page", "report")
 
 

@@ -1,4 +1,4 @@
-"""What a command prints, as an SVG that plays it: lines that appear one after another, and scroll.
+"""Output of a command as an animated SVG: lines appear one after another, and scroll.
 
 Recorders that do so are not maintained (termtosvg, since 2020) or need Node (svg-term). A program that only ever adds
 lines needs two animations: one scrolls, one uncovers.
@@ -17,10 +17,10 @@ from xml.sax.saxutils import escape
 ROOT: Final = Path(__file__).parents[2]
 ROWS, COLUMNS = 26, 118
 LINE_PX, CHARACTER_PX, MARGIN_PX = 17.0, 7.83, 12.0
-"""Of a monospaced font of 13 px."""
+"""Metrics of a monospaced font of 13 px."""
 LONGEST_PAUSE_S: Final = 0.25
 END_S: Final = 8.0
-"""How long the last lines stay before it begins again."""
+"""Display time of the last lines before the restart."""
 _STYLE: Final = (
     "text{font:13px ui-monospace,Menlo,Consolas,'DejaVu Sans Mono',monospace;fill:#d4d4d4;white-space:pre}"
     ".c{fill:#7ec699}"
@@ -28,7 +28,7 @@ _STYLE: Final = (
 
 
 class Line(NamedTuple):
-    """One that was printed, and when."""
+    """A printed line and its time."""
 
     t_s: float
     text: str
@@ -53,7 +53,7 @@ async def recorded(*words: str) -> list[Line]:
 
 
 def shortened(lines: Sequence[Line]) -> list[Line]:
-    """The same without long pauses, from 0 on."""
+    """Shorten long pauses; start at 0."""
     now_s, before_s, found = 0.0, lines[0].t_s, []
     for line in lines:
         now_s += min(line.t_s - before_s, LONGEST_PAUSE_S)
@@ -63,7 +63,7 @@ def shortened(lines: Sequence[Line]) -> list[Line]:
 
 
 def wrapped(lines: Sequence[Line]) -> list[Line]:
-    """As a terminal of so many columns breaks them."""
+    """Wrap the lines at the width of the terminal."""
     return [
         Line(line.t_s, line.text[at : at + COLUMNS]) for line in lines for at in range(0, len(line.text) or 1, COLUMNS)
     ]

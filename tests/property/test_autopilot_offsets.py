@@ -42,7 +42,7 @@ def from_euler_deg(roll: float, pitch: float, yaw: float) -> Matrix:
 
 
 class Firmware:
-    """What the autopilot computes, in 32 bit floats, from a sensor with a bias in the board's axes."""
+    """Arithmetic of the autopilot, in 32 bit floats, on a sensor with a bias in the board's axes."""
 
     def __init__(self, rotation: Matrix, scale: Vector, gyro_bias: Vector, accel_bias: Vector) -> None:
         self.rotation, self.scale = rotation, np.array(scale)

@@ -1,4 +1,4 @@
-"""What must hold whatever is fed: no exception, bounded memory, equivariance."""
+"""Invariants for any input: no exception, bounded memory, equivariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From window to biases: symmetries that must hold for every pose, law and mounting, and the covariance."""
+"""Window to biases: symmetries for every pose, law and mounting, and the covariance."""
 
 from __future__ import annotations
 

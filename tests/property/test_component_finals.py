@@ -56,7 +56,7 @@ def acks_in(raw: list[bytes]) -> list[Ack]:
 
 
 def tap(b: Bench) -> list[bytes]:
-    """What the component sends, before the wire loses or doubles it."""
+    """Messages of the component before the wire loses or doubles them."""
     sent: list[bytes] = []
     transmit = b.link._transmit
     assert transmit is not None

@@ -52,7 +52,7 @@ def torn() -> tuple[bytes, bytes, int]:
 
 
 def check_left(database: bytes, log: bytes, whole: int) -> int:
-    """How many writes have survived; they must be the first ones, and it must go on from there."""
+    """Count the surviving writes; they must be the first ones, and the store must go on from there."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / FILE).write_bytes(database)

@@ -1,4 +1,4 @@
-"""Whatever is published as a request, it is judged in one line and the verdict can be sent."""
+"""Any published request gets a verdict of one line that can be sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds for every decoder, whatever comes down the wire."""
+"""Invariants of every decoder, for any bytes."""
 
 from __future__ import annotations
 

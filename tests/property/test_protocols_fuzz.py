@@ -23,7 +23,7 @@ EVERY = [(kind, name) for kind, names in PROTOCOLS.items() for name in names]
 
 
 def held(decoder: Decoder) -> int:
-    """How much a decoder keeps: bytes, and the items of whatever else may grow."""
+    """Size of a decoder's memory: bytes, and the items of its containers."""
     return sum(
         len(value) for value in vars(decoder).values() if isinstance(value, bytes | bytearray | deque | dict | list)
     )

@@ -1,4 +1,4 @@
-"""Whatever is in a file: one line says what is wrong, or a result comes of it; never a traceback."""
+"""Any file gives one line about its fault, or a result; never a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever comes, the simulator does not fall; whatever the pose, the devices agree with the truth."""
+"""The simulator survives any input; in every pose the devices agree with the truth."""
 
 from __future__ import annotations
 

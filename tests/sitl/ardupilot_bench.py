@@ -31,11 +31,11 @@ OUR_ACCELS = tuple(f"INS_ACCOFFS_{axis}" for axis in "XYZ")
 SECOND_GYROS = tuple(f"INS_GYR2OFFS_{axis}" for axis in "XYZ")
 SECOND_ACCELS = tuple(f"INS_ACC2OFFS_{axis}" for axis in "XYZ")
 OF_NO_CONCERN = ("STAT_", "BARO", "COMPASS_DEC", "SIM_", "MIS_TOTAL")
-"""What a firmware counts, or measures of air and field, by itself."""
+"""Counters of a firmware, and its measurements of air and field."""
 GYRO_FAMILY = ("INS_GYR",)
 GYRO_LIMIT_DEG_H = 15.0
 BOOT_LIMIT_DEG_H = 80.0
-"""Of the firmware's own calibration: two windows of a quarter second."""
+"""Limit for the firmware's own calibration: two windows of a quarter second."""
 ACCEL_LIMIT_MG = 0.2
 """The gradienter of these tests is 0.003 degrees off, 0.05 mg; 12 s of white noise are 0.015 mg."""
 
@@ -110,7 +110,7 @@ def calibrates(message: Message) -> bool:
 
 
 def asks_for_ahrs(message: Message) -> bool:
-    """What tells how the EKF settles."""
+    """Requests for the messages that show the EKF settling."""
     ahrs: int = mavlink.MAVLINK_MSG_ID_AHRS
     return (
         isinstance(message, mavlink.MAVLink_command_long_message)
@@ -153,7 +153,7 @@ def written(record: Record) -> dict[str, float]:
 def assert_as_recorded(
     record: Record, changed: Mapping[str, tuple[float, float]], allowed: tuple[str, ...] = ()
 ) -> None:
-    """What has changed is what the record says, in its list or in its warnings."""
+    """Check that the changes are those in the record's list or warnings."""
     said = written(record)
     for name, (_, now) in changed.items():
         if name.startswith(allowed) and any("INS_GYR_CAL" in warning for warning in imu_warnings(record)):

@@ -40,7 +40,7 @@ ACCEL_MG = (1.0, -2.0, 3.0)
 SETTLE_S = 40.0
 """After a start of a binary: position found, first transients of the estimator over."""
 SAVED_S = 3.0
-"""By then PX4 has stored what was written (autopilots 8)."""
+"""Time in which PX4 stores written values (autopilots 8)."""
 KINDS = ("ardupilot-double", "px4-double", "ardupilot-sitl", "px4-sitl")
 BINARIES = {"ardupilot-sitl": "ARDUPILOT_SITL", "px4-sitl": "PX4_SITL"}
 
@@ -54,7 +54,7 @@ def world(motions: Sequence[Motion] = ()) -> Scenario:
 
 
 class Craft(ABC):
-    """What a test has of an autopilot on the aircraft."""
+    """A test's access to an autopilot on the aircraft."""
 
     firmware: Firmware
     real: bool
@@ -73,7 +73,7 @@ class Craft(ABC):
 
     @abstractmethod
     def true_bias(self, instance: int) -> Bias:
-        """What IMU `instance` reads too much now."""
+        """Bias of IMU `instance` now."""
 
     @abstractmethod
     async def reboot(self) -> None:
@@ -89,7 +89,7 @@ class Craft(ABC):
         self.aircraft.add(motion)
 
     def truth(self) -> Array:
-        """What a perfect IMU reads now: three rates (rad/s), three specific forces (m/s^2)."""
+        """Reading of a perfect IMU now: three rates (rad/s), three specific forces (m/s^2)."""
         return np.concatenate(self.aircraft.truth_at(self.now_s))
 
     def expected(self, instance: int) -> Array:
@@ -215,7 +215,7 @@ def _onboard(firmware: Firmware, system_id: int) -> GroundStation:
 
 
 def _tiny_offsets() -> dict[str, float]:
-    """As the binary has them: calibrated, and no bias to speak of."""
+    """Offsets of the binary: calibrated, with negligible biases."""
     return {f"INS_ACC{imu}OFFS_{axis}": 1e-6 * STANDARD_GRAVITY_M_S2 for imu in ("", "2") for axis in "XYZ"}
 
 

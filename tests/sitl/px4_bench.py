@@ -21,9 +21,11 @@ ITS_OWN = frozenset(
     | {f"CAL_GYRO{slot}_PRIO" for slot in range(4)}
     | {f"CAL_BARO{slot}_OFF" for slot in range(4)}
 )
-"""What PX4 itself may change meanwhile; those of the log are put back to their defaults by its start scripts. A slot's
-priority is -1, which means 50, until PX4's background calibration saves the slot: it then writes the 50. The
-barometer's offset is calibrated by GNSS after a start (SENS_BARO_AUTOCAL)."""
+"""Parameters that PX4 itself may change; its start scripts reset those of the log to their defaults.
+
+A slot's priority is -1, which means 50, until PX4's background calibration saves the slot: it then writes the 50. The
+barometer's offset is calibrated by GNSS after a start (SENS_BARO_AUTOCAL).
+"""
 GYRO_DEG_H = (500.0, -700.0, 1000.0)
 """Case D: integers tell it."""
 ACCEL_MG = (1.0, -2.0, 3.0)
@@ -48,7 +50,7 @@ async def flying(
 
 
 async def calibrate(daemon: CompanionProcess) -> dict[str, float]:
-    """One that succeeds; the values that it wrote, by parameter."""
+    """Calibrate successfully; return the written values, by parameter."""
     record = await daemon.calibrate(CALIBRATE_WITHIN_S)
     assert record["state"] == "done", (record["reason"], daemon.log())
     return {name: one["after"] for imu in record["imus"] for name, one in imu["written"].items()}

@@ -46,7 +46,7 @@ def said(ground: GroundStation, since_s: float = 0.0) -> str:
 
 
 async def arm(ground: GroundStation, vehicle: SitlVehicle, force: float = 0.0) -> tuple[bool, str]:
-    """Whether the firmware armed, and what was said; it is disarmed again."""
+    """Try to arm; return success and texts; disarm again."""
     since_s = asyncio.get_running_loop().time()
     result = await ground.command(ARM, 1.0, force, target=(vehicle.system_id, 1), wait_s=15.0)
     await vehicle.sleep(2.5)
@@ -89,7 +89,7 @@ async def until_it_arms(ground: GroundStation, vehicle: SitlVehicle, within_s: f
 
 
 async def seconds_until_said(ground: GroundStation, vehicle: SitlVehicle, words: str, within_s: float = 20.0) -> float:
-    """How long ArduPilot's pre-arm checks take to give a reason; on its clock, which a busy machine slows down."""
+    """Time until ArduPilot's pre-arm checks give a reason; on its clock, which a busy machine slows down."""
     begun_s = vehicle.physics_s
     while vehicle.physics_s < begun_s + within_s:
         since_s = asyncio.get_running_loop().time()

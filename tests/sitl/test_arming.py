@@ -71,7 +71,7 @@ def test_it_arms_when_asked_and_disarms(autopilot: Autopilot) -> None:
 
 
 def test_a_heartbeat_that_is_asked_for_is_there_30_ms_after_the_answer(autopilot: Autopilot) -> None:
-    """What the companion waits for before each write, so that nobody else's heartbeat stands for the autopilot's."""
+    """The companion waits for it before each write, so that no other heartbeat stands for the autopilot's."""
 
     async def main(craft: Craft) -> None:
         loop, ground = asyncio.get_running_loop(), craft.ground

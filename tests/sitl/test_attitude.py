@@ -45,7 +45,7 @@ class Bench:
         self.vehicle, self.ground, self.daemon = vehicle, ground, daemon
 
     async def set_up(self, *, net: bool = True) -> dict[str, Any]:
-        """What `companion autopilot-setup` says, from a ground station; without `net` no second set of sources."""
+        """Follow `companion autopilot-setup` from a ground station; without `net` no second set of sources."""
         shown = await self.ask("autopilot-setup")
         wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
         await self.ground.put_all(
@@ -65,7 +65,7 @@ class Bench:
         return answer
 
     async def attitude(self) -> dict[str, Any]:
-        """What the companion says of its attitude."""
+        """Attitude in the companion's status."""
         status = await self.ask("status")
         found: dict[str, Any] = status["attitude"]
         return found
@@ -92,7 +92,7 @@ class Bench:
         await asyncio.sleep(1.0)
 
     async def prearm_words(self) -> str:
-        """What ArduPilot has against arming, after asking it to look."""
+        """Ask ArduPilot for its pre-arm checks; return the reasons."""
         since_s = asyncio.get_running_loop().time()
         self.ground.send(
             mavlink.MAVLink_command_long_message(
@@ -124,7 +124,7 @@ class Bench:
         return found
 
     def turn(self, heading_deg: float) -> None:
-        """Somebody turns the aircraft."""
+        """Turn the aircraft."""
         self.vehicle.move([Turn(start_s=self.vehicle.now_s + 0.5, duration_s=4.0, heading_deg=heading_deg)])
 
 
@@ -199,7 +199,7 @@ def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("script", [True, False], ids=["script", "command"])
 def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, script: bool) -> None:
-    """By the script within a second even of a kill -9; without one, by the companion's own request."""
+    """By the script within a second, even after kill -9; without one, by the companion's own request."""
 
     async def main() -> None:
         if script:

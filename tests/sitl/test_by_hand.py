@@ -28,7 +28,7 @@ from tests.sitl.craft import BINARIES, missing
 pytestmark = pytest.mark.real_clock
 
 LEVEL_MG, SCALE_PERCENT, LEVEL_DEG = 0.5, 0.03, 0.08
-"""Of a part that nobody knows: one sigma of its stands is 0.4 mg, though it is hundredths in fact."""
+"""Limits for a part without profile: one sigma of its stands is 0.4 mg, though it is hundredths in fact."""
 NAMES = {
     "ardupilot-sitl": [f"INS_ACC{what}_{axis}" for what in ("OFFS", "SCAL") for axis in "XYZ"],
     "px4-sitl": [f"CAL_ACC{slot}_{axis}{what}" for slot in (0, 1) for what in ("OFF", "SCALE") for axis in "XYZ"],
@@ -39,9 +39,9 @@ TRIM = {
 }
 OBSERVED_S = 4.0
 STILL_AFTER_S = 1.5
-"""From the end of a movement until every filter has forgotten it."""
+"""Time from the end of a movement until every filter has settled."""
 STORED_S = 4.0
-"""By then PX4 has stored what was set."""
+"""Time in which PX4 stores set values."""
 
 
 class Accelerometer(NamedTuple):

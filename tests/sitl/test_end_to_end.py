@@ -21,7 +21,7 @@ target_accel_sigma_mg = 0.005
 """A whole minute: the figures of autopilots 9.3 are for that."""
 OBSERVE_S = 60.0
 GRADIENTER_MG = 1e3 * np.radians(0.005)
-"""Its stated error: 0.005 degrees of tilt are 0.087 mg."""
+"""Stated error: 0.005 degrees of tilt are 0.087 mg."""
 LEFT_DEG_H = {("ardupilot", 1): 4.0, ("px4", 1): 30.0, ("px4", 2): 6.0}
 LEFT_MG = {("ardupilot", 1): 0.02, ("px4", 1): 0.05, ("px4", 2): 0.03}
 """rms over the axes; PX4's first simulated IMU suffers from another 16 bits (autopilots 9.3.2: 10.9 deg/h, 24 ug)."""

@@ -27,14 +27,14 @@ JUDGED = (0, 1, 2, 5)
 """Axes that `companion flight` judges: gyros, vertical accelerometer."""
 MOVED_DEG_H = (400.0, -300.0, 200.0)
 MOVED_MG = 5.0
-"""Of the vertical accelerometer; PX4 leaves offsets in force that differ by less than 1 mg."""
+"""Step of the vertical accelerometer; PX4 ignores offsets that differ by less than 1 mg."""
 LOGGING = {
     "arducopter": {"LOG_DISARMED": 1.0, "LOG_BITMASK": float(176126 | 1 | 1 << 18)},  # attitude and IMU at 400 Hz
     "px4": {"SDLOG_BACKEND": 1.0, "SDLOG_MODE": 1.0},
 }
 STOOD_S = 35.0
 LARGEST_SIGMA = {"arducopter": (40.0 * DEG_H, 1.0 * MG), "px4": (60.0 * DEG_H, 1.0 * MG)}
-"""Of gyros and accelerometer while it stands: one that promises nothing would let everything pass."""
+"""Largest sigma of gyros and accelerometer at rest: a larger one would let every error pass."""
 
 
 async def flown(craft: str, folder: Path) -> tuple[dict[str, Any], str, list[float]]:

@@ -15,7 +15,7 @@ from tests.sitl.craft import BINARIES, missing
 pytestmark = pytest.mark.sitl
 RESUMED = "Attitude: heading pushed to the autopilot"
 ROUND_S = 60.0
-"""By then a plane has flown its circle, on half of which the wind lets its compass be read."""
+"""Time in which a plane has flown its circle; on half of it the wind lets its compass be read."""
 
 
 def binary_of(craft: str) -> Path:

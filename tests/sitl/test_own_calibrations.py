@@ -1,4 +1,4 @@
-"""What the firmwares' own calibrations do on the tilted aircraft (autopilots 3, 4.6, 9.3). Named to run late."""
+"""The firmwares' own calibrations on the tilted aircraft (autopilots 3, 4.6, 9.3). Named to run late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What writing offsets does to the firmwares, row by row (autopilots 1, 4.2, 4.3, 9.1, 9.2, 9.3)."""
+"""Effect of written offsets in the firmwares, row by row (autopilots 1, 4.2, 4.3, 9.1, 9.2, 9.3)."""
 
 from __future__ import annotations
 

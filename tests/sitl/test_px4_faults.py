@@ -1,4 +1,4 @@
-"""What may go wrong around a calibration of a real PX4: right afterwards, or refused with the old values back.
+"""Faults around a calibration of a real PX4: right afterwards, or refused with the old values restored.
 
 Some minutes of real time each.
 """
@@ -22,12 +22,12 @@ from tests.sitl.px4_bench import QUICK, SAVED_S, calibrate, changed, flying
 pytestmark = pytest.mark.sitl
 
 GYRO_LIMIT_DEG_H = {1: 80.0, 2: 15.0}
-"""By IMU: what the first one's coarse simulated steps allow in 40 s, 20 deg/h rms, and what the other's noise does."""
+"""Limits by IMU: the first one's coarse simulated steps allow 20 deg/h rms in 40 s; the other's noise less."""
 ACCEL_LIMIT_MG = 0.2
 
 
 def assert_right(vehicle: Px4Sitl, wrote: dict[str, float]) -> None:
-    """What was written is the true bias of the sensor whose slot it is."""
+    """Check that the written values are the true bias of the sensor with the slot."""
     for instance in (1, 2):
         bias = vehicle.true_bias(instance, 0.0)
         for part, true, unit, limit in (

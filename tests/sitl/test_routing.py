@@ -1,4 +1,4 @@
-"""Who carries out what is addressed to the companion (autopilots 5.4)."""
+"""Receivers of messages addressed to the companion (autopilots 5.4)."""
 
 from __future__ import annotations
 

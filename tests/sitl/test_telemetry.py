@@ -1,4 +1,4 @@
-"""What the firmwares' IMU messages are, row by row (autopilots 2, 4.5, 9.1, 9.2)."""
+"""Meaning of the firmwares' IMU messages, row by row (autopilots 2, 4.5, 9.1, 9.2)."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ def test_the_first_simulated_imu_of_px4_is_the_mean_of_three_coarse_readings_wei
 @pytest.mark.parametrize("mean", [0.48, -0.29, 0.82, 1.3, -2.4])
 @pytest.mark.parametrize("offset", [0.0, 2.4])
 def test_the_mean_behind_two_grids_is_found(mean: float, offset: float) -> None:
-    """As PX4's sensor 0 has it: rounded to its 16 bits, meaned with weights 1 2 1, corrected, cut to a mrad/s."""
+    """PX4's sensor 0: rounded to 16 bits, averaged with weights 1 2 1, corrected, cut to a mrad/s."""
     grid, sigma = 1.0653, 0.546
     raw = np.random.default_rng(8).normal(mean + offset, sigma, 30_002)
     rounded = np.rint(raw / grid) * grid

@@ -51,20 +51,20 @@ NAMES = [f"INS_TCAL1_{kind}{n}_{axis}" for kind in ("ACC", "GYR") for n in (1, 2
 NAMES += ["INS_TCAL1_TMIN", "INS_TCAL1_TMAX", "INS_TCAL1_ENABLE", "INS_GYR1_CALTEMP", "INS_ACC1_CALTEMP"]
 NAMES += [f"INS_{kind}OFFS_{axis}" for kind in ("GYR", "ACC") for axis in "XYZ"]
 WITHIN_DEG_H, WITHIN_MG = 5.0, 0.2
-"""Of 500 deg/h and 3 mg."""
+"""Limits, of 500 deg/h and 3 mg."""
 LOOK_S = 12.0
 """White noise of 2 deg/h; the firmware's own of the same size."""
 QUICK = '\n[calibration]\nmin_still_s = 8\nmax_s = 12\nat_arm = "off"\n'
 
 
 def curve(degc: float) -> Array:
-    """What the simulator adds, deg/h."""
+    """Curve added by the simulator, deg/h."""
     d = degc - MIDDLE_DEGC
     return np.asarray(CURVE[0] * d + CURVE[1] * d**2 + CURVE[2] * d**3)
 
 
 def accel_curve(degc: float) -> Array:
-    """Likewise, mg."""
+    """Curve of the accelerometers added by the simulator, mg."""
     d = degc - MIDDLE_DEGC
     return np.asarray(ACCEL_CURVE[0] * d + ACCEL_CURVE[1] * d**2)
 
@@ -73,9 +73,9 @@ STARTS_DEGC = (6.0, 12.0, 18.0, 24.0, 30.0)
 RISE_K, TCONST_S, WARM_S = 14.0, 60.0, 117.0
 """12 K, of which the companion sees the last nine or ten."""
 SCATTER_DEG_H = 30.0
-"""From one power-up to the next."""
+"""Scatter from one power-up to the next."""
 LEARNER = 2
-"""Of these five, in the middle of all that is judged."""
+"""Power-up of the learner, of these five, in the middle of all that is judged."""
 TEN_K = np.arange(0.0, 10.5, 2.0)
 
 
@@ -106,7 +106,7 @@ async def left_deg_h(vehicle: ArduPilotSitl, ground: GroundStation, degc: float,
 
 
 async def all_left(vehicle: ArduPilotSitl, ground: GroundStation, degc: float, look_s: float = LOOK_S) -> Array:
-    """Likewise, deg/h and mg."""
+    """Residuals of all axes, deg/h and mg."""
     await ground.put("SIM_IMUT_FIXED", degc)
     await vehicle.sleep(1.5)
     return np.asarray((await residual(vehicle, ground, 1, look_s)) / UNITS)
@@ -136,7 +136,7 @@ def _on_day(point: Point, day: int) -> Point:
 
 
 BIN_K = 0.5
-"""Of the firmware's own learner: what it lacks of a span by less than that it has seen."""
+"""Bin of the firmware's own learner: it counts a span as seen up to that much less."""
 
 
 async def warm_up(vehicle: ArduPilotSitl, ground: GroundStation, start_degc: float, **more: float) -> None:
@@ -156,7 +156,7 @@ async def left_over(vehicle: ArduPilotSitl, ground: GroundStation, what: str) ->
 
 
 def rms_over_ten_k(left: dict[float, Array]) -> dict[float, float]:
-    """By where ten kelvin begin, what is left in them by an aircraft that was calibrated in their middle, deg/h."""
+    """Residual over each ten kelvin of an aircraft calibrated in their middle, deg/h; key: their beginning."""
     return {
         low: float(np.sqrt(np.mean([np.square(left[low + d] - left[low + 4.0]) for d in TEN_K])))
         for low in left

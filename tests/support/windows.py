@@ -31,7 +31,7 @@ def ned_from_body(pitch_deg: float, roll_deg: float, heading_deg: float) -> Arra
 
 
 def readings(up: Array, law: Literal["axis", "slope", "euler"]) -> tuple[float, float]:
-    """Readings x and y, degrees, of a gradienter in whose FRD axes `up` (unit) points up, from the meaning of the law."""
+    """Readings x and y, degrees, of a gradienter in whose FRD axes `up` (unit) points up, by the law."""
     if law == "axis":
         return math.degrees(math.asin(-up[1])), math.degrees(math.asin(up[0]))
     if law == "slope":
