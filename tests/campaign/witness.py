@@ -138,7 +138,7 @@ class Witness:
 MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)0_[XYZ]OFF"
 """Parameters of IMU 1, the calibrated one.
 
-Its slot on PX4 is the first, as on a board whose drivers start in the order of the slots: docs/faults.md has the others.
+Its slot on PX4 is the first, as on a board whose drivers start in slot order: docs/faults.md has the others.
 """
 WATCHED = {
     True: [f"CAL_{sensor}1_{axis}OFF" for sensor in ("ACC", "GYRO") for axis in "XYZ"],
