@@ -20,7 +20,7 @@ from sim.gradienters import Jewell, RionInclinometer, WitMotionInclinometer
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from sim.motions import Motion
 from sim.px4.double import PX4Double
-from sim.thermal import Board
+from sim.thermal import ThermalBoard
 
 IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
     "vectornav": VectorNavBinary,
@@ -202,7 +202,7 @@ def demo(
         aircraft: another aircraft for the sensors; `pose`, `motions` and `warms` are then its own.
     """
     air_degc, rise_k, time_constant_s = warms or (25.0, 0.0, 1.0)
-    temperature_degc = Board(rise_k, time_constant_s).switched_on(air_degc)
+    temperature_degc = ThermalBoard(rise_k, time_constant_s).switched_on(air_degc)
     aircraft = aircraft or VirtualAircraft(
         pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, temperature_degc=temperature_degc, unix_s=unix_s
     )

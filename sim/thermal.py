@@ -28,14 +28,14 @@ def warming(start_degc: float, end_degc: float, time_constant_s: float) -> Calla
 
 
 @dataclass(frozen=True, slots=True)
-class Board:
+class ThermalBoard:
     """Self-heating over the air's temperature, and its time constant."""
 
     rise_k: float
     time_constant_s: float
 
     @classmethod
-    def drawn(cls, random: np.random.Generator) -> Board:
+    def drawn(cls, random: np.random.Generator) -> ThermalBoard:
         """Draw a typical board of a small aircraft."""
         time_constant_s = random.uniform(*TIME_CONSTANT_S)
         return cls(random.uniform(*RISE_K), time_constant_s)

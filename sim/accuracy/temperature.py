@@ -1,4 +1,4 @@
-"""Aircraft over many days: gyro biases at the next power-up, and calibrations in mid-warm-up.
+"""AgingAircraft over many days: gyro biases at the next power-up, and calibrations in mid-warm-up.
 
 Pieces and boards are those of `sim.thermal`; each day one warms up and stands still now and then. The days are means of
 still seconds, drawn directly.
@@ -23,7 +23,7 @@ from sim.accuracy.figures import Claim, Errors, Section, covered, rms, stack
 from sim.accuracy.stand import POSTURES, References, collected, samples, sites, solved, stand
 from sim.earth import Array
 from sim.imu_model import DEG_H, PARTS, AxisNoise
-from sim.thermal import Board, Curve, Piece
+from sim.thermal import Curve, Piece, ThermalBoard
 
 DAYS: Final = 20
 TRIED: Final = ("icm42688p", "bmi088", "adis16405")
@@ -48,7 +48,7 @@ class Day:
     still: Array
 
 
-class Aircraft:
+class AgingAircraft:
     def __init__(
         self, noise: AxisNoise, random: np.random.Generator, shown: Callable[[Array, float], Array] | None = None
     ) -> None:
@@ -59,7 +59,7 @@ class Aircraft:
         offset = math.sqrt(noise.scatter**2 - len(_TAUS_S) * self._flicker_sigma**2)
         usual = random.normal(0.0, 1000.0 * DEG_H, 3)
         self.piece = Piece.drawn(random, usual, np.full(3, offset), np.full(3, noise.per_kelvin))
-        self.board = Board.drawn(random)
+        self.board = ThermalBoard.drawn(random)
 
     def day(self) -> Day:
         """Return the next day."""
@@ -125,7 +125,7 @@ def power_up(part: str, seed: int, number: int) -> Errors:
     """One aircraft of a part: twenty days, then the error at the next power-up, over the part's scatter."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
-    aircraft = Aircraft(PARTS[part].gyro, random)
+    aircraft = AgingAircraft(PARTS[part].gyro, random)
     known: tuple[Point, ...] = ()
     for day in range(DAYS):
         known = kept((*known, *aircraft.seen(aircraft.day(), day)))
@@ -206,7 +206,7 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
     rate_k_s = rate_k_min / 60.0
     on_s = -1.0
     while on_s < 0.0:  # where it stands before the power came, it does not warm
-        aircraft = Aircraft(PARTS[part].gyro, random)
+        aircraft = AgingAircraft(PARTS[part].gyro, random)
         board, bends = aircraft.board, aircraft.piece.curve
         steepest = board.rise_k / board.time_constant_s
         on_s = board.time_constant_s * math.log(steepest / rate_k_s) - SPANS_S[-1] / 2.0

@@ -65,7 +65,7 @@ COMPASSES: Final = {"0.5 deg": (0.5, 0.0), "steps of 0.1": (0.05, 0.1), "steps o
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
+class TurningCase:
     part: str
     learned: bool
     """Profile of the part itself; else that of an unknown part."""
@@ -91,7 +91,7 @@ class Found:
     """Largest error against the bias of the window."""
 
 
-def _profile(case: Case) -> NoiseProfile:
+def _profile(case: TurningCase) -> NoiseProfile:
     if not case.learned:
         return noise_profile(None)
     if case.part == "vn100":
@@ -102,7 +102,7 @@ def _profile(case: Case) -> NoiseProfile:
 class Platform:
     """One stand, its collector, and the result so far."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: TurningCase) -> None:
         self.random = random = np.random.default_rng([case.seed, 31])
         site = site_at(45.0, 10.0, 100.0)
         tilt = random.normal(size=2) * 2.0
@@ -168,7 +168,7 @@ class Platform:
         return sorted(found, key=lambda one: one[0])
 
 
-def run(case: Case) -> Found:
+def run(case: TurningCase) -> Found:
     platform = Platform(case)
     collector, samples = platform.collector, platform.samples()[::-1]
     found: list[tuple[Array, Array]] = []
@@ -193,7 +193,7 @@ def run(case: Case) -> Found:
     return Found(looks, refused, named, float(np.abs(errors / sigmas).max()), float(np.abs(errors).max()) / DEG_H)
 
 
-def cases(rate_deg_s: float, seeds: int, first: int = 0) -> list[Case]:
+def cases(rate_deg_s: float, seeds: int, first: int = 0) -> list[TurningCase]:
     """Cases of one rate, over all parts, profiles, compasses and beginnings in turn."""
     begins: tuple[Begins, ...] = ("at the start", "after rest")
     kinds = [
@@ -203,7 +203,7 @@ def cases(rate_deg_s: float, seeds: int, first: int = 0) -> list[Case]:
         if rate_deg_s == 0.0 or kind[2] != "none" or kind[3] == "after rest"
     ]
     return [
-        Case(part=part, learned=learned, compass=compass, rate_deg_s=rate_deg_s, begins=begin, seed=first + k)
+        TurningCase(part=part, learned=learned, compass=compass, rate_deg_s=rate_deg_s, begins=begin, seed=first + k)
         for k, (part, learned, compass, begin) in enumerate(itertools.islice(itertools.cycle(kinds), seeds))
     ]
 

@@ -49,7 +49,7 @@ VN100: Final = (allan_model(8.9 * DEG_H, 5.0 * DEG_H), allan_model(99.0 * UG, 40
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class WarmupCase:
     """A temperature history, and the knowledge of it."""
 
     thermometer: bool
@@ -72,12 +72,12 @@ class Case:
         return lambda t_s: STEADY_DEGC + rate * t_s
 
 
-def cases() -> tuple[Case, ...]:
-    found: list[Case] = []
+def cases() -> tuple[WarmupCase, ...]:
+    found: list[WarmupCase] = []
     for seen in (False, True):
-        found += [Case(seen, on_s=on_s) for on_s in (ON_S if not seen else ON_S[:1])]
-        found += [Case(seen, ramp_deg_h_s=ramp) for ramp in RAMPS]
-        found += [Case(seen, curve_s=curve_s, late_s=late_s) for curve_s in CURVES_S for late_s in LATE_S]
+        found += [WarmupCase(seen, on_s=on_s) for on_s in (ON_S if not seen else ON_S[:1])]
+        found += [WarmupCase(seen, ramp_deg_h_s=ramp) for ramp in RAMPS]
+        found += [WarmupCase(seen, curve_s=curve_s, late_s=late_s) for curve_s in CURVES_S for late_s in LATE_S]
     return tuple(found)
 
 
@@ -90,7 +90,7 @@ class WarmRun:
     warm_up: Array
 
 
-def warm(part: str, case: Case, seed: int, number: int) -> WarmRun:
+def warm(part: str, case: WarmupCase, seed: int, number: int) -> WarmRun:
     posture, site = POSTURES[number % 3], sites()[number % len(sites())]
     standing = stand(
         part,
@@ -191,7 +191,7 @@ def section(runs: list[WarmRun], each: int) -> Section:
     return Section(f"Warm-up ({each} stands in each case)", lines, claims)
 
 
-def _rows() -> list[tuple[str, list[Case]]]:
+def _rows() -> list[tuple[str, list[WarmupCase]]]:
     """Words and cases of every line, with and without a thermometer."""
     every = cases()
     rows = [

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.aircraft import VirtualAircraft
 from sim.ardupilot.estimator import CoarseEstimator
 from sim.ardupilot.inertial import Calibrations, InertialPath
-from sim.ardupilot.parameters import NEWEST, ParameterStore, Version, default_parameters, since
+from sim.ardupilot.parameters import NEWEST, ArduPilotParameters, Version, default_parameters, since
 from sim.earth import Array
 from sim.firmware.channel import Channel, Stream
 from sim.firmware.double import AutopilotDouble
@@ -35,7 +35,7 @@ class YawSource(Protocol):
         """Select another set of sources, 1 to 3."""
 
 
-class Board(AutopilotDouble):
+class ArduPilotBoard(AutopilotDouble):
     """An autopilot without its servers.
 
     Args:
@@ -145,12 +145,12 @@ class Board(AutopilotDouble):
             for number, chunk in enumerate(chunks):
                 self.answer(channel, mavlink.MAVLink_statustext_message(severity, chunk, text_id, number))
 
-    def _new_store(self, overrides: Mapping[str, float], *, auxiliary: bool) -> ParameterStore:
+    def _new_store(self, overrides: Mapping[str, float], *, auxiliary: bool) -> ArduPilotParameters:
         table = default_parameters(self.version, len(self.imus), auxiliary=auxiliary)
         own = "MAV_SYSID" if since(self.version, "4.7") else "SYSID_THISMAV"
         table[own] = (float(self.system_id), table[own][1])
         table["SCHED_LOOP_RATE"] = (LOOP_RATE_HZ[self.vehicle], table["SCHED_LOOP_RATE"][1])
-        store = ParameterStore(table)
+        store = ArduPilotParameters(table)
         for name, value in overrides.items():
             store.set(name, value)
         return store

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.ardupilot.board import Board
+from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.inertial import AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
 from sim.ardupilot.messages import BUILDERS
 from sim.ardupilot.parameters import Version, since
@@ -29,7 +29,7 @@ _FORCE_ARM: dict[float, Version] = {2989.0: "4.3", 21196.0: "4.6"}
 class CommandServer:
     """Carries out commands; a handler returns the result, or None when the acknowledgement comes later."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: ArduPilotBoard) -> None:
         self._double = double
         self._handlers: dict[int, Callable[[Command], int | None]] = {
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,

@@ -13,11 +13,11 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
-from sim.ardupilot.board import Board
+from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.commands import CommandServer
 from sim.ardupilot.external_nav import ExternalNav
 from sim.ardupilot.messages import BUILDERS, script_floats
-from sim.ardupilot.parameter_server import ParameterServer
+from sim.ardupilot.parameter_server import ArduPilotParameterServer
 from sim.ardupilot.parameters import device_id, offset_names
 from sim.firmware.channel import Channel, Message, Stream, command_of
 from sim.firmware.double import HEARTBEAT
@@ -28,7 +28,7 @@ FLOATS_EVERY_S = 0.09
 FLOATS_ASKED_S = 3.0
 
 
-class ArduPilotDouble(Board):
+class ArduPilotDouble(ArduPilotBoard):
     """An autopilot with up to three IMUs on a virtual aircraft.
 
     It is an `End` (attach, receive) for the companion; `ground` is a second one for a ground station. `run` sends due
@@ -38,14 +38,14 @@ class ArduPilotDouble(Board):
     LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, calibrations of accelerometers and of the level, ODOMETRY,
     SETUP_SIGNING (`require_signatures` stands for it), the 10 s that consistency checks must pass before arming.
 
-    Arguments are those of `Board`.
+    Arguments are those of `ArduPilotBoard`.
     """
 
     def __init__(self, aircraft: VirtualAircraft, imus: Sequence[ImuModel], **more: Any) -> None:
         super().__init__(aircraft, imus, **more)
         self.external_nav: ExternalNav = ExternalNav(self)
         self._router = Router(self.system_id, self.channels)
-        self._parameter_server = ParameterServer(self)
+        self._parameter_server = ArduPilotParameterServer(self)
         self._commands = CommandServer(self)
         self._floats_until_s = 0.0
         self._boot_gyros(0.0)

@@ -12,7 +12,7 @@ from collections import Counter
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.ardupilot.board import Board
+from sim.ardupilot.board import ArduPilotBoard
 
 COMPASS = 1
 EXTNAV = 6
@@ -29,7 +29,7 @@ FUSED_S = 2.0
 class ExternalNav:
     """The chain from message to heading; `restart` at each boot."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: ArduPilotBoard) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
         """Rejected messages by reason."""

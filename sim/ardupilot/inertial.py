@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.ardupilot.parameters import (
-    ParameterStore,
+    ArduPilotParameters,
     caltemp_name,
     device_id,
     gyro_id_name,
@@ -37,7 +37,7 @@ _TCAL_REFERENCE_DEGC = 35.0
 _DAMPING = math.sqrt(0.5)
 
 
-def orientation_matrix(store: ParameterStore) -> Array:
+def orientation_matrix(store: ArduPilotParameters) -> Array:
     """Board to vehicle for AHRS_ORIENTATION, 101 and 102 custom; unknown numbers mean no rotation."""
     number = int(store.effective["AHRS_ORIENTATION"])
     if number in (101, 102):
@@ -51,7 +51,7 @@ def orientation_matrix(store: ParameterStore) -> Array:
 class InertialPath:
     """Output of one IMU of the autopilot. Times are aircraft time and must not go back between `reset`s."""
 
-    def __init__(self, model: ImuModel, instance: int, store: ParameterStore, *, seed: int) -> None:
+    def __init__(self, model: ImuModel, instance: int, store: ArduPilotParameters, *, seed: int) -> None:
         self.model, self.instance = model, instance
         self._store = store
         self._random = np.random.default_rng([seed, 3, instance])
@@ -190,7 +190,7 @@ class Calibrations:
     """Works on the parameters of all IMUs at once. Offsets are in board axes, before scale and orientation."""
 
     paths: list[InertialPath]
-    store: ParameterStore
+    store: ArduPilotParameters
     random: np.random.Generator
     gyros_ok: bool = True
     """The last gyro calibration converged; if not, it does not arm."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.ardupilot.board import Board
+from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.parameters import NEWEST
 from sim.firmware.messages import (
     SCALED_IMU,
@@ -22,10 +22,10 @@ from sim.firmware.messages import (
 from sim.firmware.numbers import truncated_16
 
 Message = mavlink.MAVLink_message
-Builder = Callable[["Board", float], Message]
+Builder = Callable[["ArduPilotBoard", float], Message]
 
 
-def heartbeat(double: Board, loop_s: float) -> Message:
+def heartbeat(double: ArduPilotBoard, loop_s: float) -> Message:
     """HEARTBEAT; a calibration does not show in it, neither on Copter nor on Plane."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     if double.armed:
@@ -35,7 +35,7 @@ def heartbeat(double: Board, loop_s: float) -> Message:
     return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, base, 0, state, 3)
 
 
-def highres_imu(double: Board, loop_s: float) -> Message:
+def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
     """HIGHRES_IMU: floats of the first IMU; the temperature is the barometer's, the magnetic unit is wrong by 10^6."""
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
@@ -47,7 +47,7 @@ def highres_imu(double: Board, loop_s: float) -> Message:
     )  # fmt: skip
 
 
-def _integers(double: Board, index: int, loop_s: float) -> tuple[int, ...]:
+def _integers(double: ArduPilotBoard, index: int, loop_s: float) -> tuple[int, ...]:
     """xacc..zgyro of RAW and SCALED messages (mG, mrad/s), magnetic field in milligauss, temperature in 0.01 degC."""
     t_s = double.aircraft.time_at(loop_s)
     mx, my, mz = (truncated_16(float(value)) for value in magnetic_body(double, t_s))
@@ -57,7 +57,7 @@ def _integers(double: Board, index: int, loop_s: float) -> tuple[int, ...]:
     return (*in_integers(double.imu_output(index, loop_s)), mx, my, mz, temperature)
 
 
-def raw_imu(double: Board, loop_s: float) -> Message:
+def raw_imu(double: ArduPilotBoard, loop_s: float) -> Message:
     """RAW_IMU: not raw at all, equal to SCALED_IMU."""
     ax, ay, az, gx, gy, gz, mx, my, mz, temperature = _integers(double, 0, loop_s)
     return mavlink.MAVLink_raw_imu_message(
@@ -65,26 +65,26 @@ def raw_imu(double: Board, loop_s: float) -> Message:
     )
 
 
-def scaled_imu(double: Board, loop_s: float, index: int) -> Message:
+def scaled_imu(double: ArduPilotBoard, loop_s: float, index: int) -> Message:
     """SCALED_IMU, 2, 3; a missing third IMU reads zero."""
     return SCALED_IMU[index](double.boot_ms(loop_s), *_integers(double, index, loop_s))
 
 
-def attitude(double: Board, loop_s: float) -> Message:
+def attitude(double: ArduPilotBoard, loop_s: float) -> Message:
     """ATTITUDE: the estimator's, in the vehicle frame, that is less AHRS_TRIM."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s)[:3] + double.estimator.omega_i
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
 
 
-def ahrs(double: Board, loop_s: float) -> Message:
+def ahrs(double: ArduPilotBoard, loop_s: float) -> Message:
     """AHRS: omegaI is minus the estimator's gyro bias."""
     double.update_estimator(loop_s)
     x, y, z = map(float, double.estimator.omega_i)
     return mavlink.MAVLink_ahrs_message(x, y, z, 0.0, 0.0, 0.001, 0.002)
 
 
-def ekf_status_report(double: Board, loop_s: float) -> Message:
+def ekf_status_report(double: ArduPilotBoard, loop_s: float) -> Message:
     """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS.
 
     The ratio is of any yaw: a compass', ours, or the one it holds while it stands (seen in the real firmware).
@@ -99,14 +99,14 @@ def ekf_status_report(double: Board, loop_s: float) -> Message:
     return mavlink.MAVLink_ekf_status_report_message(flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0)
 
 
-def vfr_hud(double: Board, loop_s: float) -> Message:
+def vfr_hud(double: ArduPilotBoard, loop_s: float) -> Message:
     """VFR_HUD: on a copter without an airspeed sensor the field has the speed over ground."""
     _, _, yaw = double.estimated_angles_rad(loop_s)
     heading = round(np.degrees(yaw)) % 360
     return mavlink.MAVLink_vfr_hud_message(double.airspeed_m_s, 0.0, heading, 0, double.aircraft.site.height_m, 0.0)
 
 
-def autopilot_version(double: Board, loop_s: float) -> Message:
+def autopilot_version(double: ArduPilotBoard, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -122,7 +122,7 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
     )
 
 
-def script_floats(double: Board, loop_s: float) -> Message:
+def script_floats(double: ArduPilotBoard, loop_s: float) -> Message:
     """DEBUG_FLOAT_ARRAY of companion_arming.lua; one reading where the script averages four."""
     values = [0.0] * 58
     for index, imu in enumerate(double.imus):

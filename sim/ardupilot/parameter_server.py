@@ -6,7 +6,7 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.ardupilot.board import Board
+from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.parameters import since
 from sim.firmware.channel import Channel, Write
 from sim.firmware.faults import names_match
@@ -18,10 +18,10 @@ _CHUNK = 5
 DOES_NOT_EXIST, OUT_OF_RANGE, PERMISSION_DENIED = 1, 2, 3
 
 
-class ParameterServer:
+class ArduPilotParameterServer:
     """Answers PARAM_SET, PARAM_REQUEST_READ and PARAM_REQUEST_LIST for the double."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: ArduPilotBoard) -> None:
         self._double = double
 
     def set(self, channel: Channel, message: mavlink.MAVLink_param_set_message, loop_s: float) -> None:

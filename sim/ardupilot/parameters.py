@@ -68,7 +68,7 @@ def tcal_names(instance: int, kind: Literal["GYR", "ACC"]) -> list[tuple[str, st
     return [(base + x, base + y, base + z) for base in (f"{tcal_name(instance, kind)}{order}_" for order in (1, 2, 3))]
 
 
-class ParameterStore:
+class ArduPilotParameters:
     """Values by name. `values` are the stored ones; `effective` those in use."""
 
     def __init__(self, defaults: dict[str, tuple[float, int]]) -> None:

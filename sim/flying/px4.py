@@ -40,7 +40,7 @@ FORCE_OVER = 25
 """Steps between compared velocities, which are sent in whole cm/s."""
 
 
-class Truth(Station):
+class GroundTruth(Station):
     """Feeds HIL_STATE_QUATERNION of SIH to an aircraft: rates from attitudes, forces from velocities."""
 
     def __init__(self, aircraft: FlyingAircraft, system_id: int) -> None:
@@ -124,7 +124,7 @@ class FlyingPx4(Px4, FlyingVehicle):
     """
 
     model = "sihsim_quadx"
-    backend: Truth
+    backend: GroundTruth
 
     def __init__(
         self, binary: Path, scenario: Scenario, folder: Path, *, wind: tuple[float, float], seed: int = 0
@@ -142,7 +142,7 @@ class FlyingPx4(Px4, FlyingVehicle):
         }
         self.modes = {"hold": AUTO << 16 | LOITER << 24}
         self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
-        self.backend = Truth(self.truth, self.system_id)
+        self.backend = GroundTruth(self.truth, self.system_id)
         self._flags = self.folder / "flags.txt"
         self.sticks_us = []
 

@@ -1,1 +1,1 @@
-"""Parts of the PX4 double; `sim.px4.double.Board` combines them."""
+"""Parts of the PX4 double; `sim.px4.double.PX4Board` combines them."""

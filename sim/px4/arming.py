@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 from sim.px4.calibration import Kind, find_slot
 from sim.px4.port import PX4Port
 
@@ -30,7 +30,7 @@ _BIAS_ALARM = 0.75
 class Checks:
     """The checks before arming."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self._reported: list[str] = []
         self._reported_s = -math.inf
@@ -111,7 +111,7 @@ class Request:
 class ArmAuthorization:
     """State of the authorisation for the checks before arming."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.requests = 0
         """Requests sent since the start, without repetitions."""

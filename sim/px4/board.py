@@ -11,9 +11,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.aircraft import VirtualAircraft
 from sim.firmware.double import AutopilotDouble
 from sim.imu_model import Bias, ImuModel
-from sim.px4.parameters import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, ParameterStore, default_parameters
+from sim.px4.parameters import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, PX4Parameters, default_parameters
 from sim.px4.port import NORMAL_RATES, ONBOARD_RATES, PX4Port
-from sim.px4.vehicle_imu import Sample, VehicleImu
+from sim.px4.vehicle_imu import VehicleImu, VehicleImuSample
 
 Version = Literal["1.18", "1.16"]
 
@@ -28,7 +28,7 @@ class Orders(Protocol):
         """Handle a command that it sent itself."""
 
 
-class Board(AutopilotDouble):
+class PX4Board(AutopilotDouble):
     """An autopilot without its servers.
 
     Args:
@@ -100,7 +100,7 @@ class Board(AutopilotDouble):
         ]
         self.primary_imu = 0
         """Number of the flying IMU, which HIGHRES_IMU shows."""
-        self._frozen: dict[int, Sample] = {}
+        self._frozen: dict[int, VehicleImuSample] = {}
 
     def residual(self, instance: int, loop_s: float) -> Bias:
         """Error left in the output of IMU `instance` (1..) after offsets and scales: output minus truth, FRD."""
@@ -108,7 +108,7 @@ class Board(AutopilotDouble):
         output, truth = self.vehicle_imus[instance - 1].corrected(t_s), self.aircraft.truth_at(t_s)
         return Bias(output[:3] - truth.rate_rad_s, output[3:] - truth.force_m_s2)
 
-    def imu_output(self, index: int, loop_s: float) -> Sample:
+    def imu_output(self, index: int, loop_s: float) -> VehicleImuSample:
         """Newest corrected sample of IMU index 0.. in vehicle FRD."""
         if self.faults.frozen_imu and index in self._frozen:
             return self._frozen[index]
@@ -139,13 +139,13 @@ class Board(AutopilotDouble):
         overrides: Mapping[str, float],
         ids: Sequence[int],
         slots: Sequence[int | None],
-    ) -> ParameterStore:
+    ) -> PX4Parameters:
         for device_id, slot in zip(ids, slots, strict=True):
             if slot is not None:
                 table |= {f"CAL_GYRO{slot}_ID": device_id, f"CAL_ACC{slot}_ID": device_id}
         table["MAV_SYS_ID"] = self.system_id
         table["MAV_TYPE"] = 2 if self.vehicle == "copter" else 1
-        store = ParameterStore(table)
+        store = PX4Parameters(table)
         for name, value in overrides.items():
             store.preset(name, value)
         return store

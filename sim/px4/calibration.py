@@ -14,7 +14,7 @@ import numpy as np
 
 from sim.earth import Array, mounting_matrix
 from sim.firmware.numbers import rotation_matrix
-from sim.px4.parameters import SLOTS, ParameterStore
+from sim.px4.parameters import SLOTS, PX4Parameters
 
 Kind = Literal["GYRO", "ACC"]
 _PRIORITY, _EXTERNAL_PRIORITY = 50, 75
@@ -32,7 +32,7 @@ class SensorCalibration:
         store: the parameters.
     """
 
-    def __init__(self, kind: Kind, device_id: int, store: ParameterStore, *, external: bool = False) -> None:
+    def __init__(self, kind: Kind, device_id: int, store: PX4Parameters, *, external: bool = False) -> None:
         self.kind, self.device_id, self.external = kind, device_id, external
         self._store = store
         self.slot: int | None = None
@@ -122,7 +122,7 @@ class SensorCalibration:
         self.rotation = level @ rotation_matrix(number)
 
 
-def find_slot(store: ParameterStore, kind: Kind, device_id: int) -> int | None:
+def find_slot(store: PX4Parameters, kind: Kind, device_id: int) -> int | None:
     """Return the first slot whose CAL_x_ID is this device's."""
     return next((slot for slot in range(SLOTS) if store[f"CAL_{kind}{slot}_ID"] == device_id), None)
 

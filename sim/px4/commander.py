@@ -13,10 +13,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.channel import Command
 from sim.px4.arming import NOT_AUTHORIZED, ArmAuthorization, Checks
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 from sim.px4.messages import BUILDERS
 from sim.px4.port import HEARTBEAT
-from sim.px4.rivals import Calibrations
+from sim.px4.rivals import CommandedCalibrations
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_ACCEPTED,
@@ -44,9 +44,9 @@ class Commander:
 
     def __init__(
         self,
-        double: Board,
+        double: PX4Board,
         checks: Checks,
-        calibrations: Calibrations,
+        calibrations: CommandedCalibrations,
         authorization: ArmAuthorization,
     ) -> None:
         self._double, self._checks, self._calibrations = double, checks, calibrations

@@ -17,27 +17,27 @@ from sim.aircraft import VirtualAircraft
 from sim.firmware.channel import Channel, Message, command_of
 from sim.imu_model import ImuModel
 from sim.px4.arming import ArmAuthorization, Checks
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 from sim.px4.commander import Commander
 from sim.px4.external_vision import ExternalVision
 from sim.px4.messages import BUILDERS
-from sim.px4.parameter_server import ParameterServer
+from sim.px4.parameter_server import PX4ParameterServer
 from sim.px4.parameters import Consumer
 from sim.px4.port import PX4Port
-from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, Calibrations, LearnedOffsets
+from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, CommandedCalibrations, LearnedOffsets
 from sim.px4.shell import Shell
 
 AUTOSAVE_S, AUTOSAVE_EVERY_S = 0.3, 2.0
 
 
-class PX4Double(Board):
+class PX4Double(PX4Board):
     """An autopilot with up to four IMUs on a virtual aircraft; its port is TELEM2 (MAV_1), `ground` is TELEM1 (MAV_0).
 
     Not modelled: flight, thermal compensation, calibrations but the gyros',
     PREFLIGHT_STORAGE, ODOMETRY, boards that save to flash, the data rate of a port, MAVFTP, missions, logs, events,
     SETUP_SIGNING, the target fields of TIMESYNC.
 
-    Arguments are those of `Board`.
+    Arguments are those of `PX4Board`.
     """
 
     def __init__(
@@ -46,12 +46,12 @@ class PX4Double(Board):
         super().__init__(aircraft, imus, imu_rate_hz=imu_rate_hz, **more)
         self.gyro_rival = BackgroundGyroCalibration(self)
         self.learned_offsets = LearnedOffsets(self)
-        self.calibrations = Calibrations(self)
+        self.calibrations = CommandedCalibrations(self)
         self.authorization = ArmAuthorization(self)
         self.vision = ExternalVision(self)
         self.checks = Checks(self)
         self.commander: Commander = Commander(self, self.checks, self.calibrations, self.authorization)
-        self._parameter_server = ParameterServer(self)
+        self._parameter_server = PX4ParameterServer(self)
         self._voice = Voice(self)
         self.shell = Shell(self)
         self._consumers = (
@@ -262,7 +262,7 @@ class Voice:
     Elsewhere they wait, and are dropped when they are 5 s old.
     """
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
 
     def say(self, severity: int, text: str) -> None:

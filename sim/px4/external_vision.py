@@ -12,7 +12,7 @@ from collections import Counter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.channel import Message
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 
 YAW_BIT = 8
 """Bit of EKF2_EV_CTRL."""
@@ -34,7 +34,7 @@ COMPASS_FADES_S = 10.0
 class ExternalVision:
     """The chain from message to heading; `restart` at each boot."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
         """Rejected messages by reason."""

@@ -17,16 +17,16 @@ from sim.firmware.messages import (
     system_time,
 )
 from sim.firmware.numbers import truncated_16
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 
 Message = mavlink.MAVLink_message
-Builder = Callable[["Board", float], Message | None]
+Builder = Callable[["PX4Board", float], Message | None]
 _PUBLISHED_AFTER_S = 0.0008
 """SCALED_IMU carries the time of publishing, HIGHRES_IMU that of sampling."""
 _HOLD_MODE = 4 << 16 | 3 << 24
 
 
-def heartbeat(double: Board, loop_s: float) -> Message:
+def heartbeat(double: PX4Board, loop_s: float) -> Message:
     """HEARTBEAT: UNINIT while a pre-flight check fails."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     base |= mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
@@ -42,7 +42,7 @@ def heartbeat(double: Board, loop_s: float) -> Message:
     return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_PX4, base, _HOLD_MODE, state, 3)
 
 
-def highres_imu(double: Board, loop_s: float) -> Message:
+def highres_imu(double: PX4Board, loop_s: float) -> Message:
     """HIGHRES_IMU: the primary IMU less the published estimate of its bias; the temperature is the air's."""
     t_s, height_m = double.aircraft.time_at(loop_s), double.aircraft.site.height_m
     sample_s, output = double.imu_output(double.primary_imu, loop_s)
@@ -55,7 +55,7 @@ def highres_imu(double: Board, loop_s: float) -> Message:
     )  # fmt: skip
 
 
-def scaled_imu(double: Board, loop_s: float, index: int) -> Message | None:
+def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
     """SCALED_IMU, 2, 3: corrected, no estimator, truncated to mG and mrad/s; None without that IMU."""
     if index >= len(double.imus):
         return None
@@ -68,19 +68,19 @@ def scaled_imu(double: Board, loop_s: float, index: int) -> Message | None:
     return SCALED_IMU[index](boot_ms, *fields)
 
 
-def attitude(double: Board, loop_s: float) -> Message:
+def attitude(double: PX4Board, loop_s: float) -> Message:
     """ATTITUDE: the estimator's."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s).output[:3] - double.vehicle_imus[0].estimator.gyro_bias_rad_s
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
 
 
-def timesync(double: Board, loop_s: float) -> Message:
+def timesync(double: PX4Board, loop_s: float) -> Message:
     """TIMESYNC: a request of its own."""
     return mavlink.MAVLink_timesync_message(0, double.boot_us(loop_s) * 1000)
 
 
-def home_position(double: Board, loop_s: float) -> Message:
+def home_position(double: PX4Board, loop_s: float) -> Message:
     """HOME_POSITION: its place."""
     site = double.aircraft.site
     return mavlink.MAVLink_home_position_message(
@@ -89,14 +89,14 @@ def home_position(double: Board, loop_s: float) -> Message:
     )  # fmt: skip
 
 
-def extended_sys_state(double: Board, loop_s: float) -> Message:
+def extended_sys_state(double: PX4Board, loop_s: float) -> Message:
     """EXTENDED_SYS_STATE: it never leaves the ground."""
     return mavlink.MAVLink_extended_sys_state_message(
         mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_ON_GROUND
     )
 
 
-def estimator_status(double: Board, loop_s: float) -> Message:
+def estimator_status(double: PX4Board, loop_s: float) -> Message:
     """ESTIMATOR_STATUS: the source of its heading is not in it."""
     flags = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
     flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
@@ -105,7 +105,7 @@ def estimator_status(double: Board, loop_s: float) -> Message:
     )
 
 
-def autopilot_version(double: Board, loop_s: float) -> Message:
+def autopilot_version(double: PX4Board, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT

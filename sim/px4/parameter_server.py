@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.channel import Write
 from sim.firmware.faults import names_match
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 from sim.px4.parameters import INT32, REAL32, bytes_as_float, float_as_int
 from sim.px4.port import PX4Port
 
@@ -24,10 +24,10 @@ MEANINGLESS_INDEX = 14736
 """Index of a PARAM_ERROR that names a parameter: the real one does not set it."""
 
 
-class ParameterServer:
+class PX4ParameterServer:
     """Answers PARAM_SET, PARAM_REQUEST_READ and PARAM_REQUEST_LIST for the double."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self._telling: set[int] = set()
 

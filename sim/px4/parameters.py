@@ -58,7 +58,7 @@ A value that differs from its default by no more is not saved at all.
 """
 
 
-class ParameterStore:
+class PX4Parameters:
     """Values by name. A default that is an `int` makes an INT32, one that is a `float` a REAL32."""
 
     def __init__(self, defaults: Mapping[str, float]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 from sim.px4.calibration import SensorCalibration
 from sim.px4.vehicle_imu import VehicleImu
 
@@ -25,14 +25,14 @@ LINGERS_S = 0.6
 _INFO, _CRITICAL = mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_CRITICAL
 
 
-class Calibrations:
+class CommandedCalibrations:
     """PX4's own gyro calibration on command.
 
     The command is acknowledged at the start; the result is only sent as texts. It does not subtract the Earth's
     rotation, and changes nothing below the threshold of 0.01 rad/s.
     """
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
 
     def gyros(self) -> None:
@@ -97,7 +97,7 @@ ACCEL_WORTH_M_S2, GYRO_WORTH_RAD_S = 0.05, 0.01
 class BackgroundGyroCalibration:
     """IMU_GYRO_CAL_EN: started at boot; while disarmed and still it replaces offsets that are far wrong."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.running = False
         self.commits = 0
@@ -200,7 +200,7 @@ class LearnedOffsets:
     A sensor without a slot gets one in the same way on the ground.
     """
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.commits = 0
         """Number of its writes."""

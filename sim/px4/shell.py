@@ -14,7 +14,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.channel import Channel
-from sim.px4.board import Board
+from sim.px4.board import PX4Board
 
 _BYTES = 70
 _PROMPT = "pxh> "
@@ -28,7 +28,7 @@ STATUS_S = 0.1
 class Shell:
     """Answers on every port; `typed` has the received lines."""
 
-    def __init__(self, double: Board) -> None:
+    def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.typed: list[str] = []
         self._waiting: dict[int, bytearray] = {}

@@ -14,7 +14,7 @@ import numpy as np
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
 from sim.imu_model import ImuModel
 from sim.px4.calibration import SensorCalibration
-from sim.px4.parameters import ParameterStore
+from sim.px4.parameters import PX4Parameters
 
 ACCEL_LIMIT_M_S2, GYRO_LIMIT_RAD_S = 0.4, 0.15
 """EKF2_ABL_LIM and EKF2_GYR_B_LIM."""
@@ -107,7 +107,7 @@ RAW_RATE_HZ = 1000.0
 """Rate of the sensor's own samples; their rounding adds white noise."""
 
 
-class Sample(NamedTuple):
+class VehicleImuSample(NamedTuple):
     """A sample of `vehicle_imu`."""
 
     t_s: float
@@ -124,7 +124,7 @@ class VehicleImu:
         model: ImuModel,
         index: int,
         device_id: int,
-        store: ParameterStore,
+        store: PX4Parameters,
         *,
         external: bool,
         rate_hz: float,
@@ -140,7 +140,7 @@ class VehicleImu:
         self.density = density
         """White noise of the six axes as the firmware sees it, unit * sqrt(s)."""
         self._noise = np.empty((0, 6))
-        self._last: Sample | None = None
+        self._last: VehicleImuSample | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -162,14 +162,15 @@ class VehicleImu:
         """Output without noise (6): rates and specific forces in vehicle FRD."""
         return self.correct(self.model.expected(t_s))
 
-    def sample(self, t_s: float) -> Sample:
+    def sample(self, t_s: float) -> VehicleImuSample:
         """Newest sample at this time; constant within the interval."""
         end_s = math.floor(t_s / self.interval_s + 1e-6) * self.interval_s
         if self._last is None or end_s > self._last.t_s + 1e-9:
             if not len(self._noise):
                 self._noise = self._random.standard_normal((256, 6)) * (self.density / math.sqrt(self.interval_s))
             noise, self._noise = self._noise[-1], self._noise[:-1]
-            self._last = Sample(end_s, self.correct(self.model.expected(end_s - self.interval_s / 2.0) + noise))
+            reading = self.correct(self.model.expected(end_s - self.interval_s / 2.0) + noise)
+            self._last = VehicleImuSample(end_s, reading)
         return self._last
 
     def raw_mean(self, t_s: float, over_s: float) -> Array:

@@ -12,7 +12,7 @@ from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import kept
 from companion.estimation.solution.prior import curve_of
 from companion.estimation.temperature.curve import Curve, PowerUpNodes, fit, settling
-from sim.accuracy.temperature import RATES_K_MIN, SPANS_S, Aircraft, mid_warm_up
+from sim.accuracy.temperature import RATES_K_MIN, SPANS_S, AgingAircraft, mid_warm_up
 from sim.imu_model import DEG_H, PARTS
 
 Array = NDArray[np.float64]
@@ -167,9 +167,11 @@ def test_its_own_tells_of_changes_as_well_as_it_says(part: str, shown: Callable[
     assert np.square(left).mean() < 0.05 * np.square(moved).mean()
 
 
-def learned(part: str, number: int, shown: Callable[[Array, float], Array] | None) -> tuple[Aircraft, Curve | None]:
+def learned(
+    part: str, number: int, shown: Callable[[Array, float], Array] | None
+) -> tuple[AgingAircraft, Curve | None]:
     """An aircraft after ten days, and its curve."""
-    aircraft = Aircraft(PARTS[part].gyro, np.random.default_rng([9, number]), shown)
+    aircraft = AgingAircraft(PARTS[part].gyro, np.random.default_rng([9, number]), shown)
     known = [point for day in range(10) for point in aircraft.seen(aircraft.day(), day)]
     return aircraft, curve_of(kept(known), "gyro", noise_profile(part).gyro)
 

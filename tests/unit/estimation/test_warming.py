@@ -18,7 +18,7 @@ from companion.physics.units import DEG_H
 from companion.protocols.registry import PROTOCOLS
 from sim.accuracy.experiments import SPANS_S
 from sim.accuracy.figures import covered
-from sim.accuracy.warmup import Case, cases, warm
+from sim.accuracy.warmup import WarmupCase, cases, warm
 from tests.support.still_aircraft import imu, imu_sample, noise, settings
 from tests.unit.estimation.test_windows import batches_of, window_of
 
@@ -118,12 +118,12 @@ def test_only_clocks_that_count_from_the_start_by_their_documents_tell_an_age(pr
 @pytest.mark.parametrize(
     "case",
     [
-        Case(False, ramp_deg_h_s=3.0),
-        Case(False, curve_s=300.0, late_s=5.0),
-        Case(True, curve_s=1200.0, late_s=120.0),
+        WarmupCase(False, ramp_deg_h_s=3.0),
+        WarmupCase(False, curve_s=300.0, late_s=5.0),
+        WarmupCase(True, curve_s=1200.0, late_s=120.0),
     ],
 )
-def test_the_next_minute_of_a_part_that_warms_up_is_covered(case: Case) -> None:
+def test_the_next_minute_of_a_part_that_warms_up_is_covered(case: WarmupCase) -> None:
     assert case in cases()
     runs = [warm("adis16405", case, 5, number) for number in range(8)]
     error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
-from sim.flying.px4 import Truth, source_changes
+from sim.flying.px4 import GroundTruth, source_changes
 from sim.flying.vehicle import FlyingAircraft, State
 from sim.flying.verdict import Event, Record, figures, row
 from sim.imu_model import ImuModel
@@ -172,7 +172,7 @@ def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -
     """Attitudes to rates, whole cm/s to forces; a clock that begins again is a boot."""
     aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
     aircraft.begin(100.0)
-    truth, codec = Truth(aircraft, 1), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    truth, codec = GroundTruth(aircraft, 1), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     truth.attach(None)
     for k in range(1000):
         t_s = 0.004 * k

@@ -12,7 +12,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, PARTS, AxisNoise, ImuModel, ImuSpec
 from sim.scenario import demo
-from sim.thermal import Board, Curve
+from sim.thermal import Curve, ThermalBoard
 from tests.support.extent import extent
 
 
@@ -102,7 +102,7 @@ def test_scale_misalignment_and_mounting_in_the_right_frames() -> None:
 
 
 def test_a_piece_follows_its_own_curve_and_the_die_is_as_warm_as_its_thermometer_was_before() -> None:
-    board = Board(rise_k=20.0, time_constant_s=300.0)
+    board = ThermalBoard(rise_k=20.0, time_constant_s=300.0)
     temperature = board.switched_on(5.0)
     assert [temperature(t_s) for t_s in (0.0, 1e6)] == pytest.approx([5.0, 25.0])
     assert board.switched_on(5.0, cold=0.0)(0.0) == pytest.approx(25.0)
