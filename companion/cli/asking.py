@@ -140,11 +140,11 @@ class PageAsking(Asking):
         with contextlib.suppress(asyncio.CancelledError):
             await self._serving
 
-    def say(self, *lines: str) -> None:  # noqa: D102 - as in the base class
+    def say(self, *lines: str) -> None:
         super().say(*lines)
         self._lines += lines
 
-    async def ask(self, question: Question) -> None:  # noqa: D102 - as in the base class
+    async def ask(self, question: Question) -> None:
         shown = ("words", "hint", "now", "choices")
         self._question = {key: getattr(question, key) for key in shown}
         try:

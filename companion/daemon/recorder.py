@@ -275,7 +275,7 @@ class Recorder(Subsystem):
 
     # --- on request
 
-    def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
+    def commands(self) -> Mapping[str, Handler]:
         return {"record": self._answer}
 
     async def _answer(self, request: RecordInputs, _face: str) -> AsyncIterator[Object]:
@@ -348,10 +348,10 @@ class Recorder(Subsystem):
             "lost": self.tape.lost_in_all - recording.lost_before,
         }
 
-    def tasks(self) -> Sequence[Task]:  # noqa: D102
+    def tasks(self) -> Sequence[Task]:
         return [("recorder", self.run)]
 
-    def status(self) -> Object:  # noqa: D102
+    def status(self) -> Object:
         ring, asked = self._ring, self._on_request
         recording: Object = {
             "fault": self.fault,

@@ -157,10 +157,10 @@ class Arming(Subsystem):
             case "armed" if self.armings.seen_disarmed:  # a daemon that starts in flight sees no arming
                 self.armings.add()
 
-    def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
+    def commands(self) -> Mapping[str, Handler]:
         return {"history": self._answer_history}
 
-    def status(self) -> Object:  # noqa: D102
+    def status(self) -> Object:
         setup = self.gate_setup
         return {
             "arming": {
@@ -172,7 +172,7 @@ class Arming(Subsystem):
             "calibration": self._calibration(),
         }
 
-    def tasks(self) -> Sequence[Task]:  # noqa: D102
+    def tasks(self) -> Sequence[Task]:
         setup: list[Task] = [("gate-setup", self.gate_setup.run)]
         if self._core.only_listening is not None:
             return setup

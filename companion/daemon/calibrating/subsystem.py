@@ -74,7 +74,7 @@ class Calibrating(Subsystem):
         parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets, self.on_solved)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
-    def load(self) -> None:  # noqa: D102 - as in the base class
+    def load(self) -> None:
         for part in (self.alignment, self.faces, self.by_hand, self.memory, self.manager):
             part.load()
 
@@ -88,7 +88,7 @@ class Calibrating(Subsystem):
             "temperature": self._temperature,
         }
 
-    def status(self) -> Object:  # noqa: D102
+    def status(self) -> Object:
         manager, running, job, last = self.manager, self.manager.running, self.manager.job, self.manager.last
         still = self._core.collector.status(asyncio.get_running_loop().time())
         words = manager.reason if running is None else running.words

@@ -122,10 +122,10 @@ class Devices(Subsystem):
         """Words: no autopilot has been heard, and why."""
         return ": ".join(filter(None, (f"not heard yet on {self._core.config.mavlink.url}", self.signing.rejecting)))
 
-    def load(self) -> None:  # noqa: D102 - as in the base class
+    def load(self) -> None:
         self.signing.load()
 
-    def status(self) -> Object:  # noqa: D102
+    def status(self) -> Object:
         sources = self._core.collector.status(asyncio.get_running_loop().time()).sources
         counts = {source.name: {"lost": source.lost, "dropped": source.dropped} for source in sources}
         roles = [role for sensor in self.sensors for role in sensor.roles]

@@ -44,7 +44,7 @@ class Heading(Subsystem):
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
         devices.on_pose.add(self.pose.add)
 
-    def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
+    def commands(self) -> Mapping[str, Handler]:
         return {"autopilot-setup": self._answer_setup}
 
     async def _answer_setup(self, _request: AutopilotSetup, _face: str) -> AsyncIterator[Object]:
@@ -89,7 +89,7 @@ class Heading(Subsystem):
             "rivals": [rival.words for rival in await firmware.read_rivals(self._core.parameters)],
         }
 
-    def status(self) -> Object:  # noqa: D102
+    def status(self) -> Object:
         attitude = self.attitude
         return {
             "pose": self.pose.now(),
@@ -104,7 +104,7 @@ class Heading(Subsystem):
         if self.attitude is not None:
             self.attitude.close()
 
-    def tasks(self) -> Sequence[Task]:  # noqa: D102
+    def tasks(self) -> Sequence[Task]:
         if self.attitude is None:
             return []
         return [("attitude", self.attitude.run), ("fallback", self.attitude.fallback.run)]

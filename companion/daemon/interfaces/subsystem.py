@@ -144,7 +144,7 @@ class Interfaces(Subsystem):
             parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro", DEG_H))
             parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel", MG))
 
-    def status(self) -> Object:  # noqa: D102 - as in the base class
+    def status(self) -> Object:
         return {
             "headline": self._headlines.now(),
             "vehicle": self._vehicle(),
@@ -193,7 +193,7 @@ class Interfaces(Subsystem):
                 return
             await asyncio.sleep(POSE_EVERY_S)
 
-    def tasks(self) -> Sequence[Task]:  # noqa: D102
+    def tasks(self) -> Sequence[Task]:
         tasks: list[Task] = [("component", self.component.run)]
         if self.mqtt is not None:
             tasks.append(("mqtt", self.mqtt.run))

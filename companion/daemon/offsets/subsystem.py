@@ -70,14 +70,14 @@ class Offsets(Subsystem):
         self._firmware = FirmwareCalibration(core, self.writer, self.ledger)
         self.recovery = Recovery(core, self.writer, self.ledger, imus, self.owed)
 
-    def load(self) -> None:  # noqa: D102 - as in the base class
+    def load(self) -> None:
         self.owed.load()
         self.ledger.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)
 
-    def status(self) -> Object:  # noqa: D102
+    def status(self) -> Object:
         others = [] if (words := self.companions.warning) is None else [words]
         return {
             "fault": self.ledger.fault,
@@ -91,7 +91,7 @@ class Offsets(Subsystem):
         """List the steps that can be undone on this aircraft, the latest first."""
         return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
 
-    def tasks(self) -> Sequence[Task]:  # noqa: D102
+    def tasks(self) -> Sequence[Task]:
         return [
             ("recovery", self.recovery.run),
             ("reboot-owed", self.owed.run),

@@ -73,7 +73,7 @@ class SpotTask(PoseTask):
         self._core, self._request = core, request
         self.total = self.fit_from = request.total
 
-    def wish(self, state: SessionState) -> Wish | None:  # noqa: D102 - as in the base class
+    def wish(self, state: SessionState) -> Wish | None:
         return wanted_pose(self._request, state.poses) if len(state.poses) < self.total else None
 
     def _counted(self, state: SessionState, now: Window, up: Array, first_sigma_deg: float) -> HeldPose:
@@ -134,7 +134,7 @@ class ZeroTask(SpotTask):
         if core.config.gradienter is not None:
             self.zero_deg = core.config.gradienter.offset_deg
 
-    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         assert self._gradienter is not None
         if now.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
@@ -149,7 +149,7 @@ class ZeroTask(SpotTask):
             pose = HeldPose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
         return pose, objection(self._request, state.poses, pose)
 
-    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         assert self._gradienter is not None
         compass = self._core.config.compass
         magnetic = compass is not None and compass.reference == "magnetic"
@@ -159,7 +159,7 @@ class ZeroTask(SpotTask):
         self._estimated(align(law, mounted, self.stands, ground(local, self._compass)))
         return []
 
-    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:  # noqa: D102
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:
         windows = state.windows
         result, settings, tilt = self.result, self._kept.settings(), windows[0].tilt
         assert settings is not None
@@ -194,11 +194,11 @@ class ZeroTask(SpotTask):
             imus=tuple(imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
         )
 
-    async def keep(self, record: HandRecord) -> None:  # noqa: D102
+    async def keep(self, record: HandRecord) -> None:
         assert isinstance(record, AlignmentRecord)
         await self._kept.keep(record)
 
-    def summary(self) -> str:  # noqa: D102
+    def summary(self) -> str:
         (x_deg, y_deg), sigma_deg = self.result.offset_deg, self.result.offset_sigma_deg.max()
         return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {sigma_deg:.3f}; now: companion calibrate"
 
@@ -212,17 +212,17 @@ class TurnTask(SpotTask):
         super().__init__(core, request)
         self._imus, self._known = imus, known
 
-    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         up = np.array(now.imus[0].accel_m_s2)
         pose = self._counted(state, now, up / np.linalg.norm(up), 0.01)
         return pose, objection(self._request, state.poses, pose)
 
-    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         self._make_stands(state, readable(state.windows, among=self._imus))
         self._estimated(turned(self.stands, ground(local, None)))
         return []
 
-    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> TurnRecord:  # noqa: D102
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> TurnRecord:
         result, degrees = self.result, _temperatures(state.windows[-1])
         if self._request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
             log.warnings.append(
@@ -251,13 +251,13 @@ class TurnTask(SpotTask):
         _, whole = whole_bias(calibration, (0.0, 0.0, 0.0), level, temperature_degc)
         return turn_imu_record(imu, temperature_degc, np.array(whole))
 
-    def changes(self) -> dict[str, list[Change]]:  # noqa: D102
+    def changes(self) -> dict[str, list[Change]]:
         return {
             imu.name: changes_for(self._imus[imu.name].in_force, None, vector(imu.level_bias_m_s2))
             for imu in self.result.imus
         }
 
-    def summary(self) -> str:  # noqa: D102
+    def summary(self) -> str:
         result, board, request = self.result, self.board, self._request
         words = f"level known to {_level_sigma_m_s2(result) / MG:.2f} mg, the spot slopes by {result.slope_deg:.2f} deg"
         if board is not None:
@@ -314,10 +314,10 @@ class SidesTask(PoseTask):
         self._by_imu: dict[str, FacesEstimate] = {}
         self._missing: Wish | None = _FIRST
 
-    def wish(self, state: SessionState) -> Wish | None:  # noqa: D102 - as in the base class
+    def wish(self, state: SessionState) -> Wish | None:
         return self._missing if len(state.poses) < MOST else None
 
-    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         pose = HeldPose(np.array(now.imus[0].accel_m_s2))
         imu = next((imu for imu in now.imus if imu.name in self._by_imu), None)
         if imu is None or self._missing is None:
@@ -327,7 +327,7 @@ class SidesTask(PoseTask):
         again = seen_before(found, up / np.linalg.norm(up), self._imus[imu.name].in_force.orientation)
         return pose, None if again is None else f"it stands as in stand {again + 1}: {self._missing.words}"
 
-    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         before, self._by_imu, self._missing = self._by_imu, {}, None
         for name in readable(state.windows, among=self._imus):
             if (calibration := self._imus[name].calibration) is None:
@@ -347,7 +347,7 @@ class SidesTask(PoseTask):
             for stand in set(found.left_out) - set(before[name].left_out if name in before else ())
         ]
 
-    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> FacesRecord:  # noqa: D102
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> FacesRecord:
         if self._missing is not None:
             self.shortfall = f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
             log.warnings.append(self.shortfall)
@@ -379,7 +379,7 @@ class SidesTask(PoseTask):
             ),
         )
 
-    def changes(self) -> dict[str, list[Change]]:  # noqa: D102
+    def changes(self) -> dict[str, list[Change]]:
         return {
             name: whole_accelerometer(
                 self._imus[name].in_force, vector(found.figures[BIAS]), vector(found.figures[SCALE])
@@ -387,11 +387,11 @@ class SidesTask(PoseTask):
             for name, found in self._by_imu.items()
         }
 
-    async def keep(self, record: HandRecord) -> None:  # noqa: D102
+    async def keep(self, record: HandRecord) -> None:
         assert isinstance(record, FacesRecord)
         await self._kept.keep(record)
 
-    def summary(self) -> str:  # noqa: D102
+    def summary(self) -> str:
         bias_mg = max(float(found.sigma[BIAS].max()) for found in self._by_imu.values()) / MG
         scale = max(float(found.sigma[SCALE].max()) for found in self._by_imu.values())
         end = "written" if self._request.write else "not written (--write does)"

@@ -271,11 +271,11 @@ class GroundWindows(WindowSource):
         """Add an IMU or replace it."""
         self._imus[imu.name] = imu, batches, raw
 
-    def new_stretch(self) -> None:  # noqa: D102 - as in the base class
+    def new_stretch(self) -> None:
         self._stretch.clear()
         self.clear()
 
-    def add(self, slot: int, *, good: bool) -> bool:  # noqa: D102
+    def add(self, slot: int, *, good: bool) -> bool:
         self._next = slot + 1
         return self._stretch.add(slot, good=good)
 
@@ -297,7 +297,7 @@ class GroundWindows(WindowSource):
         flags = self._stretch.flags
         return [slot for slot, good in enumerate(flags, self._next - len(flags)) if good and slot >= first]
 
-    def slots(self, since_s: float | None) -> list[int]:  # noqa: D102
+    def slots(self, since_s: float | None) -> list[int]:
         slots = self.good_slots(since_s)
         # A stretch that has begun may have had up to a fifth rejected since.
         needed = self._least if since_s is not None else 1 if self._stretch.begun else self._min_good
@@ -306,7 +306,7 @@ class GroundWindows(WindowSource):
             raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
         return slots
 
-    def work(self, slots: Sequence[int], since_s: float | None) -> Work:  # noqa: D102
+    def work(self, slots: Sequence[int], since_s: float | None) -> Work:
         imus, sources, raw = zip(*self._imus.values(), strict=True) if self._imus else ((), (), ())
         batches = [[source.batches[slot] for slot in slots] for source in sources]
         # A window since some time shows whether new offsets are in use: raw readings would not.

@@ -130,10 +130,10 @@ class Deck(WindowSource):
         if batches is not None:
             batches.on_second = functools.partial(self.take_imu, imu.name)
 
-    def set_pose(self, kind: str, batches: BatchSource) -> None:  # noqa: D102 - as in the base class
+    def set_pose(self, kind: str, batches: BatchSource) -> None:
         batches.on_second = self.take_heading if kind == "compass" else self.take_tilt
 
-    def forget(self, imu: str | None) -> None:  # noqa: D102
+    def forget(self, imu: str | None) -> None:
         for name, stream in self._streams.items():
             if imu is None or name == imu:
                 stream.clear()
@@ -194,13 +194,13 @@ class Deck(WindowSource):
         first = max(end - MAX_S, begin)
         return range(first, max(end, first))
 
-    def slots(self, since_s: float | None) -> range:  # noqa: D102
+    def slots(self, since_s: float | None) -> range:
         slots, needed = self.common(since_s), MIN_S if since_s is None else MIN_LOOK_S
         if len(slots) < needed:
             raise CalibrationRefusedError(self._at_least(needed))
         return slots
 
-    def work(self, slots: Sequence[int], since_s: float | None = None) -> Work:  # noqa: D102
+    def work(self, slots: Sequence[int], since_s: float | None = None) -> Work:
         streams = self._streams.values()
         estimate = DeckWindow(
             imus=[stream.imu for stream in streams],
@@ -215,14 +215,14 @@ class Deck(WindowSource):
         )
         return Work(slots, since_s, self.generation, estimate.run)
 
-    def accept(self, work: Work, found: Any) -> bool:  # noqa: D102
+    def accept(self, work: Work, found: Any) -> bool:
         if not super().accept(work, found):
             return False
         if work.since_s is None and isinstance(found, tuple) and (tilt := found[0].tilt) is not None:
             self._reference_deg = tilt.x_deg, tilt.y_deg
         return True
 
-    def measurement(self, since_s: float | None) -> Measurement:  # noqa: D102
+    def measurement(self, since_s: float | None) -> Measurement:
         slots = self.slots(since_s)
         estimate = self.estimate_later(slots, since_s)
 
@@ -232,7 +232,7 @@ class Deck(WindowSource):
 
         return Measurement(slots=slots, estimate=window)
 
-    def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:  # noqa: D102
+    def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
         found, seconds = self.known(0, None), self.seconds
         status = functools.partial(msgspec.structs.replace, self.stillness)
         if found is None or seconds < MIN_S:
