@@ -19,7 +19,6 @@ from companion.estimation.request import LONGEST_S, What
 from companion.formats import Object, printable
 
 MAX_SHOWN: Final = 60
-"""The most characters of a value in a refusal."""
 
 
 class Interface(enum.Flag):
@@ -27,7 +26,6 @@ class Interface(enum.Flag):
 
     COMMAND_LINE = enum.auto()
     GROUND = enum.auto()
-    """`companion ground` over MAVLink."""
     MQTT = enum.auto()
     PAGE = enum.auto()
 
@@ -42,30 +40,24 @@ class Field(NamedTuple):
 
     help: str = ""
     by: Interface = _SHELL
-    """The interfaces that may set the field."""
     metavar: str | None = None
     allowed_words: str = ""
     """The allowed values in words, where the type does not tell them."""
     flags: Mapping[str, str] = {}
     """Values that the command line takes as options of their own (--gyros), with their help."""
     positional: bool = False
-    """True: the command line takes a value that is none of `flags` without an option."""
     short: str = ""
     default: Any = None
-    """The value for the command line where none is given."""
     group: str = ""
-    """Options of the same group exclude each other."""
     type: Any = None
 
     @property
     def values(self) -> tuple[Any, ...]:
-        """The allowed values, where they are a few; empty: any value of the type."""
         kinds = (self.type, *typing.get_args(self.type))
         return next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is Literal), ())
 
     @property
     def kind(self) -> type:
-        """The plain type of a value: bool, int, float or str."""
         if self.values:
             return type(self.values[0])
         kind = next((each for each in typing.get_args(self.type) if each is not type(None)), self.type)
@@ -84,18 +76,15 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
 
     help: ClassVar[str] = ""
     by: ClassVar[Interface] = _SHELL
-    """The interfaces that may ask for it."""
     urgent: ClassVar[bool] = False
     """True: the control socket keeps places free for it."""
 
     @classmethod
     def name(cls) -> str:
-        """Return the name of the command."""
         return str(cls.__struct_config__.tag)
 
     @classmethod
     def fields(cls, by: Interface | None = None) -> dict[str, Field]:
-        """Return the fields by name; only those that an interface may set, if one is given."""
         fields = _fields(cls)
         return {name: field for name, field in fields.items() if by is None or by in field.by}
 
@@ -129,7 +118,6 @@ def _fields(kind: type[Command]) -> dict[str, Field]:
 
 
 def shown(value: object) -> str:
-    """A value as JSON, short enough for one line."""
     try:
         text = msgspec.json.encode(value).decode()
     except (OverflowError, RecursionError):
@@ -144,22 +132,16 @@ _Count = Annotated[int, msgspec.Meta(ge=1, le=10**6)]
 
 
 class Status(Command, frozen=True, tag="status"):
-    """The status of the daemon, once."""
-
     help = "what the daemon is doing"
     urgent = True
 
 
 class Monitor(Command, frozen=True, tag="monitor"):
-    """The status of the daemon, until the client goes away."""
-
     help = "watch the daemon until Ctrl-C"
     pose: Annotated[bool, Field("attitude, and records as they end, too", by=Interface.MQTT)] = False
 
 
 class Calibrate(Command, frozen=True, tag="calibrate"):
-    """Measure and write biases."""
-
     help = "calibrate now (the aircraft must be disarmed and still)"
     by = _ALL
     what: Annotated[
@@ -179,18 +161,14 @@ class Calibrate(Command, frozen=True, tag="calibrate"):
 
     @classmethod
     def of(cls, what: What, *, reboot: bool = False) -> Self:
-        """Make the command from what MAVLink says by number."""
         return cls.read({"what": what.name.lower(), "reboot": reboot})
 
     @property
     def biases(self) -> What:
-        """The biases to calibrate."""
         return What[self.what.upper()]
 
 
 class Align(Command, frozen=True, tag="align"):
-    """Measure the gradienter's zero, or the accelerometers; show or forget the alignment."""
-
     help = "measure the gradienter's zero (by turning), how it sits, or the accelerometers"
     by = _SHELL | Interface.PAGE
     action: Annotated[
@@ -219,16 +197,12 @@ class Align(Command, frozen=True, tag="align"):
 
 
 class Cancel(Command, frozen=True, tag="cancel"):
-    """Cancel what runs."""
-
     help = "cancel a running calibration"
     by = _ALL
     urgent = True
 
 
 class Undo(Command, frozen=True, tag="undo"):
-    """Restore the values from before the last write."""
-
     help = "put the autopilot's values from before the last calibration back"
     by = _ALL
     force: Annotated[
@@ -241,14 +215,10 @@ class Undo(Command, frozen=True, tag="undo"):
 
 
 class AutopilotSetup(Command, frozen=True, tag="autopilot-setup"):
-    """The parameters that the autopilot needs."""
-
     help = "what the autopilot needs set: heading, gate, offsets"
 
 
 class History(Command, frozen=True, tag="history"):
-    """The last calibrations, alignments, armings and flights."""
-
     help = "list past calibrations"
     limit: Annotated[
         _Count | None,
@@ -263,8 +233,6 @@ class History(Command, frozen=True, tag="history"):
 
 
 class Temperature(Command, frozen=True, tag="temperature"):
-    """The biases over temperature: show, write or restore."""
-
     help = "how the gyros' biases follow the temperature, as far as seen"
     action: Annotated[
         Literal["write", "undo"] | None,
@@ -283,8 +251,6 @@ class Temperature(Command, frozen=True, tag="temperature"):
 
 
 class RecordInputs(Command, frozen=True, tag="record"):
-    """Record all inputs to a file, or end a recording."""
-
     help = "record everything to a file until Ctrl-C (the last hour is kept anyway)"
     file: Annotated[
         str | None,
@@ -308,9 +274,7 @@ ALL: Final = {
         Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, RecordInputs, Answer
     )
 }  # fmt: skip
-"""The commands by name."""
 
 
 def asked_by(interface: Interface) -> dict[str, type[Command]]:
-    """Return the commands that an interface may ask for."""
     return {name: kind for name, kind in ALL.items() if interface in kind.by}

@@ -37,7 +37,6 @@ Raises:
 
 
 def no_profile(wanted: str, names: Sequence[str] = ()) -> ConfigError:
-    """Make the refusal of a profile that neither the catalogue nor the storage has."""
     near = difflib.get_close_matches(wanted, [*CATALOGUE, *names], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return ConfigError(f"{shown(wanted)}; allowed: {_allowed(names)}{hint}")
@@ -48,7 +47,6 @@ def _none(_directory: Path, wanted: str) -> NoiseProfile:
 
 
 def load(path: Path, saved: Saved = _none) -> Config:
-    """Read and check a configuration file; raise ConfigError in one line as `parse`."""
     text = read(path, "companion setup makes it (or give another with -c FILE)")
     return parse(text, str(path), saved)
 
@@ -96,7 +94,6 @@ def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
 
 
 def _with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
-    """Replace the names of saved profiles by their figures."""
     imus = []
     for index, imu in enumerate(config.imu):
         key = f"{name}: 'imu[{index}].profile': found"

@@ -17,13 +17,11 @@ UPRIGHT_COSINE = 0.5
 LAST_PORT = 65535
 LEAST_RECORDINGS_MB = 8
 MAX_TOPIC_BYTES = 200
-"""Limit of `base_topic`; MQTT itself allows 65535."""
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 _SERIAL = 'only with source = "serial"'
 
 
 def check_together(config: Config, name: str) -> None:
-    """Check the rules; raise ConfigError with the first complaint."""
     for complaint in _complaints(config):
         raise ConfigError(f"{name}: {complaint}")
 
@@ -181,7 +179,6 @@ def bind_problem(bind: str, name: str) -> str | None:
 
 
 def is_address(host: str) -> bool:
-    """Return whether it is an IP address, and no name."""
     try:
         ipaddress.ip_address(host)
     except ValueError:
@@ -224,7 +221,6 @@ def _secret(path: str | None, here: str) -> Iterator[str]:
 
 
 def broker_complaints(mqtt: Mqtt) -> Iterator[str]:
-    """Yield the complaints about [mqtt]."""
     if mqtt.base_topic is not None:
         yield from _topic(mqtt.base_topic)
     if mqtt.password_file is not None and mqtt.username is None:

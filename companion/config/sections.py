@@ -26,7 +26,6 @@ class Senders:
         self._pairs = [_pair(entry) for entry in entries]
 
     def __contains__(self, sender: tuple[int, int]) -> bool:
-        """Return whether the list names a (system, component)."""
         system, component = sender
         return any(system in systems and component in components for systems, components in self._pairs)
 
@@ -84,8 +83,7 @@ def secret_path(name: str) -> Path:
     return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / name
 
 
-class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file; unknown keys are refused."""
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True): ...
 
 
 class VehicleSection(Section, frozen=True):
@@ -100,8 +98,6 @@ class VehicleSection(Section, frozen=True):
 
 
 class Mavlink(Section, frozen=True):
-    """Address of the autopilot, and our own ids and rules on its link."""
-
     url: NonEmpty
     component_id: Annotated[int, Meta(ge=2, le=255)] = 191
     """0 means everybody, and 1 is the autopilot."""
@@ -117,23 +113,18 @@ class Mavlink(Section, frozen=True):
 
     @property
     def signing_key_path(self) -> Path | None:
-        """The key's file."""
         return None if self.signing_key_file is None else secret_path(self.signing_key_file)
 
 
 class AllanModel(msgspec.Struct, frozen=True):
-    """Noise of one axis: rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
+    """Noise of one axis: N, B and K of the Allan deviation, in rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
 
     white: float
-    """N."""
     flicker: float
-    """B; the floor of the Allan deviation is 0.664 B."""
     walk: float
-    """K."""
 
     @property
     def floor(self) -> float:
-        """The floor of the Allan deviation by flicker alone, in the axis' unit."""
         return math.sqrt(2.0 * math.log(2.0) / math.pi) * self.flicker
 
 
@@ -144,17 +135,14 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     gyro: AllanModel
     accel: AllanModel
     origin: str = ""
-    """Words: the recordings that a saved profile was learned from."""
     warm_up: tuple[float, float] | None = None
     """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: not known."""
 
     def of(self, triad: Triad) -> AllanModel:
-        """Return the noise of gyro or accelerometer."""
         return self.gyro if triad == "gyro" else self.accel
 
     @property
     def is_named(self) -> bool:
-        """True: the profile is of a known part."""
         return self.name != UNKNOWN
 
 
@@ -164,21 +152,16 @@ class Imu(Section, frozen=True):
     name: NonEmpty
     source: Literal["autopilot", "serial"]
     instance: Annotated[int, Meta(ge=1, le=3)] | None = None
-    """Number of the autopilot's IMU; None: 1."""
     port: NonEmpty | None = None
     baud: Baud | None = None
     protocol: ImuProtocol | None = None
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
     read_only: bool = False
-    """True: nothing is ever sent to the device on that port."""
     profile: str | NoiseProfile | None = None
-    """One of the catalogue (`Profile`), or a saved one."""
 
 
 class Gradienter(Section, frozen=True):
-    """The two-axis tilt sensor."""
-
     port: NonEmpty
     protocol: GradienterProtocol
     law: Law
@@ -194,8 +177,6 @@ class Gradienter(Section, frozen=True):
 
 
 class Compass(Section, frozen=True):
-    """The magnetic compass."""
-
     port: NonEmpty
     protocol: CompassProtocol
     baud: Baud | None = None
@@ -214,8 +195,6 @@ class Compass(Section, frozen=True):
 
 
 class Calibration(Section, frozen=True):
-    """Duration and target of a calibration, and what happens at arming."""
-
     min_still_s: Annotated[float, Meta(ge=2, le=600)] = 10.0
     max_s: Annotated[float, Meta(ge=2, le=3600)] = 60.0
     target_gyro_sigma_deg_h: PositiveFloat = 5.0
@@ -232,8 +211,6 @@ class Calibration(Section, frozen=True):
 
 
 class Push(Section, frozen=True):
-    """Data sent to the autopilot."""
-
     parameters: bool = True
     attitude: Literal["off", "yaw", "full"] = "off"
     attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
@@ -242,15 +219,11 @@ class Push(Section, frozen=True):
 
 
 class ComponentSection(Section, frozen=True):
-    """Our MAVLink component."""
-
     tunes: bool = True
     """True: use the autopilot's buzzer while it is disarmed."""
 
 
 class Mqtt(Section, frozen=True):
-    """A broker; without the section there is no MQTT."""
-
     host: NonEmpty
     port: Annotated[int, Meta(ge=1, le=65535)] | None = None
     base_topic: NonEmpty | None = None
@@ -261,19 +234,16 @@ class Mqtt(Section, frozen=True):
     password_file: NonEmpty | None = None
     tls: bool = False
     ca_file: NonEmpty | None = None
-    """Authority that signed the broker's certificate; None: the system's authorities."""
     cert_file: NonEmpty | None = None
     key_file: NonEmpty | None = None
     keepalive_s: Annotated[int, Meta(ge=5, le=600)] = 15
 
     @property
     def broker_port(self) -> int:
-        """The configured port, else MQTT's own."""
         return self.port or (8883 if self.tls else 1883)
 
     @property
     def password_path(self) -> Path | None:
-        """The password's file."""
         return None if self.password_file is None else secret_path(self.password_file)
 
 
@@ -281,17 +251,12 @@ class Fleet(Section, frozen=True):
     """Items for a fleet's collector, kept and sent over `mqtt`; without the section there are none."""
 
     name: NonEmpty | None = None
-    """Name of the aircraft."""
     location: Location = "off"
-    """Precision of the place in the items."""
 
 
 class Control(Section, frozen=True):
-    """The socket on which `companion status`, `calibrate`, ... find the daemon, and who may use it."""
-
     socket: NonEmpty | None = None
     group: NonEmpty | None = None
-    """Group whose members may use it, besides the daemon's own user and root."""
 
     @property
     def group_name(self) -> str | None:
@@ -307,8 +272,6 @@ class Control(Section, frozen=True):
 
 
 class Storage(Section, frozen=True):
-    """Folder of records and of the values for undo."""
-
     directory: NonEmpty | None = None
     recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
     """Size of the ring of recordings; 0: no ring; None: a modest ring, if mcap is installed."""
@@ -322,20 +285,14 @@ class Storage(Section, frozen=True):
 
 
 class Log(Section, frozen=True):
-    """Level of the log on stderr, which under systemd is the journal."""
-
     level: LogLevel = "info"
 
 
 class Web(Section, frozen=True):
-    """The page; without the section there is none."""
-
     bind: NonEmpty
 
 
 class Config(Section, frozen=True):
-    """The whole file."""
-
     mavlink: Mavlink
     imu: Annotated[list[Imu], Meta(min_length=1)]
     vehicle: VehicleSection = VehicleSection()

@@ -51,13 +51,11 @@ _briefly.maxstring = _briefly.maxother = _briefly.maxlong = 80
 
 
 def refusal_of_key(path: str) -> str | None:
-    """Give the refusal of a removed configuration key or section such as `imu[0].port`, or None."""
     remedy = KEYS.get(re.sub(r"\[\d+\]", "", path))
     return None if remedy is None else f"{path} was removed in {remedy}; see CHANGELOG"
 
 
 def refusal_of_words(command: str, word: str) -> str | None:
-    """Give the refusal of a removed command or option behind a command such as `companion flight`, or None."""
     remedy = COMMAND_LINE.get(f"{command} {word}")
     return None if remedy is None else f"{word} was removed in {remedy}"
 
@@ -104,12 +102,10 @@ def _refuse_unusable(value: object, here: str, name: str) -> None:
 
 
 def shown(value: object) -> str:
-    """Format a value as in the file; a long one is abbreviated."""
     return {True: "true", False: "false"}[value] if isinstance(value, bool) else _briefly.repr(value)
 
 
 def brief(words: str) -> str:
-    """Cut a long text."""
     return words if len(words) <= _LONGEST else f"{words[:_LONGEST]}..."
 
 

@@ -45,13 +45,10 @@ IMU_RATE_HZ: Final = 100.0
 LEAST_IMU_RATE_HZ: Final = 10.0
 LINE_SHARE: Final = 0.5
 BITS_PER_BYTE: Final = 10.0
-"""Bits on the wire for one byte (8N1): a start bit, eight bits of data, a stop bit."""
+# Lengths in MAVLink 2 of HIGHRES_IMU, VISION_POSITION_ESTIMATE and SCALED_IMU2: 63, 117 and 24 bytes, and 12 around.
 HIGHRES_BYTES: Final = 75.0
-"""Length of HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
 VISION_BYTES: Final = 129.0
-"""Length of VISION_POSITION_ESTIMATE: 117 bytes and 12."""
 SCALED_BYTES: Final = 36.0
-"""Length of SCALED_IMU2 and SCALED_IMU3: 24 bytes and 12."""
 
 TILT_SIGMA_DEG: Final = 0.05
 """Sigma of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
@@ -62,7 +59,6 @@ HEADING_SIGMA_DEG: Final = 3.0
 
 
 def settings(config: Config) -> Settings:
-    """Return duration and target of a calibration in the estimator's units."""
     wanted = config.calibration
     return Settings(
         min_still_s=wanted.min_still_s,
@@ -73,7 +69,6 @@ def settings(config: Config) -> Settings:
 
 
 def baud_of(url: str) -> int | None:
-    """Return the speed of a MAVLink url; None where it is no serial line."""
     return int(url.rpartition(":")[2]) if url.startswith("serial:") else None
 
 
@@ -104,7 +99,6 @@ def cannot_work(config: Config) -> list[str]:
 
 
 def doubtful(config: Config) -> list[str]:
-    """List the settings that are followed, but probably not meant."""
     found, gradienter = [], config.gradienter
     if config.mavlink.signing_mode == "off" and config.mavlink.signing_key_file is not None:
         found.append('mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked')
@@ -117,7 +111,6 @@ def doubtful(config: Config) -> list[str]:
 
 
 def imu_input(imu: Imu, kind: ImuMessage | None) -> ImuInput:
-    """Describe an IMU to the collector; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already."""
     return ImuInput(
         name=imu.name,
         rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),
@@ -129,14 +122,12 @@ def imu_input(imu: Imu, kind: ImuMessage | None) -> ImuInput:
 
 
 def collector(config: Config) -> RollingCollector:
-    """Make the collector, before anything is known of the autopilot's IMUs."""
     wanted, pose = settings(config), (gradienter_model(config.gradienter), compass_model(config.compass))
     windows = Deck(*pose, wanted.horizon_s) if config.vehicle.platform == "deck" else None
     return RollingCollector(wanted, [imu_input(imu, None) for imu in config.imu], *pose, windows)
 
 
 def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
-    """Make the model that turns the gradienter's readings into the direction of up."""
     if gradienter is None:
         return None
     info = PROTOCOLS["gradienter"][gradienter.protocol]
@@ -150,14 +141,12 @@ def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
 
 
 def tilt_sigma_deg(protocol: GradienterProtocol) -> float:
-    """Return the sigma of the tilt of a device with this protocol, unless configured."""
     known = PROTOCOLS["gradienter"][protocol].sigma_deg
     by_the_way = protocol in PROTOCOLS["compass"] or protocol in PROTOCOLS["imu"]
     return known or (TILT_BY_THE_WAY_SIGMA_DEG if by_the_way else TILT_SIGMA_DEG)
 
 
 def compass_model(compass: Compass | None) -> CompassModel | None:
-    """Make the model that turns the compass' readings into a true heading."""
     if compass is None:
         return None
     info = PROTOCOLS["compass"][compass.protocol]
@@ -175,7 +164,6 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
 
 
 def longest_window_s(config: Config) -> float:
-    """Return the longest window of a calibration."""
     return config.calibration.max_s if config.vehicle.platform == "ground" else KEPT_S
 
 
@@ -217,12 +205,9 @@ def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> Gradie
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Role:
-    """One use of a device."""
-
     name: str
     kind: Kind
     north: Literal["magnetic", "true"] | None = None
-    """The north that a compass' headings are configured to mean."""
 
     def refuses(self, sample: Sample) -> bool:
         """Return whether the device itself calls this a heading to another north than the configured one."""
@@ -242,12 +227,10 @@ class SerialDevice:
 
     @property
     def settings(self) -> PortSettings:
-        """Port and line."""
         return PortSettings(self.port, self.baud, self.parity)
 
     @property
     def line(self) -> Line:
-        """Setting of the line."""
         return Line(self.baud, self.parity)
 
     @property
@@ -257,12 +240,10 @@ class SerialDevice:
 
     @property
     def kind(self) -> Kind:
-        """Kind of its first role."""
         return self.roles[0].kind
 
 
 def serial_devices(config: Config) -> list[SerialDevice]:
-    """List the devices, in the order of their first roles: IMUs as configured, gradienter, compass."""
     shared: dict[str, list[tuple[Role, Imu | Gradienter | Compass]]] = {}
     for role, section in _sections(config):
         shared.setdefault(section.port or "", []).append((role, section))
@@ -294,7 +275,6 @@ def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) 
 
 
 def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Sample]]:
-    """Yield the part of a sample for each role."""
     for role in roles:
         if (part := part_for(role.kind, sample)) is not None and not role.refuses(sample):
             yield role, part
@@ -339,15 +319,12 @@ class Profiles:
         return self.of(name) != before
 
     def of(self, name: str) -> str | NoiseProfile | None:
-        """Return the profile of an IMU; None: nobody has named its part."""
         return self._imus[name].profile or self._parts.get(name)
 
     def imu(self, name: str) -> Imu:
-        """Return the configuration of an IMU with its profile."""
         return msgspec.structs.replace(self._imus[name], profile=self.of(name))
 
     def status(self) -> list[dict[str, object]]:
-        """Describe each IMU's profile for `companion status`."""
         found: list[dict[str, object]] = []
         for name, imu in self._imus.items():
             profile, file = self.of(name), None

@@ -13,7 +13,7 @@ import logging
 import math
 import secrets
 import socket
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,12 +22,12 @@ import msgspec
 from companion.config import converted, read
 from companion.config.rules import broker_complaints
 from companion.config.sections import Mqtt
-from companion.errors import CompanionError, ConfigError, LinkError
+from companion.errors import ConfigError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
 from companion.fleet.store import BatchResult, Store
 from companion.links.system.connection import Reconnection
-from companion.mqtt.broker import explain, is_of_protocol, read_password, tls_context
-from companion.mqtt.client import FIRST_WAIT_S, LONGEST_WAIT_S, MQTT_3_1_1, MQTT_5, WORTH_S, Incoming, make_client
+from companion.mqtt.broker import MQTT_3_1_1, Broker, subscribe
+from companion.mqtt.client import FIRST_WAIT_S, LONGEST_WAIT_S, WORTH_S, Incoming
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -42,14 +42,10 @@ WAITING: Final = 20 * BATCH
 """Most messages that wait to be written; more are dropped, and sent again by their aircraft."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
 BATCH_BYTES: Final = 4 * 1024 * 1024
-"""Most bytes of a batch; a database makes several copies of it."""
 AT_ONCE: Final = 50
-"""Answers sent concurrently; the time that aiomqtt takes for each grows with their number."""
 SWEEP_S: Final = 5.0
-"""Time to receive the retained hellos, which shared subscriptions do not deliver."""
 JUDGE_S: Final = 2.0
 REST: Final = 4.0
-"""Pause after a judgement, as a multiple of its duration: collecting goes first."""
 ANSWER_S: Final = 10.0
 STOP_AGAIN_S: Final = 0.5
 _HELLO: Final = "fleet/+/hello"
@@ -73,19 +69,6 @@ def load_broker(path: Path) -> Mqtt:
     return mqtt
 
 
-@contextlib.asynccontextmanager
-async def connected(client: aiomqtt.Client) -> AsyncIterator[aiomqtt.Client]:
-    """Connect; errors of the disconnection do not replace a cancellation."""
-    import aiomqtt
-
-    await client.__aenter__()
-    try:
-        yield client
-    finally:
-        with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):
-            await client.__aexit__(None, None, None)
-
-
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
     """Cancel tasks until they have ended; return their exceptions.
 
@@ -103,12 +86,12 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
 class BoundedMessages(asyncio.Queue[Any]):
     """Queue of messages that is bounded in bytes, too: one message may have 256 KiB."""
 
-    most_bytes = WAITING_BYTES
-    _bytes = 0
+    def __init__(self, maxsize: int = WAITING, most_bytes: int = WAITING_BYTES) -> None:
+        super().__init__(maxsize)
+        self._bytes, self._most_bytes = 0, most_bytes
 
     def full(self) -> bool:
-        """Tell whether there is no room for another message."""
-        return super().full() or self._bytes >= self.most_bytes
+        return super().full() or self._bytes >= self._most_bytes
 
     def _put(self, item: Any) -> None:
         super()._put(item)
@@ -120,25 +103,12 @@ class BoundedMessages(asyncio.Queue[Any]):
         return item
 
 
-class Inbox(BoundedMessages):
-    """Queue of the messages of the next batch."""
-
-    most_bytes = BATCH_BYTES
-
-
 class Collector:
-    """Collector at one broker, beside any number of others; `run` it as a task."""
-
     def __init__(self, settings: Mqtt, store: Store) -> None:
-        self.settings, self.store = settings, store
-        self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
-        self._protocol: int = MQTT_5
+        self.store = store
+        client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
+        self._broker = Broker(settings, client_id)
         self._reconnection = Reconnection("fleet", worth_s=WORTH_S, first_s=FIRST_WAIT_S, cap_s=LONGEST_WAIT_S)
-
-    @property
-    def where(self) -> str:
-        """Address of the broker."""
-        return f"{self.settings.host}:{self.settings.broker_port}"
 
     async def run(self) -> None:
         """Collect until cancelled.
@@ -149,45 +119,17 @@ class Collector:
         await self._reconnection.keep(self._once)
 
     async def _once(self) -> str:
-        import aiomqtt
-
-        await asyncio.to_thread(self.store.prepare)
-        reached = False
+        options = {"timeout": ANSWER_S, "max_queued_incoming_messages": WAITING, "queue_type": BoundedMessages}
         try:
-            password = await asyncio.to_thread(read_password, self.settings)
-            async with connected(self._client(password)) as client:
-                reached = True
+            await asyncio.to_thread(self.store.prepare)
+            async with self._broker.connected(2 * MOST_BYTES, **options) as client:
                 await self._serve(client)
-        except LinkError as error:
-            return str(error)
-        except CompanionError:
-            raise
-        except (aiomqtt.MqttError, OSError, TimeoutError) as error:
-            if not reached and self._protocol == MQTT_5 and is_of_protocol(error):
-                # A broker without MQTT 5 refuses it, closes the connection, or does not answer.
-                self._protocol = MQTT_3_1_1
-                return f"{self.where}: no MQTT 5 there, so one collector only; going on with MQTT 3.1.1"
-            self._protocol = MQTT_5
-            return f"{self.where}: {explain(error, self.settings, self.client_id, reached=reached)}"
         finally:
             self.store.close()
-        return f"{self.where}: the connection has ended"
-
-    def _client(self, password: str | None) -> aiomqtt.Client:
-        return make_client(
-            self.settings,
-            self._protocol,
-            2 * MOST_BYTES,
-            password=password,
-            identifier=self.client_id,
-            timeout=ANSWER_S,
-            tls_context=tls_context(self.settings),
-            max_queued_incoming_messages=WAITING,
-            queue_type=BoundedMessages,
-        )
+        return f"{self._broker.where}: the connection has ended"
 
     async def _serve(self, client: aiomqtt.Client) -> None:
-        items, hellos = Inbox(BATCH), Inbox(BATCH)
+        items, hellos = BoundedMessages(BATCH, BATCH_BYTES), BoundedMessages(BATCH, BATCH_BYTES)
         tasks = [
             asyncio.create_task(self._receive(client, items, hellos), name="fleet listener"),
             asyncio.create_task(self._collect(client, items, 1), name="fleet writer"),
@@ -204,23 +146,18 @@ class Collector:
                 raise end
 
     async def _subscribe(self, client: aiomqtt.Client) -> None:
-        alone = self._protocol == MQTT_3_1_1
+        alone = self._broker.protocol == MQTT_3_1_1
         shared = "" if alone else _SHARED
-        for topic in (shared + _ITEM, shared + _HELLO):
-            await self._subscribe_to(client, topic)
+        for topic in (_ITEM, _HELLO):
+            await subscribe(client, shared + topic, qos=1)
         words = "MQTT 3.1.1: no other collector beside this one" if alone else "MQTT 5"
-        self._reconnection.up(f"{self.where} ({words}) into {self.store.where}")
+        self._reconnection.up(f"{self._broker.where} ({words}) into {self.store.where}")
         if not alone:
             # Shared subscriptions do not deliver retained hellos.
-            await self._subscribe_to(client, _HELLO, qos=0)
+            await subscribe(client, _HELLO, qos=0)
             await asyncio.sleep(SWEEP_S)
             await client.unsubscribe(_HELLO)
         await asyncio.get_running_loop().create_future()
-
-    async def _subscribe_to(self, client: aiomqtt.Client, topic: str, qos: int = 1) -> None:
-        granted = await client.subscribe(topic, qos=qos)
-        if any(getattr(code, "value", code) >= 128 for code in granted):
-            raise LinkError(f"{self.where}: the broker does not let us hear {topic} (its access list?)")
 
     async def _receive(
         self, client: aiomqtt.Client, items: asyncio.Queue[Incoming], hellos: asyncio.Queue[Incoming]

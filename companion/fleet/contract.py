@@ -18,12 +18,9 @@ from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.estimation.records.flight_record import KeptFlight
 from companion.fleet import schema
 from companion.fleet.acl import AIRCRAFT_ID
+from companion.mqtt.fleet import FORMAT_VERSION, MOST_RANGES, MOST_SEQUENCE
 from companion.samples import TRIADS
 
-FORMAT_VERSION: Final = 1
-MOST_RANGES: Final = 256
-"""Most ranges of sequences in one message to an aircraft."""
-MOST_SEQUENCE: Final = 2**53
 MOST_BYTES: Final = 256 * 1024
 _AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
@@ -46,13 +43,10 @@ Row = dict[str, Any]
 Rows = dict[str, list[Row]]
 
 
-class NotTakenError(Exception):
-    """A payload breaks the contract; the message is one line with the reason."""
+class NotTakenError(Exception): ...
 
 
 class Hello(msgspec.Struct, frozen=True):
-    """Range of the items that an aircraft keeps."""
-
     format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]
     aircraft: _Aircraft
     epoch: _Epoch
@@ -76,12 +70,10 @@ class ReceivedItem(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> Row:
-        """Columns of the primary key."""
         return {name: getattr(self, name) for name in _KEY}
 
 
 def _row(table: sa.Table, told: _Object) -> Row:
-    """Make a row of values by the names of its columns, without the item's key."""
     return {name: _fitting(column, told.get(name)) for name, column in table.c.items() if name not in _KEY}
 
 
@@ -110,8 +102,7 @@ def _fitting(column: sa.Column[Any], value: object) -> Any:
     raise NotTakenError(f"{column.name}: found {str(value)[:40]}; allowed: {allowed}")
 
 
-def _calibration(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Object)
+def _calibration(told: _Object) -> Rows:
     if told.get("state") not in _STATES:
         raise NotTakenError(f"state: found {str(told.get('state'))[:40]}; allowed: {', '.join(_STATES)}")
     biases: list[Row] = []
@@ -147,27 +138,24 @@ def _calibration(body: bytes) -> Rows:
     return {"calibrations": [_row(schema.calibrations, found)], "biases": biases}
 
 
-def _arming(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Object)
+def _arming(told: _Object) -> Rows:
     return {"armings": [_row(schema.armings, told | {"calibration_at": told.get("calibration")})]}
 
 
-def _undo(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Object)
+def _undo(told: _Object) -> Rows:
     return {"undos": [_row(schema.undos, told | {"of_at": told.get("of")})]}
 
 
-def _alignment(body: bytes) -> Rows:
-    return {"alignments": [_row(schema.alignments, msgspec.json.decode(body, type=_Object))]}
+def _alignment(told: _Object) -> Rows:
+    return {"alignments": [_row(schema.alignments, told)]}
 
 
-def _event(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Object)
-    return {"events": [_row(schema.events, {"what": told.get("what"), "body": body.decode()})]}
+def _event(told: _Object) -> Rows:
+    return {"events": [_row(schema.events, {"what": told.get("what"), "body": msgspec.json.encode(told).decode()})]}
 
 
-def _flight(body: bytes) -> Rows:
-    flight = msgspec.json.decode(body, type=KeptFlight).flight
+def _flight(told: _Object) -> Rows:
+    flight = msgspec.convert(told, KeptFlight).flight
     rows: list[Row] = []
     for imu in flight.imus:
         flown = min(imu.drift.get("flown", ()), key=lambda each: abs(each.seconds - 30.0), default=None)
@@ -191,19 +179,14 @@ def _flight(body: bytes) -> Rows:
     return {"flights": rows}
 
 
-def _kept_raw(body: bytes) -> Rows:
-    msgspec.json.decode(body, type=_Object)
-    return {}
-
-
-KINDS: Final[dict[str, Callable[[bytes], Rows]]] = {
+KINDS: Final[dict[str, Callable[[_Object], Rows]]] = {
     "calibration": _calibration,
     "arming": _arming,
     "undo": _undo,
     "alignment": _alignment,
     "event": _event,
-    "profile": _kept_raw,
-    "curve": _kept_raw,
+    "profile": lambda _: {},
+    "curve": lambda _: {},
     "flight": _flight,
 }
 """Parsers of the bodies by kind; items of other kinds are kept until a newer companion knows them."""
@@ -226,26 +209,15 @@ def moment(words: str) -> datetime.datetime:
 
 
 def addressed(topic: str) -> tuple[str, str] | None:
-    """Give the aircraft of a topic and "hello" or "item"; None: it is another topic."""
     match = _AIRCRAFT.fullmatch(topic)
     return None if match is None else (match[1], match[2])
 
 
 def read_hello(aircraft: str, payload: bytes) -> Hello:
-    """Parse a hello on that aircraft's topic.
-
-    Raises:
-        NotTakenError: it is none, names another aircraft, or has a newer format.
-    """
     return _decode(aircraft, payload, Hello)
 
 
 def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
-    """Parse the key of an item on that aircraft's topic, of any format.
-
-    Raises:
-        NotTakenError: it has none, or names another aircraft.
-    """
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
     return _decode(aircraft, payload, ReceivedItem)
@@ -264,17 +236,17 @@ def rows_of(item: ReceivedItem) -> tuple[Row, Rows]:
         columns: Row = {"kind": kind[:64], "at": moment(at), "clock": clock[:16], "same": None}
         if kind not in KINDS:
             return {**columns, "state": "unknown"}, {}
-        rows = KINDS[kind](bytes(item.body))
+        body = msgspec.json.decode(item.body, type=_Object)
+        rows = KINDS[kind](body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise NotTakenError(f"{str(item.kind)[:64]}: {error}") from None
     for row in rows.get("events", ()):
         row["at"] = columns["at"]
-    columns["same"] = _same(item, rows)
+    columns["same"] = _same(item, rows, body)
     return {**columns, "state": "taken"}, {table: [{**item.key, **row} for row in of] for table, of in rows.items()}
 
 
 def ranges(sequences: Iterable[int]) -> list[list[int]]:
-    """Combine numbers in any order into ranges from first to last, both included."""
     found: list[list[int]] = []
     for sequence in sorted(set(sequences)):
         if found and found[-1][1] == sequence - 1:
@@ -285,7 +257,6 @@ def ranges(sequences: Iterable[int]) -> list[list[int]]:
 
 
 def answers(epoch: str, found: list[list[int]]) -> list[bytes]:
-    """Encode ranges as payloads of `confirmed` or `wanted`."""
     return [
         msgspec.json.encode(
             {"format_version": FORMAT_VERSION, "epoch": epoch, "sequences": found[start : start + MOST_RANGES]}
@@ -304,10 +275,8 @@ def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
     return told
 
 
-def _same(item: ReceivedItem, rows: Rows) -> str:
+def _same(item: ReceivedItem, rows: Rows, body: _Object) -> str:
     """Hash everything that stays the same when an item is sent again under another epoch, so not `undone_at`."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
-    if not rows:
-        content = msgspec.json.decode(item.body)
-    told_again = msgspec.json.encode((item.kind, item.at, content), order="deterministic")
+    told_again = msgspec.json.encode((item.kind, item.at, content if rows else body), order="deterministic")
     return hashlib.sha256(told_again).hexdigest()[:32]

@@ -38,58 +38,52 @@ _FEW_TELL: Final = 1.2
 _LEAST_NOISE: Final = 0.08
 """Least scatter of the logarithm of a noise that is measured over some ten seconds."""
 _BOUND_DEG: Final = 5.0
-_DRIFT_AFTER: Final = 8
-"""Power-ups until an alarm; a level that takes longer has drifted."""
-SHOWN: Final = 30
-"""Power-ups for which a level that has moved is shown."""
+_DRIFT_AFTER_POWER_UPS: Final = 8
+SHOWN_POWER_UPS: Final = 30
 _AXES: Final = [f"{triad} {axis}" for triad in ("gyro", "accel") for axis in "xyz"]
-ZERO_SIGMAS: Final = 8.0
-"""Least move of a zero in a finding, in sigmas."""
+LEAST_ZERO_SIGMAS: Final = 8.0
 ZERO_USUAL_DEG: Final = 0.05
 """One sigma between two alignments of a good gradienter, from the air's temperature."""
 MOST_CALIBRATIONS: Final = 2000
 """Most calibrations of an aircraft, the latest ones: five years of one a day."""
-SAME_POWER_UP: Final = datetime.timedelta(minutes=30)
-"""Most time between two calibrations that agree and count as one power-up."""
+SAME_POWER_UP_WITHIN: Final = datetime.timedelta(minutes=30)
 MOST_DEGC: Final = 150.0
 """Limit of a believable temperature, to catch kelvins that were not turned into degrees."""
 _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
-_TOGETHER: Final = 10
-"""Most power-ups between moves of accelerometers that count as one move of the gradienter."""
+_TOGETHER_WITHIN_POWER_UPS: Final = 10
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
-"""Least sizes of findings, by kind, for the word "replace"."""
 
 
 class PartHistory(NamedTuple):
-    """One IMU over its power-ups, in their order; NaN: not known."""
+    """One IMU over its n power-ups, in their order; NaN: not known.
+
+    Arrays are (n,), or (n, 6) for gyro x y z in rad/s and accelerometer x y z in m/s^2. `biases` are by the readings
+    alone, `white` is in their units times sqrt(s), and `new_zero` tells whether the gradienter's zero differs from the
+    power-up before.
+    """
 
     at: Sequence[datetime.datetime]
     temperature_degc: Floats
-    """(n,)"""
     biases: Floats
-    """(n, 6) gyro rad/s, accelerometer m/s^2, by the readings alone."""
     sigma_use: Floats
-    """(n, 6) sigma of the biases, same units."""
     white: Floats
-    """(n, 6) white noise, same units times sqrt(s)."""
     new_zero: NDArray[np.bool_]
-    """(n,) whether the gradienter's zero differs from the power-up before."""
 
 
 class PartFinding(NamedTuple):
-    """Complaint about a sensor."""
+    """Complaint about a sensor: bias, drift, scatter, noise, zero or compass.
+
+    `axis` is 0 to 5, or -1 for none; `since` is the index of a power-up; `size` is a multiple of what is usual; `moved`
+    is the move of a level, rad/s or m/s^2.
+    """
 
     kind: str
-    """bias, drift, scatter, noise, zero, compass."""
     axis: int
-    """0 to 5; -1: none."""
     since: int
     size: float
-    """Multiple of what is usual."""
     words: str
     moved: float = 0.0
-    """Move of a level, rad/s or m/s^2."""
 
 
 def columns_of(history: PartHistory, model: Floats | None) -> Columns:
@@ -136,7 +130,6 @@ def counts(alarm: Alarm) -> bool:
 
 
 def judge(history: PartHistory, model: Floats | None) -> list[PartFinding]:
-    """List the findings against one IMU as of its latest power-up, the worst first."""
     columns = columns_of(history, model)
     n = len(history.biases)
     found: dict[tuple[int, str], PartFinding] = {}
@@ -154,11 +147,11 @@ def judge(history: PartHistory, model: Floats | None) -> list[PartFinding]:
             its = "times its model's" if model is not None else "times what it was"
             words = f"{_AXES[axis]} turn-on scatter {alarm.size:.1f} {its}"
             found[axis, "scatter"] = PartFinding("scatter", axis, alarm.since, alarm.size, words)
-        elif alarm.kind == "level" and n - alarm.at <= SHOWN:
+        elif alarm.kind == "level" and n - alarm.at <= SHOWN_POWER_UPS:
             before = found.get((axis, "level"))
             size = alarm.size + (before.size if before else 0.0)
             since = before.since if before else alarm.since
-            kind = "drift" if before or alarm.at - alarm.since >= _DRIFT_AFTER else "bias"
+            kind = "drift" if before or alarm.at - alarm.since >= _DRIFT_AFTER_POWER_UPS else "bias"
             moved = abs(size) * unit / (DEG_H if axis < 3 else MG)
             its = "its model's turn-on scatter" if model is not None else "its turn-on scatter"
             words = (
@@ -187,11 +180,9 @@ def judge_compass(heading_bound_deg: Floats) -> list[PartFinding]:
 
 
 def compass_column(heading_bound_deg: Floats) -> Columns:
-    """Make the column of the heading's bound for `watch`."""
     bound = np.log(np.where(heading_bound_deg > 0.0, heading_bound_deg, np.nan))[:, None]
     n, nowhere = len(bound), np.full((len(bound), 1), np.nan)
-    six = np.repeat(bound[:LEARNS], 6, axis=1)
-    unit = np.fmax(scatter_of_part(six, nowhere[:LEARNS, 0])[0, :1], _LEAST_NOISE)
+    unit = np.fmax(scatter_of_part(bound[:LEARNS], nowhere[:LEARNS, 0])[0], _LEAST_NOISE)
     return Columns(
         values=bound / unit,
         variance=np.zeros((n, 1)),
@@ -206,23 +197,20 @@ def compass_column(heading_bound_deg: Floats) -> Columns:
 
 
 def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[PartFinding]:
-    """Judge the gradienter by its latest two alignments, (m, 2) and (m,); `since` is the index of the later one."""
     if len(offset_deg) < 2:
         return []
     moved = float(np.abs(offset_deg[-1] - offset_deg[-2]).max())
     sigmas = moved / float(np.sqrt(np.square(sigma_deg[-2:]).sum() + ZERO_USUAL_DEG**2))
-    if not sigmas > ZERO_SIGMAS:
+    if not sigmas > LEAST_ZERO_SIGMAS:
         return []
     words = f"gradienter: its zero has moved by {moved:.2f} deg between two alignments ({moved * G * DEG / MG:.1f} mg)"
     return [PartFinding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
 
 
-_Calibration = tuple[Any, list[Any]]
-"""Row of `calibrations`, and the rows of `biases` of one IMU: x, y, z."""
+_CalibrationOfImu = tuple[Any, list[Any]]  # row of `calibrations`, rows of `biases`: x, y, z
 
 
-def _figures(calibration: _Calibration, name: str) -> list[float]:
-    """Give a figure of gyro x y z, accelerometer x y z."""
+def _figures(calibration: _CalibrationOfImu, name: str) -> list[float]:
     names = (f"gyro_{name}_rad_s", f"accel_{name}_m_s2")
     return [np.nan if (value := getattr(row, each)) is None else value for each in names for row in calibration[1]]
 
@@ -230,7 +218,7 @@ def _figures(calibration: _Calibration, name: str) -> list[float]:
 def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Row]]:
     """Judge an aircraft by all calibrations in the database; return its rows of `parts` and of `findings`."""
     done = _done(connection, aircraft)
-    imus: dict[str, list[_Calibration]] = {}
+    imus: dict[str, list[_CalibrationOfImu]] = {}
     biases = _biases(connection, aircraft)
     for key, about in done.items():
         for imu, rows in biases.get(key, {}).items():
@@ -267,7 +255,6 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
 
 
 def _others(connection: sa.Connection, model: str, aircraft: str) -> Floats | None:
-    """Read the scatter of a model, by the parts that are in other aircraft now."""
     query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != aircraft)
     found: dict[tuple[str, str], Floats] = {}
     for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
@@ -278,7 +265,6 @@ def _others(connection: sa.Connection, model: str, aircraft: str) -> Floats | No
 
 
 def _done(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], Any]:
-    """Read the calibrations that were not undone, by key, in the order of epochs and sequences."""
     query = """
         SELECT s.epoch, s.sequence, s.started_at, s.duration_s, s.firmware, s.heading_bound_deg,
                s.zero_at, s.zero_x_deg, s.zero_y_deg, s.zero_sigma_deg, i.received_at
@@ -309,7 +295,7 @@ def _biases(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], d
     return found
 
 
-def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
+def _power_ups(calibrations: list[_CalibrationOfImu]) -> list[_CalibrationOfImu]:
     """Select the last calibration of each power-up, of the part that is in the aircraft now.
 
     Calibrations of one power-up must also agree, as a wrong clock could join many.
@@ -321,13 +307,13 @@ def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
     for before, one in pairwise(calibrations):
         read, use = (np.array([_figures(each, name) for each in (before, one)]) for name in ("read", "sigma_use"))
         off = np.nan_to_num(np.abs(read[1] - read[0]) / np.sqrt(np.square(use).sum(axis=0)))
-        if abs(one[0].started_at - before[0].started_at) < SAME_POWER_UP and (off < _AGREE_SIGMAS).all():
+        if abs(one[0].started_at - before[0].started_at) < SAME_POWER_UP_WITHIN and (off < _AGREE_SIGMAS).all():
             found.pop()
         found.append(one)
     return found
 
 
-def _history(calibrations: Sequence[_Calibration]) -> PartHistory:
+def _history(calibrations: Sequence[_CalibrationOfImu]) -> PartHistory:
     biases, sigma_stat, sigma_use = (
         np.array([_figures(one, name) for one in calibrations]) for name in ("read", "sigma_stat", "sigma_use")
     )
@@ -352,12 +338,11 @@ _Found = list[tuple[str | None, Sequence[datetime.datetime], PartFinding]]
 
 
 def _of_the_gradienter(found: _Found, imus: int) -> _Found:
-    """Replace findings of level accelerometers that moved together by one against the gradienter."""
     left = list(found)
     for axis, name in ((3, "forward"), (4, "right")):
         of_it = [one for one in found if one[2].axis == axis and one[2].kind in ("bias", "drift")]
         moved, sinces = [one[2].moved for one in of_it], [one[2].since for one in of_it]
-        if imus < 2 or len(of_it) < imus or max(sinces) - min(sinces) > _TOGETHER:
+        if imus < 2 or len(of_it) < imus or max(sinces) - min(sinces) > _TOGETHER_WITHIN_POWER_UPS:
             continue
         if min(moved) * max(moved) > 0.0 and max(map(abs, moved)) < 2.0 * min(map(abs, moved)):
             mean = float(np.mean(np.abs(moved)))

@@ -35,7 +35,6 @@ _STANDINGS: Final = (
     ("caution", "last try failed", "tried_state IN ('failed', 'cancelled') AND tried_reason <> ''"),
     ("fine", "calibrated", "1 = 1"),
 )
-"""Kind, word and condition of each standing, the worst first: the first condition that holds counts."""
 _CASES: Final = " ".join(f"WHEN {holds} THEN {place}" for place, (_, _, holds) in enumerate(_STANDINGS))
 _FLEET: Final = (
     f"SELECT f.*, CASE {_CASES} END AS standing,"  # noqa: S608 - constants
@@ -51,7 +50,6 @@ _ORDERED: Final = (
 
 
 def standing(one: Any) -> tuple[str, str, str]:
-    """Give the kind of card, the word and the reason for a row of the fleet."""
     kind, word, _ = _STANDINGS[one.standing]
     why = one.tried_reason if one.tried_state in ("failed", "cancelled") else ""
     if word == "not calibrated":
@@ -64,7 +62,6 @@ def standing(one: Any) -> tuple[str, str, str]:
 
 
 def glance(connection: sa.Connection, now: datetime.datetime) -> str:
-    """Show the fleet: the worst `MOST_AIRCRAFT`."""
     since = {"stale": now - STALE, "silent": now - SILENT}
     counted = f"SELECT standing, COUNT(*) AS number, SUM(silent) AS silent FROM ({_FLEET}) s GROUP BY standing"  # noqa: S608 - constants
     groups = _rows(connection, f"{counted} ORDER BY standing", **since)
@@ -104,7 +101,6 @@ def _line(one: Any, now: datetime.datetime) -> Markup:
 
 
 def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
-    """Show one aircraft; None: it was never heard."""
     query = f"SELECT * FROM ({_FLEET}) s WHERE aircraft = :which"  # noqa: S608 - constants
     found = _rows(connection, query, which=which, stale=now - STALE, silent=now - SILENT)
     if not found:
@@ -132,7 +128,6 @@ def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> s
 
 
 def _findings(connection: sa.Connection, which: str | None = None) -> Markup | None:
-    """Show the findings, the worst first: all of one aircraft, or the worst of each."""
     each, one = findings.c, sa.join(findings, known, findings.c.aircraft == known.c.aircraft)
     query = sa.select(each.aircraft, known.c.name, each.words, sa.func.count().over().label("all")).select_from(one)
     query = query.where(each.place == 0 if which is None else each.aircraft == which)
@@ -184,7 +179,6 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:
-    """Give a figure of three axes in deg/h or mg; None: it is not known of all."""
     column = f"{triad}_{what}_{UNITS[triad].name.replace('/', '_')}"
     x, y, z = (getattr(axes[axis], column) for axis in "xyz")
     return None if None in (x, y, z) else (x, y, z)
@@ -240,17 +234,15 @@ def _refused(connection: sa.Connection, now: datetime.datetime) -> Markup | None
     return card("caution", tag("p", "Not everything could be taken:"), tag("ul", *lines), more)
 
 
-_MOMENTS: Final = ("heard_at", "calibrated_at", "tried_at", "armed_at", "started_at", "at")
+_TIMES: Final = dict.fromkeys(("heard_at", "calibrated_at", "tried_at", "armed_at", "started_at", "at"), UtcTime())
 
 
 def _rows(connection: sa.Connection, query: str, **values: Any) -> Sequence[Any]:
     """Run a query; times are times, also where the database keeps them as texts."""
-    names = [name for name in _MOMENTS if name in query.split()[1:] or "*" in query]
-    columns = {name: UtcTime() for name in names}
     times = [
         sa.bindparam(name, type_=UtcTime()) for name, value in values.items() if isinstance(value, datetime.datetime)
     ]
-    return connection.execute(sa.text(query).bindparams(*times).columns(**columns), values).all()
+    return connection.execute(sa.text(query).bindparams(*times).columns(**_TIMES), values).all()
 
 
 def _moment(at: datetime.datetime | None) -> str:

@@ -18,11 +18,9 @@ from companion.errors import StorageError
 
 VERSION: Final = 4
 _LOCK: Final = 0x636F6D70616E696F
-"""Key of PostgreSQL's advisory lock that the collector holds while it reads and changes the version."""
 _STATEMENT_MS: Final = 30_000
 _BUSY_S: Final = 10.0
 OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
-"""Errors of a database that cannot be reached, is full or broken."""
 OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
 
 
@@ -33,11 +31,9 @@ class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
     cache_ok = True
 
     def process_bind_param(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
-        """Convert a value for the database."""
         return value if value is None or dialect.name != "sqlite" else value.astimezone(datetime.UTC)
 
     def process_result_value(self, value: Any, dialect: sa.Dialect) -> datetime.datetime | None:
-        """Convert a value from the database."""
         found: datetime.datetime | None = value
         return found if found is None or found.tzinfo is not None else found.replace(tzinfo=datetime.UTC)
 
@@ -49,7 +45,6 @@ class Words(sa.types.TypeDecorator[str]):
     cache_ok = True
 
     def process_bind_param(self, value: str | None, dialect: sa.Dialect) -> str | None:
-        """Convert a value for the database."""
         return value if value is None else value.replace("\0", "\ufffd")
 
 
@@ -249,10 +244,8 @@ _VIEW: Final = re.compile(r"-- (\w+): (.*)\n([^;]+);")
 _VIEWS: Final = Path(__file__).with_name("views.sql")
 
 
-def bring_up_to_date(connection: sa.Connection) -> bool:
-    """Make the tables, and views that are missing; return whether anything was to do.
-
-    All of it happens within the connection's transaction, by one collector at a time.
+def bring_up_to_date(connection: sa.Connection) -> None:
+    """Make tables and views that are missing, within the connection's transaction, by one collector at a time.
 
     Raises:
         StorageError: another version has made the tables.
@@ -268,7 +261,7 @@ def bring_up_to_date(connection: sa.Connection) -> bool:
             remedy = "name a new database with --database: aircraft send again what they still keep"
         raise StorageError(f"the database has tables of version {found}; allowed: {VERSION}; {remedy}")
     if found is not None and {view for view, _, _ in views()} <= {*inspector.get_view_names()}:
-        return False
+        return
     for view, _, _ in reversed(views()):
         connection.exec_driver_sql(f"DROP VIEW IF EXISTS {view}")
     if found is None:
@@ -278,7 +271,6 @@ def bring_up_to_date(connection: sa.Connection) -> bool:
         connection.exec_driver_sql(f"CREATE VIEW {view} AS /* {purpose} */ {query}")
         if connection.dialect.name == "postgresql":  # which forgets what stands in a query's text
             connection.exec_driver_sql(f"COMMENT ON VIEW {view} IS '{purpose}'")
-    return True
 
 
 def views() -> list[tuple[str, str, str]]:
@@ -340,6 +332,5 @@ def _prepare_sqlite(connection: Any, _record: object) -> None:
 
 
 def why(error: sa.exc.SQLAlchemyError) -> str:
-    """Give the database's own message in one line."""
     cause = getattr(error, "orig", None) or error
     return " ".join(str(cause).split())[:300] or type(cause).__name__

@@ -25,10 +25,8 @@ LEAST_POWER_UPS: Final = 8
 LEAST_PARTS: Final = 4
 WANDER_LAG: Final = 30
 """Power-ups between the two levels that tell the wander."""
-_FOR_A_TERM: Final = 24
-"""Power-ups for each further power of the temperature."""
-_OUTLIER: Final = 3.0
-"""Sigmas beyond which a step is left out of the slope over temperature."""
+_POWER_UPS_PER_TEMPERATURE_TERM: Final = 24
+_OUTLIER_SIGMAS: Final = 3.0
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
 """Columns with one scatter: parts are mounted in any direction, but the gradienter adds to the level accelerometers."""
 CLIP: Final = 3.0
@@ -42,24 +40,22 @@ _TWICE: Final = (0.375, np.log(2.0))
 """Factor of z^2 and constant of the log-likelihood ratio for twice the scatter."""
 OWN_WEIGHT: Final = 8.0
 """Weight of the model's scatter, in power-ups: the scatter of parts differs by a quarter."""
-_HELD: Final = 2.5
-_HELD_MEAN: Final = 0.9775
-"""Mean square of a normal number that is clipped to `_HELD`."""
-_MEDIAN_OF_3: Final = 0.449
-"""Variance of the median of three normal numbers."""
+_HELD_SIGMAS: Final = 2.5
+_MEAN_SQUARE_OF_HELD: Final = 0.9775  # of a normal number that is clipped to `_HELD_SIGMAS`
+_VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # of normal numbers
 _STEP_K: Final = 15.0
 _AT_DEGC: Final = 20.0
-_BEFORE: Final = np.square([100.0, 50.0, 10.0, 2.0])
-"""Initial variances in scatters: of the level, and of the three coefficients over temperature."""
+_INITIAL_VARIANCES: Final = np.square(
+    [100.0, 50.0, 10.0, 2.0]
+)  # in scatters: the level, three coefficients over temperature
 _NEW_LEVEL: Final = 1e4
-_BASE: Final = 20
-"""Power-ups before a move that the level is compared with."""
+_BASE_POWER_UPS: Final = 20
 
 
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Floats:
-    """Estimate the scatter of a part from its power-ups in order, (n, 6) and (n,); NaN: not measured.
+    """Estimate the scatter of a part from its power-ups in order, (n, c) and (n,); NaN: not measured.
 
-    Rows of the result, (2, 6): one sigma from one power-up to another at one temperature, errors of the calibrations
+    Rows of the result, (2, c): one sigma from one power-up to another at one temperature, errors of the calibrations
     included; one sigma of the step that stays. Steps between successive power-ups, less the part that follows the
     temperature, are the input: neither ageing nor a single move makes them larger.
     """
@@ -78,13 +74,11 @@ def scatter_of_model(parts: Sequence[Floats]) -> Floats | None:
 
 
 def middle_of(values: Floats) -> float:
-    """Give the median of the known values; NaN: none is known."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else np.nan
 
 
 def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float]:
-    """Estimate the scatter and the wander of one column; NaN: not known."""
     there = np.isfinite(bias)
     value, degc = bias[there], temperature_degc[there]
     if len(value) < LEAST_POWER_UPS:
@@ -92,13 +86,13 @@ def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float]:
     known = np.isfinite(degc)
     warmer = np.where(known, degc - (degc[known].mean() if known.any() else 0.0), 0.0) / _STEP_K
     # A line for few, up to a cubic for many.
-    laws = warmer[:, None] ** np.arange(1, 2 + min(len(value) // _FOR_A_TERM, 2))
+    laws = warmer[:, None] ** np.arange(1, 2 + min(len(value) // _POWER_UPS_PER_TEMPERATURE_TERM, 2))
     step, by = np.diff(value), np.diff(laws, axis=0)
     weight = np.ones(len(step))
     for _ in range(3):
         terms = np.linalg.lstsq(by * weight[:, None], step * weight, rcond=None)[0]
         scale = _sigma(step - by @ terms)
-        weight = (np.abs(step - by @ terms) <= _OUTLIER * scale).astype(np.float64)
+        weight = (np.abs(step - by @ terms) <= _OUTLIER_SIGMAS * scale).astype(np.float64)
     turn_on = scale / np.sqrt(2.0)
     if len(value) < 3 * WANDER_LAG:
         return turn_on, np.nan
@@ -112,45 +106,43 @@ def _sigma(steps: Floats) -> float:
 
 
 class Alarm(NamedTuple):
-    """Change of one column's figure."""
+    """Change of one column's figure, found at power-up `at`; `since` is the first power-up that counts towards it.
+
+    `until` is the power-up at which the scatter was as before; the number of power-ups: not yet, or a moved level.
+    `size` is the move of the level, or the scatter since then, in usual scatters.
+    """
 
     column: int
     kind: Literal["level", "scatter"]
     since: int
-    """Index of the first power-up that counts towards it."""
     at: int
-    """Index of the power-up at which it was found."""
     until: int
-    """Index of the power-up at which the scatter was as before; the number of power-ups: not yet, or a moved level."""
     size: float
-    """Move of the level, or the scatter since then, in usual scatters."""
 
 
 class Columns(NamedTuple):
-    """Figures of n power-ups in order, in c columns that are tested side by side."""
+    """Figures of n power-ups in order, in c columns that are tested side by side; NaN: not known.
+
+    The first three arrays and `relevel` are (n, c), the others (c,). All but `temperature_degc`, `first` and `unit` are
+    in usual scatters.
+    """
 
     values: Floats
-    """(n, c) in usual scatters; NaN: not measured."""
     variance: Floats
-    """(n, c) variance of a value beyond the usual one, in squares of the usual scatter."""
+    """Variance of a value beyond the usual one."""
     temperature_degc: Floats
-    """(n, c); NaN: not known."""
     wander: Floats
-    """(c,) one sigma of the step of the level from one power-up to the next, in usual scatters."""
+    """One sigma of the step of the level from one power-up to the next."""
     relevel: NDArray[np.bool_]
-    """(n, c) whether the reference of the measurement has changed, so that the level may differ."""
+    """True where the reference of the measurement has changed, so that the level may differ."""
     first: NDArray[np.int_]
-    """(c,) number of power-ups at the beginning that define what is usual, at least 3."""
+    """Number of power-ups at the beginning that define what is usual, at least 3."""
     most_own: Floats
-    """(c,) largest accepted scatter of the column itself, in usual scatters."""
     least: Floats
-    """(c,) least move or scatter that raises an alarm."""
     unit: Floats
-    """(c,) usual scatter."""
 
 
 def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
-    """Find the alarms of all columns, in the order in which they were raised."""
     values, variance, temperature_degc, wander, relevel, first, most_own, least, _ = columns
     n, c = values.shape
     there = np.isfinite(values)
@@ -162,7 +154,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
     # A value that was not measured repeats the one before; the filter does not count it.
     held = np.maximum.accumulate(np.where(there, np.arange(n)[:, None], there.argmax(axis=0)), axis=0)
     y, laws = np.nan_to_num(values[held, every] - values[held[0], every]), laws[held, every]
-    x, p = np.zeros((c, 4)), np.tile(np.diag(_BEFORE), (c, 1, 1))
+    x, p = np.zeros((c, 4)), np.tile(np.diag(_INITIAL_VARIANCES), (c, 1, 1))
     own, count = np.full(c, OWN_WEIGHT), np.full(c, OWN_WEIGHT)
     up, down, wide = np.zeros((3, c))
     up_0, down_0, wide_0 = np.zeros((3, c), dtype=int)
@@ -203,7 +195,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
         middle = before.sum(axis=0) - before.max(axis=0) - before.min(axis=0)
         apart = h[:, 1:] - laws[latest, every, 1:].mean(axis=0)
         of_law = ((p[:, 1:, 1:] * apart[:, None, :]).sum(axis=2) * apart).sum(axis=1)
-        about = usual * (1.0 + _MEDIAN_OF_3) + more + of_law
+        about = usual * (1.0 + _VARIANCE_OF_MEDIAN_OF_3) + more + of_law
         d2 = np.square(y[k] - (h[:, 1:] * x[:, 1:]).sum(axis=1) - middle) / about
         tells = here & (seen >= 3)
         wide = np.where(tells, np.maximum(wide + _TWICE[0] * np.minimum(d2, CLIP**2) - _TWICE[1], 0.0), wide)
@@ -217,7 +209,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
 
         # Learn the column's own scatter, except while it is in doubt or the filter does not know the level.
         learns = here & (wide < SCATTER_LIMIT / 4.0) & (of_filter < usual)
-        own = own + np.where(learns, usual * np.minimum(np.square(z), _HELD**2) / _HELD_MEAN, 0.0)
+        own = own + np.where(learns, usual * np.minimum(np.square(z), _HELD_SIGMAS**2) / _MEAN_SQUARE_OF_HELD, 0.0)
         count = count + learns
         latest = np.where(here, np.stack([latest[1], latest[2], np.full(c, k)]), latest)
         seen = seen + here
@@ -226,7 +218,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
             rose = up[column] > LEVEL_LIMIT
             since = int((up_0 if rose else down_0)[column])
             level = _at_one_temperature(y, laws, x, column)
-            moved = np.median(level[since : k + 1]) - np.median(level[max(since - _BASE, 0) : since])
+            moved = np.median(level[since : k + 1]) - np.median(level[max(since - _BASE_POWER_UPS, 0) : since])
             if not abs(moved) >= least[column]:
                 continue
             alarms.append(Alarm(column, "level", since, k, n, float(moved)))
@@ -253,7 +245,7 @@ def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, F
     """
     weight: Floats = there.astype(np.float64)
     for _ in range(8):
-        inverse = np.linalg.inv((laws * weight[:, None]).T @ laws + np.diag(1.0 / _BEFORE))
+        inverse = np.linalg.inv((laws * weight[:, None]).T @ laws + np.diag(1.0 / _INITIAL_VARIANCES))
         x = inverse @ (laws * weight[:, None]).T @ y
         off = np.abs(y - laws @ x)
         scale = max(MAD_TO_SIGMA * float(np.median(off)), 1.0)
@@ -266,5 +258,4 @@ def _scatter(level: Floats) -> float:
 
 
 def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:
-    """Reduce the values of one column to one temperature, (n,)."""
     return np.asarray(y[:, column] - laws[:, column, 1:] @ x[column, 1:])

@@ -37,7 +37,6 @@ LEAST_PASSWORD: Final = 12
 WRONG_PASSWORD_S: Final = 2.0
 AGAIN_S: Final = 30
 SOON_S: Final = 2
-"""Period after which a browser tries again when the database could not be read."""
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
 
 
@@ -86,11 +85,9 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Address for a browser."""
         return page_url(self._host, self._port)
 
     async def run(self) -> NoReturn:
-        """Serve until cancelled; an address that is taken is waited for."""
         await self._reconnection.keep(self._serve)
 
     async def _serve(self) -> str:

@@ -17,7 +17,6 @@ from sqlalchemy.dialects import postgresql, sqlite
 from companion.errors import LinkError
 from companion.fleet import schema
 from companion.fleet.contract import (
-    FORMAT_VERSION,
     KINDS,
     Hello,
     NotTakenError,
@@ -33,6 +32,7 @@ from companion.fleet.contract import (
 from companion.fleet.judgement import judged
 from companion.fleet.schema import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
 from companion.mqtt.client import Incoming
+from companion.mqtt.fleet import FORMAT_VERSION
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +40,6 @@ MOST_REJECTED: Final = 10_000
 _SHOWN_BYTES: Final = 4096
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
 _AGAIN: Final = 500
-"""Items of a newer aircraft that are parsed again in one transaction after an update."""
 
 
 class BatchResult(NamedTuple):
@@ -52,19 +51,15 @@ class BatchResult(NamedTuple):
 
 
 class Store:
-    """Store of items, hellos and judgements; calls block, so call them in a thread."""
-
     def __init__(self, database: str) -> None:
         self._engine, self._reads = engine_of(database), engine_of(database, reads_only=True)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
 
     @property
     def where(self) -> str:
-        """Address of the database, without a password."""
         return self._engine.url.set(drivername=self._engine.dialect.name).render_as_string()
 
     def close(self) -> None:
-        """Close the connections; the next call opens a new one."""
         self._engine.dispose()
         self._reads.dispose()
 
@@ -182,7 +177,6 @@ class Store:
         return outcome
 
     def _put_made(self, connection: sa.Connection, made: Rows) -> None:
-        """Write the rows made from items, and mark the aircraft that are to be judged again."""
         for name, rows in sorted(made.items()):
             self._put(connection, schema.tables.tables[name], rows)
         table = schema.judgements
@@ -195,7 +189,6 @@ class Store:
             connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news), values)
 
     def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
-        """Insert rows that are not there yet, in the order of their keys, so that no two collectors deadlock."""
         if not rows:
             return
         keys = [column.name for column in table.primary_key]
@@ -327,5 +320,4 @@ def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str,
 
 
 def _without_zero(value: object) -> object:
-    """Replace zero bytes, which PostgreSQL refuses in a text."""
     return value.replace("\0", "\ufffd") if isinstance(value, str) else value

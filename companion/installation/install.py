@@ -38,7 +38,6 @@ with `systemctl edit`, in /etc); all else is below /etc/companion, the owner's."
 
 
 def folder() -> Path:
-    """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError where there is none."""
     here = Path(__file__).resolve().parent
     for candidate in (here / "systemd", here.parents[1] / "systemd"):
         if (candidate / SERVICE).is_file():
@@ -47,7 +46,6 @@ def folder() -> Path:
 
 
 def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
-    """Return a shipped file for this executable, without stamp; raise CompanionError where that cannot be."""
     text = (folder() / shipped).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
@@ -57,7 +55,6 @@ def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
 
 
 def stamped(data: bytes) -> bytes:
-    """Put a first line before the data that shows a later change by hand."""
     return f"{_STAMP}{hashlib.sha256(data).hexdigest()}\n".encode() + data
 
 
@@ -83,32 +80,25 @@ Run = Callable[[Sequence[str]], str | None]
 
 @dataclass(frozen=True, slots=True)
 class InstallStep:
-    """One step of an installation, and its outcome."""
-
     what: str
     outcome: Outcome
     words: str = ""
 
     def line(self) -> str:
-        """Format it for people."""
         return f"{self.outcome:9}  {self.what}" + (f": {self.words}" if self.words else "")
 
 
 @dataclass(frozen=True, slots=True)
 class Installation:
-    """Root folder, prefix and executable of an installation."""
-
     root: Path
     prefix: Path
     executable: str
 
     @property
     def is_this_machine(self) -> bool:
-        """Return whether the running machine is meant."""
         return self.root == Path("/")
 
     def path(self, shipped: str) -> Path:
-        """Return the path of a shipped file."""
         target = SHIPPED[shipped]
         base = str(self.prefix).lstrip("/") if target.startswith("lib/") else "etc/companion"
         return self.root / base / target
@@ -118,7 +108,6 @@ PREFIX: Final = Path("/usr/local")
 
 
 def own_executable() -> str:
-    """Return the path of the running companion: beside its Python."""
     return str(Path(sys.executable).with_name("companion"))
 
 
@@ -145,7 +134,6 @@ def start_service(run: Run | None = None) -> Iterator[InstallStep]:
 
 
 def how_to_start() -> str:
-    """Return the command that starts the service."""
     return _START_PACKAGED if _is_packaged() else "sudo companion install-service"
 
 
@@ -219,7 +207,6 @@ def _check_user(command: str) -> None:
 
 
 def _check_reach(executable: str) -> None:
-    """Raise CompanionError where the service, nobody's account, could not run this installation."""
     package = Path(companion.__file__).parent
     for path in (Path(executable), package, Path(sys.base_prefix)):
         why = unreachable(path)
@@ -271,7 +258,6 @@ def _reload(run: Run) -> Iterator[InstallStep]:
 
 
 def systemd_runs() -> bool:
-    """Return whether systemd runs here."""
     return Path("/run/systemd/system").is_dir()
 
 

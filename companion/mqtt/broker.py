@@ -1,21 +1,126 @@
-"""Credentials for the broker, and its refusals in words.
+"""Connection to a broker by aiomqtt 2: credentials, TLS, the version of MQTT, and refusals in words.
 
-Password and certificates are read for every connection, so that a correction needs no restart.
+Only this module and `client` know aiomqtt, whose version 3 will be another library.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import logging
 import os
 import socket
 import ssl
 import stat
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from companion.config.sections import Mqtt
-from companion.errors import LinkError
+from companion.errors import CompanionError, LinkError
 
+if TYPE_CHECKING:
+    import aiomqtt
+
+logger = logging.getLogger(__name__)
+_quiet = logging.getLogger(f"{__name__}.aiomqtt")
+# Errors of the library reach us as exceptions, and are logged once, in words for people.
+_quiet.setLevel(logging.CRITICAL)
+
+MQTT_3_1_1: Final = 4
+MQTT_5: Final = 5
 MAX_PASSWORD_BYTES: Final = 4096
+_LEAST_REFUSAL_CODE: Final = 128
+
+
+class Broker:
+    """Connects one client, in the newest version of MQTT that the broker speaks.
+
+    MQTT 5 is tried first: only there can a message say that it was published to be retained, and only there is the
+    broker told how long a message may be. Credentials are read for every connection: a correction needs no restart.
+    """
+
+    def __init__(self, settings: Mqtt, client_id: str) -> None:
+        self.settings, self.client_id = settings, client_id
+        self.where = f"{settings.host}:{settings.broker_port}"
+        self.protocol = MQTT_5
+        if is_open_to_all(settings):
+            words = "mqtt: password file %s: everybody on this computer can read it (chmod o-r)"
+            logger.warning(words, settings.password_path)
+
+    @contextlib.asynccontextmanager
+    async def connected(self, most_bytes: int, **options: Any) -> AsyncIterator[aiomqtt.Client]:
+        """Hold a connection; `most_bytes`: longest packet that the broker may send (MQTT 5).
+
+        Raises:
+            LinkError: why there is no connection, or why it ended.
+        """
+        import aiomqtt
+
+        reached = False
+        try:
+            client = await self._connect(most_bytes, options)
+            reached = True
+            try:
+                yield client
+            finally:
+                # An error of the disconnection must not replace a cancellation.
+                with contextlib.suppress(aiomqtt.MqttError, OSError):
+                    await client.__aexit__(None, None, None)
+        except CompanionError:
+            raise
+        except (aiomqtt.MqttError, OSError, UnicodeError, ExceptionGroup) as error:
+            if any(isinstance(cause, MemoryError) for cause in causes(error)):
+                raise MemoryError from error
+            logger.debug("mqtt", exc_info=error)
+            raise LinkError(
+                f"{self.where}: {explain(error, self.settings, self.client_id, reached=reached)}"
+            ) from error
+
+    async def _connect(self, most_bytes: int, options: dict[str, Any]) -> aiomqtt.Client:
+        import aiomqtt
+
+        password = await asyncio.to_thread(read_password, self.settings)
+        context = await asyncio.to_thread(tls_context, self.settings)
+        while True:
+            client = self._client(most_bytes, password=password, tls_context=context, **options)
+            try:
+                return await client.__aenter__()
+            except aiomqtt.MqttError as error:
+                before, self.protocol = self.protocol, MQTT_5
+                # A broker that is too old for MQTT 5 says so, or says nothing, or closes the connection.
+                if before != MQTT_5 or not is_of_protocol(error):
+                    raise
+                self.protocol = MQTT_3_1_1
+
+    def _client(self, most_bytes: int, **options: Any) -> aiomqtt.Client:
+        import aiomqtt
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        properties = None
+        if self.protocol == MQTT_5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.MaximumPacketSize = most_bytes
+        return aiomqtt.Client(
+            self.settings.host,
+            self.settings.broker_port,
+            identifier=self.client_id,
+            username=self.settings.username,
+            protocol=aiomqtt.ProtocolVersion(self.protocol),
+            clean_session=True if properties is None else None,
+            keepalive=self.settings.keepalive_s,
+            properties=properties,
+            logger=_quiet,
+            **options,
+        )
+
+
+async def subscribe(client: aiomqtt.Client, topic: str, **options: Any) -> None:
+    """Subscribe to a topic; raise LinkError where the broker refuses it."""
+    granted = await client.subscribe(topic, **options)
+    if any(getattr(code, "value", code) >= _LEAST_REFUSAL_CODE for code in granted):
+        raise LinkError(f"the broker does not let us hear {topic} (its access list?)")
 
 
 def read_password(settings: Mqtt) -> str | None:
@@ -31,7 +136,7 @@ def read_password(settings: Mqtt) -> str | None:
         with path.open("rb") as file:
             content = file.read(MAX_PASSWORD_BYTES + 1)
     except OSError as error:
-        raise LinkError(f"password file {path}: {_why(error)}") from None
+        raise LinkError(f"password file {path}: {_words(error)}") from None
     try:
         password = content.decode().removesuffix("\n").removesuffix("\r")
     except UnicodeDecodeError:
@@ -42,7 +147,6 @@ def read_password(settings: Mqtt) -> str | None:
 
 
 def is_open_to_all(settings: Mqtt) -> bool:
-    """Return whether everybody on this computer can read the password."""
     path = settings.password_path
     try:
         return path is not None and bool(path.stat().st_mode & stat.S_IROTH)
@@ -71,29 +175,31 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
         what = (error.reason or str(error)).lower().replace("_", " ")
         raise LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)") from None
     except OSError as error:
-        raise LinkError(f"{error.filename or where}: {_why(error)}") from None
+        raise LinkError(f"{error.filename or where}: {_words(error)}") from None
     return context
 
 
-def _why(error: OSError) -> str:
-    return {
-        FileNotFoundError: "no such file",
-        PermissionError: "may not be read by this user",
-        IsADirectoryError: "is a folder",
-    }.get(type(error)) or (error.strerror or str(error))
-
-
 UNSUPPORTED_PROTOCOL: Final = 132
-"""Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
 _BAD_PASSWORD: Final = (134, 135)
-_CLIENT_ID: Final = 133
-_UNAVAILABLE: Final = (136, 137)
-_SHUTTING_DOWN: Final = 139
-_TAKEN_OVER: Final = 142
-_LOST: Final = (7, 128)
-"""Codes of a lost connection: paho's own, and that of MQTT 5."""
-_SILENT: Final = (16, 141)
-"""Codes of silence for twice the keepalive: paho's own, and that of MQTT 5."""
+_TAKEN_OVER: Final = (
+    "another client called {id!r} has taken over: is there a second companion for this vehicle?"
+    " (mqtt.base_topic tells them apart)"
+)
+_LOST: Final = "the connection is gone (broker stopped? network? another client called {id!r}?)"
+_SILENT: Final = "nothing heard from the broker any more"
+_REASONS: Final = {
+    7: _LOST,
+    16: _SILENT,
+    128: _LOST,
+    UNSUPPORTED_PROTOCOL: "the broker speaks neither MQTT 5 nor 3.1.1",
+    133: "the broker refuses the client id {id!r} (mqtt.client_id)",
+    136: "the broker is not available now",
+    137: "the broker is not available now",
+    139: "the broker shuts down",
+    141: _SILENT,
+    142: _TAKEN_OVER,
+}
+"""Reason codes of MQTT 5 (its section 2.4), and paho's own below 128; paho turns those of MQTT 3.1.1 into the same."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
@@ -109,18 +215,13 @@ def causes(error: BaseException) -> list[BaseException]:
     return found
 
 
-def reason_code(error: BaseException) -> int | None:
-    """Return the reason code of the broker (or paho), if there is one."""
-    for cause in causes(error):
-        code = getattr(cause, "rc", None)
-        if code is not None:
-            return int(getattr(code, "value", code))
-    return None
+def _reason_code(error: BaseException) -> int | None:
+    codes = (getattr(cause, "rc", None) for cause in causes(error))
+    return next((int(getattr(code, "value", code)) for code in codes if code is not None), None)
 
 
 def is_of_protocol(error: BaseException) -> bool:
-    """Return whether the broker may lack the version of MQTT that was tried."""
-    return reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
+    return _reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
 
 
 def _is_unanswered(error: BaseException) -> bool:
@@ -130,9 +231,14 @@ def _is_unanswered(error: BaseException) -> bool:
 
 def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
     """Say in one line why there is no connection, without the address; `reached`: there was one."""
-    code = reason_code(error)
+    code = _reason_code(error)
+    if code in _BAD_PASSWORD:
+        if settings.username is None:
+            return "the broker asks for a user (mqtt.username, mqtt.password_file)"
+        return f"the broker refuses user {settings.username!r}: unknown, or the password is wrong"
     if code is not None:
-        return _of_code(code, error, settings, client_id)
+        words = _REASONS.get(code)
+        return f"the broker says: {causes(error)[-1]}" if words is None else words.format(id=client_id)
     hint = " (does it want tls = true?)"
     if settings.tls:
         hint = " (does it want a certificate? mqtt.cert_file)" if settings.cert_file is None else ""
@@ -144,29 +250,6 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
         if isinstance(cause, OSError) and (words := _of_system(cause, settings)):
             return words
     return str(error) or type(error).__name__
-
-
-def _of_code(code: int, error: BaseException, settings: Mqtt, client_id: str) -> str:
-    if code in _BAD_PASSWORD:
-        if settings.username is None:
-            return "the broker asks for a user (mqtt.username, mqtt.password_file)"
-        return f"the broker refuses user {settings.username!r}: unknown, or the password is wrong"
-    if code == _TAKEN_OVER:
-        return (
-            f"another client called {client_id!r} has taken over: is there a second companion for this vehicle?"
-            " (mqtt.base_topic tells them apart)"
-        )
-    words = {
-        UNSUPPORTED_PROTOCOL: "the broker speaks neither MQTT 5 nor 3.1.1",
-        _CLIENT_ID: f"the broker refuses the client id {client_id!r} (mqtt.client_id)",
-        _SHUTTING_DOWN: "the broker shuts down",
-        **dict.fromkeys(
-            _LOST, f"the connection is gone (broker stopped? network? another client called {client_id!r}?)"
-        ),
-        **dict.fromkeys(_SILENT, "nothing heard from the broker any more"),
-        **dict.fromkeys(_UNAVAILABLE, "the broker is not available now"),
-    }
-    return words.get(code) or f"the broker says: {causes(error)[-1]}"
 
 
 def _of_system(error: OSError, settings: Mqtt) -> str | None:
@@ -181,4 +264,8 @@ def _of_system(error: OSError, settings: Mqtt) -> str | None:
         return "no answer"
     if isinstance(error, ConnectionRefusedError):
         return "nobody listens there (is the broker running?)"
-    return os.strerror(error.errno).lower() if error.errno else None
+    return _words(error) if error.errno else None
+
+
+def _words(error: OSError) -> str:
+    return os.strerror(error.errno).lower() if error.errno else str(error)

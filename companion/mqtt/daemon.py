@@ -1,11 +1,6 @@
 """The daemon as the MQTT process sees it: a stream of its status and attitude, and answers to requests.
 
-Each request over MQTT is answered, none is obeyed twice, and a flood stays bounded. An answer repeats the request's
-transaction. A calibration is answered twice: "accepted" at once, and how it ended; everything else once. Requests go to
-the control socket, as the command line's do, so refusals are the same too. Three kinds of messages are no new request:
-- a retained one comes back at every connection, for ever: it is never obeyed, and the log says so once;
-- the empty payload that deletes a retained one looks like a request (on MQTT 3.1.1): it is ignored;
-- a repeat of a transaction (QoS 1 delivers at least once) gets the same answer again.
+Requests go to the control socket, as the command line's do, so refusals are the same too.
 """
 
 from __future__ import annotations
@@ -16,7 +11,6 @@ import difflib
 import logging
 import re
 import time
-from collections import OrderedDict
 from collections.abc import AsyncGenerator, Callable
 from typing import Final
 
@@ -34,11 +28,7 @@ AGAIN_S: Final = 1.0
 ANSWER_WITHIN_S: Final = 10.0
 CLOCKS_AGREE_S: Final = 2.0
 
-MONITOR: Final[Object] = {"command": "monitor", "pose": True}
-"""Request for the stream, whose first reply holds the status and the last record."""
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
-"""Sends a request to the control socket and yields the replies."""
-Respond = Callable[[str, Object], None]
 Transaction = str | int | None
 
 MAX_PAYLOAD_BYTES: Final = 4096
@@ -46,7 +36,6 @@ MAX_TRANSACTION: Final = 128
 MAX_NUMBER: Final = 2**53
 """The largest integer that every reader of JSON keeps exactly."""
 MAX_PENDING: Final = 8
-"""The most requests that wait for their end, such as cancels in the middle of a write."""
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
 KNOWN: Final = asked_by(Interface.MQTT)
@@ -54,57 +43,37 @@ _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 class Daemon:
-    """Follows the daemon; `follow` runs until cancelled."""
+    """Follows the daemon. `news` is set at every reply, and when the stream ends.
+
+    `clock_agrees`: the autopilot's GNSS time confirms the clock of this computer.
+    """
 
     def __init__(self, ask: Ask) -> None:
         self.ask = ask
         self.status: Object | None = None
         self.pose: Object | None = None
         self.record: Object | None = None
-        """The last calibration's record."""
         self.alive = False
         self.news = asyncio.Event()
-        """Set at every reply, and when the stream ends."""
         self.clock_agrees = False
-        """True if the autopilot's GNSS time confirms the clock of this computer."""
 
     @property
     def vehicle(self) -> Object:
-        """The vehicle's part of the status; empty before the first."""
         return {} if self.status is None else dict(self.status["vehicle"])
 
     async def follow(self) -> None:
-        """Read the stream of states, again after every loss."""
         while True:
             try:
-                await self._read()
+                async with contextlib.aclosing(self.ask({"command": "monitor", "pose": True})) as replies:
+                    while True:
+                        async with asyncio.timeout(SILENT_S):
+                            self._accept(await anext(replies, None))
             except (CompanionError, TimeoutError) as error:
                 if self.alive:
                     logger.warning("mqtt: the daemon gives no state: %s", str(error) or "it is silent")
             self.alive, self.pose = False, None
             self.news.set()
             await asyncio.sleep(AGAIN_S)
-
-    async def _read(self) -> None:
-        async with contextlib.aclosing(self.ask(MONITOR)) as replies:
-            while True:
-                async with asyncio.timeout(SILENT_S):
-                    reply = await anext(replies, None)
-                self._accept(reply)
-
-    async def refresh(self) -> None:
-        """Read the status and the last record now; keep the old ones where no answer comes."""
-        # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4: the end reads here.
-        reading = asyncio.ensure_future(self._read_once())
-        try:
-            await asyncio.wait([reading], timeout=SILENT_S)
-        finally:
-            reading.cancel()
-
-    async def _read_once(self) -> None:
-        with contextlib.suppress(CompanionError):
-            async with contextlib.aclosing(self.ask(MONITOR)) as replies:
-                self._accept(await anext(replies, None))
 
     def _accept(self, reply: Object | None) -> None:
         if reply is None or reply["kind"] == "error":
@@ -134,54 +103,57 @@ class Daemon:
 
 
 class Request(msgspec.Struct):
-    """A request, and how it was answered last."""
+    """A request, and its last response. `problem`: why it cannot be asked of the daemon; empty: it can."""
 
     command: str
     transaction: Transaction = None
     content: Object = {}
     problem: str = ""
-    """Why it cannot be asked of the daemon, in one line; empty: it can."""
     at_s: float = 0.0
     response: Object | None = None
 
 
 def parse(command: str, payload: bytes) -> Request:
-    """Judge a request's payload: a JSON object with known keys, or nothing. Never raises."""
+    """Parse a request's payload: a JSON object with known keys, or nothing. Never raises."""
+    request = Request(command)
+    try:
+        _read(request, payload)
+    except CalibrationRefusedError as error:
+        request.problem = str(error)
+    return request
 
-    def unfit(reason: str, transaction: Transaction = None) -> Request:
-        return Request(command, transaction, problem=reason)
 
-    if command not in KNOWN:
-        return unfit(f"unknown request {command!r}; known: {', '.join(KNOWN)}")
+def _read(request: Request, payload: bytes) -> None:
+    if request.command not in KNOWN:
+        raise CalibrationRefusedError(f"unknown request {request.command!r}; allowed: {', '.join(KNOWN)}")
     if len(payload) > MAX_PAYLOAD_BYTES:
-        return unfit(f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
+        raise CalibrationRefusedError(f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
     try:
         content = msgspec.json.decode(payload) if payload.strip() else {}
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         why = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        return unfit(f"the payload is not JSON: {why}; allowed: a JSON object, or nothing")
+        raise CalibrationRefusedError(f"the payload is not JSON: {why}; allowed: a JSON object, or nothing") from None
     if not isinstance(content, dict):
-        return unfit(f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
+        raise CalibrationRefusedError(f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
     transaction = content.pop("transaction", None)
     if not _is_transaction(transaction):
-        return unfit(
+        raise CalibrationRefusedError(
             f"'transaction': found {shown(transaction)}; allowed: a text of at most {MAX_TRANSACTION} characters, or a"
             " whole number"
         )
-    kind = KNOWN[command]
+    request.transaction = transaction
+    kind = KNOWN[request.command]
     known = kind.fields(Interface.MQTT)
     for key, value in content.items():
         if key not in known:
             near = difflib.get_close_matches(key[:MAX_SHOWN], known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(('transaction', *known))}"
-            return unfit(f"unknown key {shown(key)}; {hint}", transaction)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            allowed = ", ".join(("transaction", *known))
+            raise CalibrationRefusedError(f"unknown key {shown(key)}; allowed: {allowed}{hint}")
         if value is None:
-            return unfit(f"{key!r}: found null; allowed: {known[key].allowed}", transaction)
-    try:
-        kind.read(content)
-    except CalibrationRefusedError as error:
-        return unfit(str(error), transaction)
-    return Request(command, transaction, content)
+            raise CalibrationRefusedError(f"{key!r}: found null; allowed: {known[key].allowed}")
+    kind.read(content)
+    request.content = content
 
 
 def _is_transaction(value: object) -> bool:
@@ -191,24 +163,34 @@ def _is_transaction(value: object) -> bool:
 
 
 class Requests:
-    """Accepts requests and answers them.
+    """Accepts requests; each is answered by `respond`, none is obeyed twice, and a flood stays bounded.
 
-    `on_retained` is called once for each command with a retained request at the broker.
+    An answer repeats the request's transaction. A calibration is answered twice: "accepted" at once, and how it ended;
+    everything else once. Three kinds of messages are no new request:
+
+    - a retained one comes back at every connection, for ever: it is never obeyed, and the log says so once;
+    - the empty payload that deletes a retained one looks like a request (on MQTT 3.1.1): it is ignored;
+    - a repeat of a transaction (QoS 1 delivers at least once) gets the same answer again.
     """
 
-    def __init__(self, ask: Ask, respond: Respond, on_retained: Callable[[str], None]) -> None:
-        self._ask, self._respond, self._on_retained = ask, respond, on_retained
+    def __init__(self, ask: Ask, topic: str, respond: Callable[[str, Object], None]) -> None:
+        self._ask, self._topic, self._respond = ask, topic, respond
         self._tasks: set[asyncio.Task[None]] = set()
-        self._known: OrderedDict[tuple[str, Transaction], Request] = OrderedDict()
+        self._known: dict[tuple[str, Transaction], Request] = {}
         self._retained: set[str] = set()
 
     def accept(self, command: str, payload: bytes, *, retained: bool) -> None:
-        """Accept one request; its answer comes later."""
         if _COMMAND.fullmatch(command) is None:
             logger.debug("mqtt: a request %.60r is ignored", command)
             return
-        if self._is_leftover(command, payload, retained=retained):
+        if not payload and (retained or command in self._retained):
+            self._retained.discard(command)
             return
+        if retained and command not in self._retained:
+            self._retained.add(command)
+            topic = self._topic + command
+            words = "mqtt: the retained request at %s is not obeyed; delete it: mosquitto_pub -r -n -t %s"
+            logger.warning(words, topic, topic)
         request = parse(command, payload)
         reason = "a retained request is never obeyed; send it again without retain" if retained else request.problem
         if reason:
@@ -217,34 +199,18 @@ class Requests:
             self._start(request)
 
     async def close(self, within_s: float) -> None:
-        """Wait so long for answers, then drop the requests."""
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=within_s)
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def _is_leftover(self, command: str, payload: bytes, *, retained: bool) -> bool:
-        """Return whether this only deletes a retained request; report a retained one."""
-        if retained and payload:
-            if command not in self._retained:
-                self._retained.add(command)
-                self._on_retained(command)
-            return False
-        if payload or not (retained or command in self._retained):
-            return False
-        self._retained.discard(command)
-        return True
-
     def _is_repeat(self, request: Request) -> bool:
         """Return whether the transaction is known already; answer it as before."""
         if request.transaction is None:
             return False
-        now_s = asyncio.get_running_loop().time()
-        while self._known and now_s - next(iter(self._known.values())).at_s > REMEMBER_S:
-            self._known.popitem(last=False)
         known = self._known.get((request.command, request.transaction))
-        if known is None:
+        if known is None or asyncio.get_running_loop().time() - known.at_s > REMEMBER_S:
             return False
         if known.content != request.content:
             reason = f"transaction {request.transaction!r} was another {request.command}; give each one of its own"
@@ -255,14 +221,14 @@ class Requests:
 
     def _start(self, request: Request) -> None:
         if len(self._tasks) >= MAX_PENDING:
-            reason = f"{MAX_PENDING} requests are waiting for their end already"
-            self._refuse(request, "busy", reason)
+            self._refuse(request, "busy", f"{MAX_PENDING} requests are waiting for their end already")
             return
         if request.transaction is not None:
             request.at_s = asyncio.get_running_loop().time()
+            self._known.pop((request.command, request.transaction), None)
             self._known[request.command, request.transaction] = request
             if len(self._known) > REMEMBERED:
-                self._known.popitem(last=False)
+                del self._known[next(iter(self._known))]
         task = asyncio.get_running_loop().create_task(self._run(request), name=f"mqtt {request.command}")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -290,9 +256,8 @@ class Requests:
             self._reject(request, "other", str(error))
         except Exception:
             logger.exception("mqtt request %s failed", request.command)
-            self._answer(
-                request, {"state": "failed", "reason": "internal error of the daemon; its log has the details"}
-            )
+            reason = "internal error of the daemon; its log has the details"
+            self._answer(request, {"state": "failed", "reason": reason})
 
     def _answer(self, request: Request, answer: Object) -> None:
         request.response = {"transaction": request.transaction, **answer}

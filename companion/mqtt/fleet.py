@@ -31,22 +31,18 @@ from companion.storage.state import UNREADABLE
 
 logger = logging.getLogger(__name__)
 
-LOOK_S: Final = 2.0
+COLLECT_EVERY_S: Final = 2.0
 BATCH: Final = 20
-"""Most entries read from the disk at once; a whole history may wait there."""
 WINDOW: Final = 8
-"""The most items under way without a confirmation."""
 CONFIRMED_WITHIN_S: Final = 30.0
 LONGEST_WAIT_S: Final = 600.0
 HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
 PAUSE_S: Final = 0.05
 CURVES_AFTER_S: Final = 60.0
-"""Delay of the first curves, which have to be worked out first."""
 CURVES_EVERY_S: Final = 6 * 3600.0
 INBOX: Final = 64
-AIRCRAFT, CURVE = "aircraft", "curve/"
-"""Marks: the last aircraft, and the curve that was told last."""
+AIRCRAFT_MARK, CURVE_MARKS = "aircraft", "curve/"
 
 FORMAT_VERSION: Final = 1
 MOST_RANGES: Final = 256
@@ -92,10 +88,9 @@ class AircraftFleet:
         self._inbox: deque[Incoming] = deque(maxlen=INBOX)
         self._woken = asyncio.Event()
         self._kept: list[Kept] = []
-        self._of: str | None = None
-        self._news = True
+        self._aircraft: str | None = None
+        self._has_news = True
         self._caught_up = False
-        """True once files of earlier runs were read."""
         self._started_s = 0.0
         self._curves_s = math.inf
         self._connection: tuple[MqttLink, int] | None = None
@@ -107,15 +102,12 @@ class AircraftFleet:
         self._expires_s = 0.0
         self._wait_s = CONFIRMED_WITHIN_S
         self._problem: str | None = None
-        self._fault = ""
-        """Last fault of the program, logged once."""
 
     def status(self) -> Object:
-        """For `companion status` and `check`."""
         waiting = sum(kept.waiting for kept in self._kept)
         confirmed_at = max((kept.confirmed_at for kept in self._kept if kept.confirmed_at), default=None)
-        told = "never confirmed so far" if confirmed_at is None else f"last confirmed {confirmed_at[:16]}Z"
-        words = f"{waiting or 'no'} item{'' if waiting == 1 else 's'} waiting for the fleet, {told}"
+        last = "never confirmed so far" if confirmed_at is None else f"last confirmed {confirmed_at[:16]}Z"
+        words = f"{waiting or 'no'} item{'' if waiting == 1 else 's'} waiting for the fleet, {last}"
         if self._problem is not None:
             words = f"{words}; {self._problem}"
         elif self._nameless:
@@ -123,7 +115,7 @@ class AircraftFleet:
         return {
             "good": self._problem is None and not self._nameless,
             "summary": words,
-            "aircraft": self._of,
+            "aircraft": self._aircraft,
             "waiting": waiting,
             "confirmed_at": confirmed_at,
             "kept": [kept._asdict() for kept in self._kept],
@@ -141,16 +133,17 @@ class AircraftFleet:
             self._woken.set()
 
     async def run(self) -> None:
-        """Keep and send until cancelled; never raises anything else."""
         self._started_s = asyncio.get_running_loop().time()
         self._curves_s = self._started_s + CURVES_AFTER_S
         try:
             while True:
-                problems = [await self._try(step) for step in (self._listen, self._take, self._greet, self._send)]
+                problems = [
+                    await self._try(step) for step in (self._read_answers, self._collect, self._greet, self._send)
+                ]
                 self._problem = next((each for each in problems if each is not None), None)
                 self._woken.clear()
                 if not self._inbox:
-                    await comes(self._woken, LOOK_S)
+                    await comes(self._woken, COLLECT_EVERY_S)
         finally:
             self._items.close()
 
@@ -158,48 +151,49 @@ class AircraftFleet:
         """Run a step; return its error in words. Keeping and sending do not hinder each other."""
         try:
             await step()
-        except CompanionError as error:
-            if str(error) != self._problem:
-                logger.warning("fleet: %s", error)
-            return str(error)
         except Exception as error:
-            fault, self._fault = self._fault, f"{type(error).__name__} {step.__name__}"
-            logger.log(logging.DEBUG if fault == self._fault else logging.ERROR, "fleet", exc_info=True)
+            is_known = isinstance(error, CompanionError)
+            words = str(error) if is_known else f"internal error: {error!r}"
+            if words != self._problem:
+                logger.warning("fleet: %s", words, exc_info=not is_known)
+            return words
         return None
 
-    # --- keeping
+    # --- collecting
 
-    async def _take(self) -> None:
-        if self._of is None:
-            marks = await self._offload(self._items.marks, AIRCRAFT)
-            self._of = marks[AIRCRAFT].value if marks else None
+    async def _collect(self) -> None:
+        if not self._caught_up:
+            marks = await self._offload(self._items.marks, AIRCRAFT_MARK)
+            self._aircraft = marks[AIRCRAFT_MARK].value if marks else None
             await self._count()
+            if self._aircraft is not None:
+                # What an earlier run has left is of the aircraft that there was then.
+                await self._collect_all(CurrentAircraft(self._aircraft, None, self._clock()))
+            self._caught_up = True
         uid, system_id = self._daemon.vehicle.get("uid"), self._daemon.vehicle.get("system_id")
-        if self._of is not None and not self._caught_up:
-            # What an earlier run has left is of the aircraft that there was then.
-            await self._take_all(CurrentAircraft(self._of, None, self._clock()))
-        self._caught_up = True
         if uid is None:
             return
-        look = CurrentAircraft(uid, system_id, self._clock())
-        if uid != self._of:
-            moved = [look.item("event", utc_now(), {"what": "airframe changed", "before": self._of})]
-            await self._add(uid, [SourceItems({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
-            self._of = uid
-        self._news |= await self._offload(self._sources.has_news)
-        if self._news:
-            await self._take_all(look)
-            self._news = False
+        current = CurrentAircraft(uid, system_id, self._clock())
+        if uid != self._aircraft:
+            moved = [current.item("event", utc_now(), {"what": "airframe changed", "before": self._aircraft})]
+            await self._add(
+                uid, [SourceItems({AIRCRAFT_MARK: Mark("", uid)}, moved if self._aircraft is not None else [])]
+            )
+            self._aircraft = uid
+        self._has_news |= await self._offload(self._sources.has_news)
+        if self._has_news:
+            await self._collect_all(current)
+            self._has_news = False
         now_s = asyncio.get_running_loop().time()
         if now_s >= self._curves_s:
             self._curves_s = now_s + CURVES_EVERY_S
-            await self._take_curves(look)
+            await self._collect_curves(current)
 
-    async def _take_all(self, look: CurrentAircraft) -> None:
+    async def _collect_all(self, current: CurrentAircraft) -> None:
         batch: list[SourceItems] = [SourceItems({})] * BATCH
         while len(batch) == BATCH:
-            batch = await self._offload(lambda: list(islice(self._sources.entries(look), BATCH)))
-            await self._add(look.aircraft, batch)
+            batch = await self._offload(lambda: list(islice(self._sources.entries(current), BATCH)))
+            await self._add(current.aircraft, batch)
             # A history is no hurry.
             await asyncio.sleep(PAUSE_S)
 
@@ -208,17 +202,16 @@ class AircraftFleet:
             await self._offload(self._items.add, aircraft, entries, utc(utc_now()))
             await self._count()
 
-    async def _take_curves(self, look: CurrentAircraft) -> None:
-        """Keep the curves of biases over temperature that differ from those told last."""
-        marks = await self._offload(self._items.marks, f"{CURVE}{look.aircraft}/")
+    async def _collect_curves(self, current: CurrentAircraft) -> None:
+        marks = await self._offload(self._items.marks, f"{CURVE_MARKS}{current.aircraft}/")
         entries = []
         reply = await self._daemon.result({"command": "temperature", "face": "fleet"})
         for imu in reply["imus"]:
             body = {key: imu[key] for key in ("imu", "power_ups", "days", "curve", "accel_curve")}
-            key, mark = f"{CURVE}{look.aircraft}/{imu['imu']}", Mark("", imu["summary"])
+            key, mark = f"{CURVE_MARKS}{current.aircraft}/{imu['imu']}", Mark("", imu["summary"])
             if imu["curve"] and marks.get(key) != mark:
-                entries.append(SourceItems({key: mark}, [look.item("curve", utc_now(), body)]))
-        await self._add(look.aircraft, entries)
+                entries.append(SourceItems({key: mark}, [current.item("curve", utc_now(), body)]))
+        await self._add(current.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
         """Return how good the clock was at a time: good within this run where the autopilot's GNSS confirms it now."""
@@ -230,20 +223,20 @@ class AircraftFleet:
     async def _count(self) -> None:
         self._kept = await self._offload(self._items.aircraft)
 
-    # --- hearing
+    # --- answers of the collector
 
-    async def _listen(self) -> None:
-        heard = bool(self._inbox)
+    async def _read_answers(self) -> None:
+        if not self._inbox:
+            return
         while self._inbox:
             message = self._inbox.popleft()
             said = parse(message.payload)
             for kept in self._kept:
-                if said is not None and message.topic in _heard(kept.aircraft):
-                    await self._heed(kept.aircraft, *said, confirmed=message.topic.endswith("/confirmed"))
-        if heard:
-            await self._count()
+                if said is not None and message.topic in _answer_topics(kept.aircraft):
+                    await self._handle_answer(kept.aircraft, *said, confirmed=message.topic.endswith("/confirmed"))
+        await self._count()
 
-    async def _heed(self, aircraft: str, epoch: str, sequences: list[Range], *, confirmed: bool) -> None:
+    async def _handle_answer(self, aircraft: str, epoch: str, sequences: list[Range], *, confirmed: bool) -> None:
         if confirmed:
             if await self._offload(self._items.confirm, aircraft, epoch, sequences, utc(utc_now())):
                 self._under_way -= {
@@ -278,12 +271,12 @@ class AircraftFleet:
         if now_s - self._hello_s < HELLO_AGAIN_S and all(kept.aircraft in self._greeted for kept in news):
             return
         for kept in news:
-            for topic in _heard(kept.aircraft):
-                await link.hear(topic)
+            for topic in _answer_topics(kept.aircraft):
+                await link.subscribe(topic)
             hello = {
                 "format_version": FORMAT_VERSION,
                 "aircraft": kept.aircraft,
-                "name": self._settings.name if kept.aircraft == self._of else None,
+                "name": self._settings.name if kept.aircraft == self._aircraft else None,
                 "epoch": kept.epoch,
                 "first": kept.first,
                 "last": kept.last,
@@ -321,7 +314,7 @@ class AircraftFleet:
         self._expires_s = now_s + self._wait_s
 
 
-def _heard(aircraft: str) -> tuple[str, str]:
+def _answer_topics(aircraft: str) -> tuple[str, str]:
     return f"fleet/{aircraft}/confirmed", f"fleet/{aircraft}/wanted"
 
 
@@ -339,10 +332,9 @@ def parse(payload: bytes) -> tuple[str, list[Range]] | None:
 
 
 def encode_item(waiting: Waiting, location: Location) -> bytes:
-    """Encode the payload of an item, with the place as exact as configured."""
-    told = waiting.item
+    item = waiting.item
     try:
-        body = msgspec.json.decode(told.body)
+        body = msgspec.json.decode(item.body)
     except UNREADABLE:
         body = {}  # the disk has spoilt it
     return msgspec.json.encode(
@@ -351,9 +343,9 @@ def encode_item(waiting: Waiting, location: Location) -> bytes:
             "aircraft": waiting.aircraft,
             "epoch": waiting.epoch,
             "sequence": waiting.sequence,
-            "kind": told.kind,
-            "at": told.at,
-            "clock": told.clock,
+            "kind": item.kind,
+            "at": item.at,
+            "clock": item.clock,
             "body": body if location == "full" else _less_place(body, location),
         }
     )

@@ -23,16 +23,10 @@ TOLD: Final = "told"
 _WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles", "flights")
 _NAME: Final = re.compile(r"([a-z0-9][a-z0-9._-]*)\.json")
 _LISTED: Final = 200
-"""Most entries of a list; the daemon keeps no more."""
 FORMAT_VERSION: Final = 1
-
-Told = tuple[str, list[Item]]
-"""The value of the mark, and the items."""
 
 
 class _Keys(msgspec.Struct, frozen=True):
-    """Keys that are needed here, of a file or an entry of any kind."""
-
     system_id: int | None = None
     undone_at: str | None = None
     started_at: str = ""
@@ -52,34 +46,29 @@ _Found = tuple[_Keys, Object]
 
 
 def utc(at: str) -> str:
-    """Return a time of a record in the contract's form."""
     return f"{at.removesuffix('+00:00')}Z" if at.endswith("+00:00") else at
 
 
 class CurrentAircraft(msgspec.Struct, frozen=True):
-    """Aircraft that the items found now belong to."""
+    """Aircraft that the items found now belong to, and what tells how good the clock was at a time."""
 
     aircraft: str
     system_id: int | None
     """MAVLink system; records of another one do not belong to the aircraft. None: all do."""
     clock: Callable[[str], Clock]
-    """Returns how good the clock was at a time."""
 
     def owns(self, system_id: int | None) -> bool:
-        """Return whether a record of that MAVLink system belongs to the aircraft."""
         return self.system_id is None or system_id in (None, self.system_id)
 
     def item(self, kind: str, at: str, body: object) -> Item:
-        """Make an item."""
         return Item(kind, utc(at), self.clock(at), msgspec.json.encode(body))
 
     def undo(self, what: str, of: str, undone_at: str) -> Item:
-        """Make the item of an undo of what was written by `what` at `of`."""
         return self.item("undo", undone_at, {"what": what, "of": of, "undone_at": undone_at})
 
 
 class Sources:
-    """Files of one storage directory; marks of what was told are in `items`. Reading blocks."""
+    """Files of one storage directory; `items` keeps the marks of what was told. Reading blocks."""
 
     def __init__(self, directory: Path, items: FleetItems) -> None:
         self._directory, self._items = directory, items
@@ -96,34 +85,26 @@ class Sources:
         self._seen = seen
         return not (settled and self._settled)
 
-    def entries(self, look: CurrentAircraft) -> Iterator[SourceItems]:
+    def entries(self, current: CurrentAircraft) -> Iterator[SourceItems]:
         """Yield what was not told yet.
 
         Raises:
             StorageError: a list or a folder cannot be read.
         """
-        yield from self._records(look)
-        yield from self._alignments(look)
-        armings = {one.armed_at: body for one, body in self._listed("armings.json")}
-        yield from self._told(
-            ARMING, dict.fromkeys(armings, TOLD), lambda key, _: (TOLD, [look.item("arming", key, armings[key])])
-        )
-        yield from self._profiles(look)
-        yield from self._flights(look)
+        for source in (self._records, self._alignments, self._armings, self._profiles, self._flights):
+            yield from source(current)
 
-    def _told(self, prefix: str, stamps: Mapping[str, str], tell: Callable[[str, str], Told]) -> Iterator[SourceItems]:
-        """Yield an entry for each key whose stamp differs from its mark; `tell` makes it from the mark's value."""
+    def _changed(self, prefix: str, stamps: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+        """Yield each key whose stamp differs from its mark, with the mark's value; forget marks without a key."""
         marks = self._items.marks(prefix)
         for key, stamp in stamps.items():
             before = marks.pop(prefix + key, Mark("", ""))
             if before.stamp != stamp:
-                value, items = tell(key, before.value)
-                yield SourceItems({prefix + key: Mark(stamp, value)}, items)
+                yield key, before.value
         if marks:
             self._items.forget(marks)
 
     def _stamps(self, folder: str) -> dict[str, str]:
-        """Return the stamp of each JSON file of a folder by its name, in order."""
         path = self._directory / folder
         return {name: _stamp(path / f"{name}.json") for name in named_in(path, _NAME)}
 
@@ -141,83 +122,86 @@ class Sources:
         except msgspec.ValidationError as error:
             raise StorageError(f"{self._directory / name}: cannot be used: {error}") from error
 
-    def _records(self, look: CurrentAircraft) -> Iterator[SourceItems]:
-        parts = {key: mark.value for key, mark in self._items.marks(f"{IMU}{look.aircraft}/").items()}
-        changed: dict[str, Mark] = {}
+    def _records(self, current: CurrentAircraft) -> Iterator[SourceItems]:
+        parts = {key: mark.value for key, mark in self._items.marks(f"{IMU}{current.aircraft}/").items()}
+        stamps = self._stamps("records")
+        for number, before in self._changed(RECORD, stamps):
+            marks: dict[str, Mark] = {}
+            items: list[Item] = []
+            value, found = before, self._read(f"records/{number}.json")
+            if found is not None and current.owns(found[0].system_id):
+                record, body = found
+                began, _, undone_at = before.partition(" ")
+                if began != record.started_at:
+                    now = _parts(current, record)
+                    for key in now:
+                        if parts.get(key, now[key]) != now[key]:
+                            earlier, later = (msgspec.json.decode(ids) for ids in (parts[key], now[key]))
+                            event = {"what": "imu exchanged", "imu": key.rpartition("/")[2]}
+                            event |= {"before": earlier, "now": later}
+                            items.append(current.item("event", record.started_at, event))
+                    parts |= now
+                    marks = {key: Mark("", ids) for key, ids in now.items()}
+                    items.append(current.item("calibration", record.started_at, body))
+                if record.undone_at is not None and undone_at != record.undone_at:
+                    items.append(current.undo("calibration", record.started_at, record.undone_at))
+                value = f"{record.started_at} {record.undone_at or ''}"
+            yield SourceItems({RECORD + number: Mark(stamps[number], value), **marks}, items)
 
-        def tell(number: str, before: str) -> Told:
-            found = self._read(f"records/{number}.json")
-            if found is None or not look.owns(found[0].system_id):
-                return before, []
-            record, body = found
-            began, _, undone_at = before.partition(" ")
-            items = []
-            if began != record.started_at:
-                for imu in record.imus:
-                    name, ids = imu.get("name", ""), {key: imu.get(key) for key in ("gyro_id", "accel_id")}
-                    if ids == {"gyro_id": None, "accel_id": None}:
-                        continue
-                    key, now = f"{IMU}{look.aircraft}/{name}", msgspec.json.encode(ids).decode()
-                    if parts.get(key, now) != now:
-                        earlier = msgspec.json.decode(parts[key])
-                        event = {"what": "imu exchanged", "imu": name, "before": earlier, "now": ids}
-                        items.append(look.item("event", record.started_at, event))
-                    parts[key], changed[key] = now, Mark("", now)
-                items.append(look.item("calibration", record.started_at, body))
-            if record.undone_at is not None and undone_at != record.undone_at:
-                items.append(look.undo("calibration", record.started_at, record.undone_at))
-            return f"{record.started_at} {record.undone_at or ''}", items
-
-        for entry in self._told(RECORD, self._stamps("records"), tell):
-            yield SourceItems({**entry.marks, **changed}, entry.items)
-            changed.clear()
-
-    def _alignments(self, look: CurrentAircraft) -> Iterator[SourceItems]:
+    def _alignments(self, current: CurrentAircraft) -> Iterator[SourceItems]:
         listed = self._listed("by-hand.json")
         # "predicted": gyro offsets that version 0.1 wrote.
         done = {f"{one.what} {one.measured_at}": (one, body) for one, body in listed if one.state != "predicted"}
-
-        def tell(key: str, before: str) -> Told:
+        stamps = {key: one.undone_at or TOLD for key, (one, _) in done.items()}
+        for key, before in self._changed(BY_HAND, stamps):
             one, body = done[key]
             items: list[Item] = []
-            if not look.owns(one.system_id):
-                return before, items
-            if before != TOLD:
+            owned = current.owns(one.system_id)
+            if owned and before != TOLD:
                 told = {"undone_at": None, **body, "record": self._figures(one.measured_at)}
-                items.append(look.item("alignment", one.measured_at, told))
-            if one.undone_at is not None:
-                items.append(look.undo(one.what, one.measured_at, one.undone_at))
-            return TOLD, items
-
-        return self._told(BY_HAND, {key: one.undone_at or TOLD for key, (one, _) in done.items()}, tell)
+                items.append(current.item("alignment", one.measured_at, told))
+            if owned and one.undone_at is not None:
+                items.append(current.undo(one.what, one.measured_at, one.undone_at))
+            yield SourceItems({BY_HAND + key: Mark(stamps[key], TOLD if owned else before)}, items)
 
     def _figures(self, measured_at: str) -> Object | None:
-        """Return the record of an alignment, while it is the latest of its kind."""
         for name in ("alignment.json", "faces.json"):
             found = self._read(name)
             if found is not None and found[0].measured_at == measured_at:
                 return found[1]
         return None
 
-    def _profiles(self, look: CurrentAircraft) -> Iterator[SourceItems]:
-        def tell(name: str, before: str) -> Told:
+    def _armings(self, current: CurrentAircraft) -> Iterator[SourceItems]:
+        armings = {one.armed_at: body for one, body in self._listed("armings.json")}
+        for at, _ in self._changed(ARMING, dict.fromkeys(armings, TOLD)):
+            yield SourceItems({ARMING + at: Mark(TOLD, TOLD)}, [current.item("arming", at, armings[at])])
+
+    def _profiles(self, current: CurrentAircraft) -> Iterator[SourceItems]:
+        stamps = self._stamps("profiles")
+        for name, before in self._changed(PROFILE, stamps):
             found = self._read(f"profiles/{name}.json")
-            if found is None or found[0].saved_at == before:
-                return before, []
-            return found[0].saved_at, [look.item("profile", found[0].saved_at, found[1])]
+            value = before if found is None else found[0].saved_at
+            items = [] if found is None or value == before else [current.item("profile", value, found[1])]
+            yield SourceItems({PROFILE + name: Mark(stamps[name], value)}, items)
 
-        return self._told(PROFILE, self._stamps("profiles"), tell)
-
-    def _flights(self, look: CurrentAircraft) -> Iterator[SourceItems]:
-        def tell(number: str, before: str) -> Told:
-            found = self._read(f"flights/{number}.json")
+    def _flights(self, current: CurrentAircraft) -> Iterator[SourceItems]:
+        stamps = self._stamps("flights")
+        for number, before in self._changed(FLIGHT, stamps):
+            items: list[Item] = []
+            value, found = before, self._read(f"flights/{number}.json")
             flight = None if found is None else found[0].flight
             # A flight whose log was read again is the same flight.
-            if found is None or flight is None or before == flight.key or not look.owns(flight.system_id):
-                return before, []
-            return flight.key, [look.item("flight", flight.began_at or found[0].read_at, found[1])]
+            if found is not None and flight is not None and flight.key != before and current.owns(flight.system_id):
+                value = flight.key
+                items.append(current.item("flight", flight.began_at or found[0].read_at, found[1]))
+            yield SourceItems({FLIGHT + number: Mark(stamps[number], value)}, items)
 
-        return self._told(FLIGHT, self._stamps("flights"), tell)
+
+def _parts(current: CurrentAircraft, record: _Keys) -> dict[str, str]:
+    """Return the device ids of the record's IMUs as JSON, by the key of their marks; IMUs without ids are left out."""
+    ids = {imu.get("name", ""): {key: imu.get(key) for key in ("gyro_id", "accel_id")} for imu in record.imus}
+    known = {name: each for name, each in ids.items() if any(value is not None for value in each.values())}
+    return {f"{IMU}{current.aircraft}/{name}": msgspec.json.encode(each).decode() for name, each in known.items()}
 
 
 def _stamp(path: Path) -> str:

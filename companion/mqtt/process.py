@@ -26,10 +26,8 @@ _json: Final = msgspec.json.encode
 MEMORY_MIB: Final = 128
 """The process needs 30 MiB, the fleet's part included."""
 FOUND_WITHIN_S: Final = 3.0
-"""Wait this long for the autopilot's system id; without it the vehicle is number 1, as on MAVLink."""
 NEWS_WITHIN_S: Final = 1.0
 PROGRESS_S: Final = 0.5
-AFTER_FAULT_S: Final = 30.0
 ANSWER_AT_END_S: Final = 0.5
 FLUSH_S: Final = 1.0
 
@@ -59,7 +57,6 @@ class MqttProcess:
             self.fleet = AircraftFleet(config.fleet, config.storage.path, self.daemon, lambda: self.link)
 
     def status(self) -> Object:
-        """Return the connection's state, for `companion status` and `check`; the fleet's under its own key."""
         fleet: Object | None = None if self.fleet is None else self.fleet.status()
         if self._only_listening and self._has_fleet:
             fleet = {"good": True, "summary": "not looked at in a check: companion status, once the daemon runs"}
@@ -71,17 +68,21 @@ class MqttProcess:
     async def run(self) -> None:
         """Serve the broker until cancelled. In a check the broker is only connected to."""
         if self._only_listening:
-            await self._connect_only()
+            self.topics = Topics(self._base())
+            self.link = MqttLink(self._settings, client_id=f"{self._client_id(self.topics.base)}-check")
+            await self.link.run()
         async with asyncio.TaskGroup() as group:
-            group.create_task(self.daemon.follow(), name="daemon")
+            tasks = [group.create_task(self.daemon.follow(), name="daemon")]
             if self.fleet is not None:
-                group.create_task(self.fleet.run(), name="fleet")
-            group.create_task(self._publish_forever(), name="publisher")
+                tasks.append(group.create_task(self.fleet.run(), name="fleet"))
+            try:
+                await self._publish_forever()
+            finally:
+                for task in tasks:
+                    task.cancel()
 
-    async def _ask(self, request: Object) -> AsyncGenerator[Object, None]:
-        async with contextlib.aclosing(ask(self._socket, {"face": "mqtt", **request})) as replies:
-            async for reply in replies:
-                yield reply
+    def _ask(self, request: Object) -> AsyncGenerator[Object, None]:
+        return ask(self._socket, {"face": "mqtt", **request})
 
     @property
     def _known_system_id(self) -> int | None:
@@ -98,52 +99,57 @@ class MqttProcess:
         await comes(self.daemon.news, NEWS_WITHIN_S)
         self.daemon.news.clear()
 
-    async def _connect_only(self) -> None:
-        base = self._base()
-        self.topics = Topics(base)
-        self.link = MqttLink(self._settings, client_id=f"{self._client_id(base)}-check")
-        await self.link.run()
-
     async def _publish_forever(self) -> None:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(FOUND_WITHIN_S):
                 while self._settings.base_topic is None and self._known_system_id is None:
                     await self._news()
         while True:
-            try:
-                await self._publish_as(self._base())
-            except MemoryError:
-                raise
-            except Exception:
-                logger.exception("MQTT met a fault of the program; it begins again in %.0f s", AFTER_FAULT_S)
-                await asyncio.sleep(AFTER_FAULT_S)
+            await self._publish_as(Topics(self._base()))
 
-    async def _publish_as(self, base: str) -> None:
+    async def _publish_as(self, topics: Topics) -> None:
         """Serve under a base topic until the vehicle has another one."""
-        self.topics = topics = Topics(base)
+
+        def respond(command: str, response: Object) -> None:
+            droppable = response["state"] == "refused" or "repeated" in response
+            link.outbox.answer(topics.response + command, _json(response), droppable=droppable)
+
+        def on_message(message: Incoming) -> None:
+            if message.topic == topics.status:
+                if message.payload != ONLINE and link.outbox.kept(topics.status) == ONLINE:
+                    # The last will of an earlier connection, come late.
+                    link.outbox.keep(topics.status, ONLINE, again=True)
+            elif message.topic.startswith(topics.request):
+                command = message.topic.removeprefix(topics.request)
+                requests.accept(command, message.payload, retained=message.retained)
+            elif self.fleet is not None:
+                self.fleet.on_message(message)
+
+        requests = Requests(self.daemon.ask, topics.request, respond)
+        self.topics = topics
         self.link = link = MqttLink(
             self._settings,
-            client_id=self._client_id(base),
+            client_id=self._client_id(topics.base),
             will=(topics.status, OFFLINE),
             subscriptions=(f"{topics.request}+", topics.status),
-            on_message=self._on_message,
+            on_message=on_message,
         )
-        self._requests = Requests(self.daemon.ask, self._respond, self._on_retained)
         self._pace, self._progress, self._progress_s = Pace(), b"", -math.inf
         running = asyncio.get_running_loop().create_task(link.run(), name="mqtt link")
         try:
-            while self._base() == base:
+            while self._base() == topics.base:
                 self._publish(link, topics)
                 if running.done():
                     running.result()
                 await self._news()
-            logger.info("mqtt: the vehicle is %s, no longer %s", self._base(), base)
-            await self._requests.close(ANSWER_AT_END_S)
+            logger.info("mqtt: the vehicle is %s, no longer %s", self._base(), topics.base)
+            await requests.close(ANSWER_AT_END_S)
             for topic in topics.kept:
                 link.outbox.keep(topic, b"")  # the broker forgets it
         except asyncio.CancelledError:
-            await self._requests.close(ANSWER_AT_END_S)
-            await self.daemon.refresh()
+            await requests.close(ANSWER_AT_END_S)
+            self.daemon.news.clear()
+            await self._news()  # such as the record of what was cancelled just now
             self._publish(link, topics)
             link.outbox.keep(topics.status, OFFLINE)
             raise
@@ -169,37 +175,10 @@ class MqttProcess:
         progress = b"" if job is None else _json(job)
         busy = daemon.status["progress"] is not None
         if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not busy):
-            outbox.pass_on(topics.progress, progress)
+            outbox.send_telemetry(topics.progress, progress)
             self._progress, self._progress_s = progress, now_s
         if daemon.pose is not None:
-            outbox.pass_on(topics.attitude, _json(daemon.pose))
-
-    # --- messages received
-
-    def _on_message(self, message: Incoming) -> None:
-        if self.topics is None or self.link is None:
-            return
-        if message.topic == self.topics.status:
-            if message.payload != ONLINE and self.link.outbox.kept(message.topic) == ONLINE:
-                # The last will of an earlier connection, come late.
-                self.link.outbox.keep(message.topic, ONLINE, again=True)
-        elif message.topic.startswith(self.topics.request):
-            command = message.topic.removeprefix(self.topics.request)
-            self._requests.accept(command, message.payload, retained=message.retained)
-        elif self.fleet is not None:
-            self.fleet.on_message(message)
-
-    def _on_retained(self, command: str) -> None:
-        if self.topics is not None:
-            topic = self.topics.request + command
-            logger.warning(
-                "mqtt: the retained request at %s is not obeyed; delete it: mosquitto_pub -r -n -t %s", topic, topic
-            )
-
-    def _respond(self, command: str, response: Object) -> None:
-        if self.topics is not None and self.link is not None:
-            droppable = response["state"] == "refused" or "repeated" in response
-            self.link.outbox.answer(self.topics.response + command, _json(response), droppable=droppable)
+            outbox.send_telemetry(topics.attitude, _json(daemon.pose))
 
 
 def summary(status: Object) -> Object:
@@ -216,28 +195,27 @@ def summary(status: Object) -> Object:
 
 
 class Pace:
-    """Says when a state is worth a message.
+    """Decides when a state is worth a message.
 
     At once when the state itself changes, within a second when anything else does; every ten seconds when only words
     change that tell how long ago something was.
     """
 
     def __init__(self) -> None:
-        self._said: Object | None = None
-        self._said_s = 0.0
+        self._sent: Object | None = None
+        self._sent_s = 0.0
 
     def is_due(self, state: Object, now_s: float) -> bool:
-        """Return whether to send a state now; then it counts as sent."""
-        said = self._said
-        if said == state:
+        sent = self._sent
+        if sent == state:
             return False
         due = (
-            said is None
-            or said["state"] != state["state"]
-            or now_s - self._said_s >= (SLOW_S if _lasting(said) == _lasting(state) else LEAST_S)
+            sent is None
+            or sent["state"] != state["state"]
+            or now_s - self._sent_s >= (SLOW_S if _lasting(sent) == _lasting(state) else LEAST_S)
         )
         if due:
-            self._said, self._said_s = state, now_s
+            self._sent, self._sent_s = state, now_s
         return due
 
 
@@ -246,7 +224,7 @@ def _lasting(state: Object) -> Object:
 
 
 class Topics:
-    """All topics under one base, such as "companion/1"."""
+    """All topics under one base, such as "companion/1"; those of requests and responses lack the command's name."""
 
     def __init__(self, base: str) -> None:
         self.base = base
@@ -254,4 +232,3 @@ class Topics:
         self.kept = (self.status, self.state, self.record)
         self.progress, self.attitude = f"{base}/calibration/progress", f"{base}/attitude"
         self.request, self.response = f"{base}/request/", f"{base}/response/"
-        """Topics of a request and its response, without the name of the command."""

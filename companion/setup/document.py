@@ -24,12 +24,10 @@ class _Block:
     lines: list[str]
 
     def last_key(self) -> int:
-        """The index of the last line that is a key, on or off, or the header."""
         keys = [index for index, line in enumerate(self.lines) if index and _KEY.match(line)]
         return keys[-1] if keys else 0
 
     def set(self, key: str, value: Any) -> None:
-        """Let the section say so; None: let it say nothing of it."""
         places = [(index, match) for index, line in enumerate(self.lines) if (match := _KEY.match(line))]
         mine = sorted(
             ((match["off"] is not None, index, match) for index, match in places if match["key"] == key),
@@ -46,7 +44,6 @@ class _Block:
 
 
 def toml(value: Any) -> str:
-    """A value as TOML has it: texts, numbers, truths, and lists of them."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml, value))}]"
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)

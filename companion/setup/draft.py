@@ -34,16 +34,12 @@ _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compas
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question for the operator."""
-
     words: str
     now: str
-    """Present answer."""
     put: Callable[[str], None]
     """Accepts an answer; raises ConfigError, in one line, for a wrong one."""
     hint: str = ""
     choices: Sequence[str] = ()
-    """Answers that a page shows as buttons."""
     key: str = ""
 
 
@@ -56,22 +52,18 @@ class Draft:
         self.guessed: set[str] = set()
 
     def result(self) -> str:
-        """Return the new text; raise CompanionError where single lines of it cannot be changed."""
         return render(self.text, self.wanted)
 
     def parsed(self) -> Config:
-        """Parse the new text; raise ConfigError with one line where it is wrong."""
         # Names of saved profiles are for the daemon to look up.
         return config.parse(self.result(), "answer", lambda _, name: name)
 
     @property
     def url(self) -> str | None:
-        """The autopilot's url, unless it is the sample's."""
         return None if self.is_new else str(self.wanted["mavlink"]["url"])
 
     @property
     def lines(self) -> dict[str, Line]:
-        """Return the line settings of the configured ports."""
         if self.is_new:
             return {}
         found = {}
@@ -86,7 +78,6 @@ class Draft:
         return found
 
     def take_url(self, url: str) -> None:
-        """Set the autopilot's url; raise ConfigError for a wrong one."""
         self._put("mavlink", "url", url)
         self.is_new = False
 
@@ -96,12 +87,10 @@ class Draft:
         self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
     def show_page(self, bind: str) -> None:
-        """Add the page at an address unless there is one; raise ConfigError where it is no address."""
         if "web" not in self.wanted:
             self._put("web", "bind", bind)
 
     def section(self, kind: Kind) -> Table | None:
-        """Return the section of a device; of IMUs the first on a port of its own."""
         if kind == "imu":
             return next((imu for imu in self.wanted["imu"] if imu.get("source") == "serial"), None)
         found: Table | None = self.wanted.get(kind)
@@ -134,7 +123,6 @@ class Draft:
                 self.guessed.add("gradienter.law")
 
     def other_imus(self) -> list[Table]:
-        """List sections for further IMUs that the autopilot may have."""
         imus = self.wanted["imu"]
         taken = {
             imu.get("instance", 1) if imu["source"] == "autopilot" else imu.get("autopilot_instance") for imu in imus
@@ -147,7 +135,6 @@ class Draft:
         ]
 
     def questions(self) -> Iterator[Question]:
-        """Yield the questions, with the answers that hold at present."""
         yield Question(
             "Where is it calibrated: on the ground, or on a deck (a boat)?",
             self.wanted.get("vehicle", {}).get("platform", "ground"),
@@ -228,17 +215,14 @@ class Draft:
 
 
 def part_key(name: str) -> str:
-    """Name the question for the part of an IMU."""
     return f"imu.{name}.profile"
 
 
 def storage_beside(path: Path) -> Path:
-    """Return the folder of the records for a configuration that is somebody's own file."""
     return path.absolute().with_name("companion-state")
 
 
 def one_of(words: str, allowed: Sequence[str]) -> str:
-    """Return the only choice that begins with these words."""
     found = [choice for choice in allowed if words and choice.startswith(words.strip().lower())]
     if len(found) != 1:
         raise ConfigError(f"found {shown(words)}; allowed: {', '.join(allowed)}")
@@ -263,7 +247,6 @@ def _mounting(words: str) -> str | list[float]:
 
 
 def mounting_words(mounting: Any) -> str:
-    """Format a mounting as an answer."""
     if not isinstance(mounting, str):
         return " ".join(f"{angle:g}" for angle in mounting)
     if mounting == "ROTATION_NONE":
@@ -273,12 +256,10 @@ def mounting_words(mounting: Any) -> str:
 
 
 def sample() -> str:
-    """Return the sample configuration of this version."""
     return installing.content(installing.SAMPLE).decode()
 
 
 def begin(path: Path) -> Draft:
-    """Load the configuration, or the sample where there is none; raise ConfigError where it cannot be used."""
     try:
         text = read_regular(path, config.MOST_BYTES).decode()
     except FileNotFoundError:
@@ -292,7 +273,6 @@ def begin(path: Path) -> Draft:
 
 
 def is_writable(path: Path) -> bool:
-    """Return whether the file may be written, or made."""
     folder = path.parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -300,7 +280,6 @@ def is_writable(path: Path) -> bool:
 
 
 def holds(path: Path, text: str) -> bool:
-    """Return whether the file exists with just this content."""
     try:
         return read_regular(path, config.MOST_BYTES) == text.encode()
     except OSError:

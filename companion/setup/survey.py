@@ -32,8 +32,6 @@ listens longer."""
 
 
 class HeardUdp(asyncio.DatagramProtocol):
-    """Messages heard on a UDP port."""
-
     def __init__(self, senders: Iterable[Heartbeat] = (), *, from_here: bool = True) -> None:
         self.senders = dict.fromkeys(senders)
         self.from_here = from_here
@@ -42,11 +40,9 @@ class HeardUdp(asyncio.DatagramProtocol):
 
     @property
     def autopilot(self) -> Heartbeat | None:
-        """The first autopilot heard."""
         return next((one for one in self.senders if one.is_autopilot), None)
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        """Note the senders of a datagram."""
         self.datagrams += 1
         self.from_here &= ipaddress.ip_address(addr[0]).is_loopback
         self.senders |= dict.fromkeys(heartbeats(data))
@@ -74,14 +70,11 @@ async def listen_udp(port: int) -> HeardUdp:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Everything heard on every port."""
-
     serial: dict[str, Heard | str]
     udp: dict[int, HeardUdp | str]
 
     @property
     def autopilots(self) -> list[str]:
-        """List the urls of the autopilots, those on wires of their own first."""
         wired = [
             f"serial:{port}:{heard.line.baud}"
             for port, heard in self.serial.items()
@@ -110,7 +103,6 @@ class Survey:
         return any(not isinstance(found, str) for found in heard)
 
     def silent_url(self, url: str) -> bool:
-        """Return whether no autopilot was heard at a MAVLink url."""
         kind, where, number = parse_url(url)
         if kind == "serial":
             return self.silent(where)
@@ -118,7 +110,6 @@ class Survey:
 
 
 def same_port(one: str, other: str) -> bool:
-    """Return whether two names are one serial port."""
     return resolve(ROOT, one) == resolve(ROOT, other)
 
 
@@ -134,8 +125,6 @@ Tell = Callable[[str, str], None]
 
 
 async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed: Believed) -> Survey:
-    """Listen to all at the same time; half a minute at the most."""
-
     async def one(port: int) -> HeardUdp | str:
         found: HeardUdp | str
         try:
@@ -156,7 +145,6 @@ async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed:
 
 
 def in_words(place: str, found: Heard | HeardUdp | str) -> str:
-    """Describe what was heard at a place, in one line."""
     if isinstance(found, str):
         return f"left alone: {found.removeprefix(f'{place}: ')}"
     if isinstance(found, HeardUdp):

@@ -39,7 +39,6 @@ def split_address(bind: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only programs on this board can reach an address."""
     return host == "localhost" or ipaddress.ip_address(host).is_loopback
 
 
@@ -51,7 +50,6 @@ def page_url(host: str, port: int) -> str:
 
 
 def new_token() -> str:
-    """Make a token such as "k7xm-p2qd-9rtw"."""
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(_GROUP)) for _ in range(_GROUPS))
 
 
@@ -102,7 +100,6 @@ class Access:
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
     def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
-        """Return why a request comes from another site's page; None: it comes from our own."""
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "asked by another site"
         origin, host = headers.get("origin"), headers.get("host", "")
@@ -111,7 +108,6 @@ class Access:
         return None
 
     def refuses_token(self, headers: Mapping[str, str]) -> str | None:
-        """Return why no action may be started; None: one may."""
         given = _bare(headers.get(TOKEN_HEADER, ""))
         if not given:
             return "needs the token: companion web-token, on the board, shows it"

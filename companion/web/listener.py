@@ -46,7 +46,6 @@ class Connection(H11Protocol):
         self._lost = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in H11Protocol
-        """Begin the deadline, and make the oldest connection end where there are too many."""
         super().connection_made(transport)
         endpoint = transport.get_extra_info("socket")
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
@@ -57,7 +56,6 @@ class Connection(H11Protocol):
         self._deadline = self.loop.call_later(ANSWERED_WITHIN_S, self.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the connection."""
         self._exempt()
         self._lost = True
         super().connection_lost(exc)
@@ -65,7 +63,6 @@ class Connection(H11Protocol):
             self._on_lost()
 
     def keep_open(self, on_lost: Callable[[], object]) -> None:
-        """Exempt a connection that carries a stream; call `on_lost` at its end."""
         self._exempt()
         if self._lost:
             on_lost()
@@ -73,7 +70,6 @@ class Connection(H11Protocol):
             self._on_lost = on_lost
 
     def abort(self) -> None:
-        """End the connection at once, whatever is still to be sent."""
         self._exempt()
         self.transport.abort()
 

@@ -36,7 +36,6 @@ logger = logging.getLogger(__name__)
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
 
 WORTH_S: Final = 10.0
-"""A page that was open for this long is opened again at once."""
 WRONG_TOKEN_S: Final = 2.0
 MAX_WAITING: Final = 16
 """The most answers to wrong tokens that are delayed at a time: each holds a connection."""
@@ -44,11 +43,9 @@ ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 MAX_VIEWERS: Final = 16
 MAX_STRANGERS: Final = 4
-"""The most viewers of one address without the token; on the board itself all have the same address."""
 MAX_BEHIND: Final = 20
 """Ten seconds of events: a viewer that has so many to read yet is dropped, and begins anew."""
 AGAIN_S: Final = 0.5
-"""Pause after which a companion that gave no status is asked again."""
 ACTIONS: Final = asked_by(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
 _STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
@@ -67,11 +64,9 @@ class Page:
         self.local = is_loopback(self._host)
         self.access = Access(new_token(), handed_out=self.local)
         self.problem: str | None = "not open yet"
-        """Why nobody can look, in one line; None while the page is there."""
         self._html = _assembled()
         self._tag = hashlib.sha256(self._html).hexdigest()[:16]
         self._viewers: dict[Viewer, None] = {}
-        """The oldest first."""
         self._looked_at = asyncio.Event()
         self._delayed = self._wrong_tokens = 0
         self._reconnection = Reconnection("page", worth_s=WORTH_S, first_s=1.0, cap_s=30.0, on_state=self._on_state)
@@ -90,7 +85,6 @@ class Page:
         )
 
     async def run(self) -> None:
-        """Serve until cancelled; an address that is not there yet is waited for."""
         await self._reconnection.keep(self._serve)
 
     async def _serve(self) -> str:
@@ -110,11 +104,9 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Address for a browser."""
         return page_url(self._host, self._port)
 
     def status(self) -> Object:
-        """Return what `companion status` shows."""
         return {
             "good": self.problem is None,
             "summary": self.problem or self.url + ("" if self.local else " (buttons: companion web-token)"),
@@ -188,7 +180,6 @@ class Page:
         return _json({key: value for key, value in reply.items() if key != "kind"})
 
     async def _result(self, asked: Object) -> Object:
-        """Return the last reply; an action that takes longer than a person waits goes on, and the events show it."""
         try:
             async with asyncio.timeout(ACTION_WITHIN_S):
                 async for reply in self._ask(asked):
@@ -240,7 +231,6 @@ class Page:
         return None
 
     async def _show_forever(self) -> NoReturn:
-        """Show the status, twice a second while anybody looks."""
         while True:
             await self._looked_at.wait()
             try:
@@ -266,21 +256,17 @@ class Page:
 
 
 class Viewer:
-    """One stream of events."""
-
     def __init__(self, connection: Connection, peer: str, *, has_token: bool) -> None:
         self.connection, self.peer, self.has_token = connection, peer, has_token
         self._events: asyncio.Queue[bytes] = asyncio.Queue(MAX_BEHIND)
 
     def send(self, event: bytes) -> None:
-        """Queue an event; drop the viewer when it reads too slowly."""
         try:
             self._events.put_nowait(event)
         except asyncio.QueueFull:
             self.connection.abort()
 
     async def events(self) -> AsyncIterator[bytes]:
-        """Yield the events."""
         while True:
             yield await self._events.get()
 
@@ -299,7 +285,6 @@ class _OwnNames:
 
 
 def file_name(record: Object) -> str:
-    """Name the download of a record by its time, without characters that file systems dislike."""
     return f"companion-{re.sub(r'[^0-9T]+', '-', str(record.get('started_at')))}.json"
 
 
@@ -315,7 +300,6 @@ def _json(value: object, status: int = 200) -> Response:
 
 
 async def _refuse(_request: Request, error: Exception) -> Response:
-    """Answer an error with its reason: a refusal of the companion is a conflict."""
     if not isinstance(error, HTTPException):
         return _json({"reason": str(error)}, 409)
     answer = _json({"reason": error.detail}, error.status_code)
@@ -328,7 +312,6 @@ def _peer(request: Request) -> str:
 
 
 def event(value: object, name: str | None = None) -> bytes:
-    """Encode a server-sent event."""
     head = f"event: {name}\n".encode() if name else b""
     return head + b"data: " + msgspec.json.encode(value) + b"\n\n"
 

@@ -16,8 +16,8 @@ import msgspec
 
 from companion.estimation.records.flight_record import AXES, Drift, ImuFlight, Split, Stages, Term
 from companion.estimation.records.record import ArmingRecord, ImuRecord, Record, WrittenParameter
-from companion.fleet.collector import connected, stop
-from companion.fleet.contract import FORMAT_VERSION
+from companion.fleet.collector import stop
+from companion.mqtt.fleet import FORMAT_VERSION
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 
@@ -209,7 +209,7 @@ class Aircraft:
         """Stay connected to the broker until cancelled; reconnect after every loss."""
         while True:
             with contextlib.suppress(*_LEAVES):
-                async with connected(aiomqtt.Client(host, port, identifier=f"aircraft-{self.id}")) as client:
+                async with aiomqtt.Client(host, port, identifier=f"aircraft-{self.id}") as client:
                     tasks = [asyncio.create_task(self._hear(client)), asyncio.create_task(self._tell(client))]
                     try:
                         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -76,7 +76,7 @@ def test_a_broker_without_mqtt_5_gets_one_collector(
     with caplog.at_level(logging.INFO):
         asyncio.run(main())
     assert items_in(database) == told_by(fleet)
-    assert "no MQTT 5 there, so one collector only; going on with MQTT 3.1.1" in caplog.text
+    assert "MQTT 3.1.1: no other collector beside this one" in caplog.text
 
 
 @pytest.mark.parametrize("database", KINDS, indirect=True)

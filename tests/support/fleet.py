@@ -96,7 +96,7 @@ class Connection:
         self.loses: Callable[[], bool] = lambda: False
         self.collector = Collector(self.deliver)
 
-    async def hear(self, topic: str) -> None:
+    async def subscribe(self, topic: str) -> None:
         self.heard.add(topic)
 
     def deliver(self, topic: str, payload: bytes, *, retained: bool = False) -> None:

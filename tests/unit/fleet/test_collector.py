@@ -8,18 +8,16 @@ from pathlib import Path
 import pytest
 
 from companion.errors import ConfigError
-from companion.fleet.collector import BATCH, BATCH_BYTES, WAITING, WAITING_BYTES, BoundedMessages, Inbox, load_broker
+from companion.fleet.collector import BATCH, BATCH_BYTES, WAITING, WAITING_BYTES, BoundedMessages, load_broker
 from companion.fleet.contract import MOST_BYTES
 from companion.mqtt.client import Incoming
 
 LARGEST = Incoming("fleet/0/item", bytes(MOST_BYTES))
 
 
-@pytest.mark.parametrize(
-    ("queue", "most", "most_bytes"), [(BoundedMessages, WAITING, WAITING_BYTES), (Inbox, BATCH, BATCH_BYTES)]
-)
-def test_what_waits_is_bounded_in_bytes_and_in_number(queue: type[BoundedMessages], most: int, most_bytes: int) -> None:
-    waiting = queue(most)
+@pytest.mark.parametrize(("most", "most_bytes"), [(WAITING, WAITING_BYTES), (BATCH, BATCH_BYTES)])
+def test_what_waits_is_bounded_in_bytes_and_in_number(most: int, most_bytes: int) -> None:
+    waiting = BoundedMessages(most, most_bytes)
     while not waiting.full():
         waiting.put_nowait(LARGEST)
     with pytest.raises(asyncio.QueueFull):

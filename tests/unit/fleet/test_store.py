@@ -17,10 +17,11 @@ import sqlalchemy as sa
 
 from companion.errors import CompanionError, LinkError, StorageError
 from companion.fleet import contract, schema
-from companion.fleet.contract import MOST_RANGES, answers, ranges
+from companion.fleet.contract import answers, ranges
 from companion.fleet.schema import url_of
 from companion.fleet.store import BatchResult, Store
 from companion.mqtt.client import Incoming
+from companion.mqtt.fleet import MOST_RANGES
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, items_in, rows_of, told_by
 from tests.support.fleet import check

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from companion.mqtt.client import MAX_ANSWERS, Outbox, Parcel
+from companion.mqtt.client import LONG_BYTES, MAX_ANSWERS, MOST_TRIES, Outbox
 
 pytestmark = pytest.mark.real_clock
 
@@ -53,10 +53,13 @@ def test_a_value_that_changes_while_it_is_sent_is_sent_again() -> None:
 def test_what_the_broker_never_takes_waits_for_another_value() -> None:
     async def main() -> None:
         box = Outbox()
-        box.keep("record", b"long")
-        box.sent(await box.next(), given_up=True)
+        long = bytes(LONG_BYTES + 1)
+        box.keep("record", long)
+        parcel = await box.next()
+        parcel.tries = MOST_TRIES + 1
+        box.sent(parcel)
         box.opened()
-        box.keep("record", b"long")
+        box.keep("record", long)
         assert len(box) == 0
         box.keep("record", b"short")
         assert await drain(box) == [("record", b"short")]
@@ -87,14 +90,14 @@ def test_a_flood_of_refusals_pushes_out_refusals_and_no_result() -> None:
 def test_telemetry_is_only_for_now() -> None:
     async def main() -> None:
         box = Outbox()
-        box.pass_on("attitude", b"before")
+        box.send_telemetry("attitude", b"before")
         assert len(box) == 0
         box.opened()
         for number in range(100):
-            box.pass_on("attitude", b"%d" % number)
+            box.send_telemetry("attitude", b"%d" % number)
         parcel = await box.next()
-        assert parcel == Parcel("passing", "attitude", b"99")
-        box.pass_on("attitude", b"lost")
+        assert (parcel.topic, parcel.payload, parcel.qos) == ("attitude", b"99", 0)
+        box.send_telemetry("attitude", b"lost")
         box.closed()
         assert len(box) == 0
 

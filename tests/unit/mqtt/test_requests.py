@@ -24,8 +24,7 @@ class Daemon:
         self.running = False
         self.fault: Exception | None = None
         self.refusal: tuple[str, str] | None = None
-        self.retained: list[str] = []
-        self.requests = Requests(self.answer, self.respond, self.retained.append)
+        self.requests = Requests(self.answer, "companion/1/request/", self.respond)
 
     async def answer(self, request: Object) -> AsyncGenerator[Object, None]:
         self.asked.append(request)
@@ -149,12 +148,14 @@ def test_a_fault_of_the_program_is_answered_too() -> None:
     run_virtual(main())
 
 
-def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request() -> None:
+def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request(caplog: pytest.LogCaptureFixture) -> None:
     async def main() -> None:
         daemon = Daemon()
         for _ in range(3):  # three connections
             await daemon.take(b'{"transaction": "old"}', retained=True)
-        assert daemon.retained == ["calibrate"]
+        assert [record.getMessage().partition(" is not obeyed")[0] for record in caplog.records] == [
+            "mqtt: the retained request at companion/1/request/calibrate"
+        ]
         assert daemon.states() == ["refused"] * 3
         await daemon.take(b"")  # on MQTT 3.1.1 its deletion looks like this
         assert daemon.asked == []
@@ -186,7 +187,7 @@ def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request() ->
         ("calibrate", b'{"timeout_s": true}', ["'timeout_s'", "found true", "above 0"]),
         ("calibrate", b'{"timeout_s": "5"}', ["'timeout_s'", 'found "5"']),
         ("calibrate", b'{"reboot": 1}', ["'reboot'", "found 1", "true or false"]),
-        ("cancel", b'{"what": "both"}', ['unknown key "what"', "known: transaction"]),
+        ("cancel", b'{"what": "both"}', ['unknown key "what"', "allowed: transaction"]),
         ("undo", b'{"force": null}', ["'force'", "found null"]),
         ("undo", b'{"transaction": {"a": 1}}', ["'transaction'", "a whole number"]),
         ("undo", b'{"transaction": 1.5}', ["'transaction'", "found 1.5"]),
