@@ -12,43 +12,38 @@ from companion.links.system.events import Listeners
 from companion.protocols.guess import AUTOPILOT_NAMES
 
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
-FRESH_S: Final = 3.0
-"""A heartbeat older than this says nothing about now: they come once a second, and two may be lost in a row."""
-MAX_PEERS: Final = 64
-"""The most senders that are remembered; newcomers beyond are not."""
+FRESH_S: Final = 3.0  # heartbeats come once a second, and two may be lost in a row
+MAX_PEERS: Final = 64  # the most senders that are remembered; newcomers beyond are not
 MAX_TEXTS: Final = 200
 
 Fields = Mapping[str, object]
 
 
 class Address(NamedTuple):
-    """A component of a vehicle."""
-
     system_id: int
     component_id: int
 
 
 class PeerState(NamedTuple):
-    """The last heartbeat of a component."""
-
     kind: int
     autopilot: int
     base_mode: int
     system_status: int
     at_s: float
 
+    @property
+    def firmware(self) -> str:
+        return AUTOPILOT_NAMES.get(self.autopilot, f"autopilot type {self.autopilot}")
+
 
 class Text(NamedTuple):
-    """A STATUSTEXT."""
-
+    system_id: int
     severity: int
     words: str
     at_s: float
 
 
 class AutopilotSeen(NamedTuple):
-    """The autopilot as its heartbeat shows it."""
-
     system_id: int
     firmware: str | None
     armed: Literal["armed", "disarmed", "unknown"]
@@ -59,34 +54,28 @@ class GroundListener:
 
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
-        self.first_s: float | None = None
-        """Time of the first heartbeat."""
+        self.first_s: float | None = None  # of the first heartbeat
         self.heartbeats: dict[Address, PeerState] = {}
-        self.texts: list[tuple[int, Text]] = []
-        """Texts of the companions of all vehicles with their system ids, oldest first, at most 200."""
-        self.on_text: Listeners[[int, Text]] = Listeners()
-        """Listeners for every text, with its system id."""
+        self.texts: list[Text] = []  # of all vehicles' companions, oldest first
+        self.on_text: Listeners[[Text]] = Listeners()
 
     def update(self, name: str, source: Address, fields: Fields, now_s: float) -> None:
-        """Keep a HEARTBEAT or STATUSTEXT; ignore other messages."""
         if name == "HEARTBEAT":
             self._heartbeat(source, fields, now_s)
         elif name == "STATUSTEXT" and source.component_id == self.component_id:
             self._text(source.system_id, fields, now_s)
 
     def companions(self) -> list[int]:
-        """List the system ids of the vehicles whose companion was heard."""
         return sorted(target.system_id for target in self.heartbeats if target.component_id == self.component_id)
 
     def vehicle(self, system_id: int, now_s: float) -> AutopilotSeen:
-        """Describe a vehicle's autopilot."""
         beat = self.heartbeats.get(Address(system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
         if beat is None:
             return AutopilotSeen(system_id, None, "unknown")
         armed: Literal["armed", "disarmed", "unknown"] = "unknown"
         if now_s - beat.at_s <= FRESH_S:
             armed = "armed" if beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED else "disarmed"
-        return AutopilotSeen(system_id, AUTOPILOT_NAMES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
+        return AutopilotSeen(system_id, beat.firmware, armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
         """Return whether the companion is at work by a heartbeat later than `since_s`; None: there was none."""
@@ -98,8 +87,8 @@ class GroundListener:
     def texts_of(self, system_id: int, since_s: float) -> list[Text]:
         """List the texts of a vehicle's companion since then; continuation lines are joined."""
         found: list[Text] = []
-        for source, text in self.texts:
-            if source != system_id or text.at_s < since_s:
+        for text in self.texts:
+            if text.system_id != system_id or text.at_s < since_s:
                 continue
             if found and text.words.startswith(GOES_ON):
                 words = f"{found[-1].words} {text.words.removeprefix(GOES_ON)}"
@@ -109,13 +98,10 @@ class GroundListener:
         return found
 
     def summary(self) -> str:
-        """Name who was heard; empty: nobody."""
         vehicles, others = [], []
         for (system, component), beat in sorted(self.heartbeats.items()):
             if component == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES:
-                vehicles.append(
-                    f"system {system} ({AUTOPILOT_NAMES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
-                )
+                vehicles.append(f"system {system} ({beat.firmware})")
             else:
                 station = " (a ground station)" if beat.kind == mavlink.MAV_TYPE_GCS else ""
                 others.append(f"{system}/{component}{station}")
@@ -132,10 +118,11 @@ class GroundListener:
 
     def _text(self, system_id: int, fields: Fields, now_s: float) -> None:
         # A terminal must not obey it.
-        text = Text(whole(fields, "severity"), to_ascii(str(fields.get("text", "")).rstrip("\0")), now_s)
-        self.texts.append((system_id, text))
+        words = to_ascii(str(fields.get("text", "")).rstrip("\0"))
+        text = Text(system_id, whole(fields, "severity"), words, now_s)
+        self.texts.append(text)
         del self.texts[:-MAX_TEXTS]
-        self.on_text.tell(system_id, text)
+        self.on_text.tell(text)
 
 
 def whole(fields: Fields, name: str) -> int:
@@ -145,7 +132,6 @@ def whole(fields: Fields, name: str) -> int:
 
 
 def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
-    """Format the sigmas of a result."""
     gyro = f"sigma {gyro_deg_h:.3g} deg/h" if gyro_deg_h is not None else ""
     accel = f"{'' if gyro else 'sigma '}{accel_mg:.3g} mg" if accel_mg is not None else ""
     return ", ".join(filter(None, (gyro, accel)))

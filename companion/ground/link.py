@@ -1,20 +1,15 @@
-"""The link from the ground, on MAVSDK 4.1.
+"""The link from the ground, on MAVSDK 4.1, and one command with all its answers (`Exchange`).
 
-Of MAVSDK's parts two serve here: MavlinkDirectServer, which sends and hears any message from the start, before MAVSDK
-has found a system, and Param, a parameter client with retries. Its `send_command` would also wait for a final ACK, but
-keeps the progress to itself, repeats with confirmation 0 (which is a new request) and does not ask again when the
-final answer was lost: `exchange` does that.
+MavlinkDirectServer sends and hears any message, also before MAVSDK has found a system; Param is a parameter client with
+retries. MAVSDK's own `send_command` keeps the progress to itself, repeats with confirmation 0 (which is a new request)
+and does not ask again when the final answer was lost. MAVSDK 4.1 has no signing: where there is a key, the companion's
+own link checks and signs, and MAVSDK talks to it over `raw://`. MAVSDK calls back in threads of its own; everything
+here goes on in the event loop.
 
-MAVSDK 4.1 has no signing: where there is a key it is given whole messages that were checked, over its own `raw://`
-connection, and what it sends is signed; the link itself is the companion's then.
-
-MAVSDK calls back in threads of its own; everything here goes on in the event loop.
-
-One command and all its answers, over a radio that loses some of them (`Exchange`): MAVLink's command protocol from the
-asking side. Repeat with a counted-up `confirmation` until the first answer, then follow IN_PROGRESS to the one final
-answer. When progress falls silent the final answer may have been lost: the same request again brings it back for as
-long as the companion remembers it (`component.commands`), and later than that must not be sent, since it would count
-as a new one.
+`Exchange` is MAVLink's command protocol from the asking side, over a radio that loses packets: repeat with a counted-up
+`confirmation` until the first answer, then follow IN_PROGRESS to the one final answer. When progress falls silent, the
+same request again brings a lost final answer back for as long as the companion remembers it (`component.commands`);
+later it would count as a new one, and must not be sent.
 """
 
 from __future__ import annotations
@@ -42,14 +37,7 @@ logger = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[Signing]:
-    """Carry what MAVSDK sends and hears over a url, signed, until the context ends.
-
-    `own`: system and component that MAVSDK sends as.
-
-    Raises:
-        LinkError: the url is none.
-        mavsdk.MavsdkError: MAVSDK refuses the raw connection.
-    """
+    """Carry what MAVSDK sends as `own` and hears over a url, signed, until the context ends."""
     await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
     loop, parser = asyncio.get_running_loop(), mavlink.MAVLink(None)
     parser.robust_parsing = True
@@ -93,7 +81,6 @@ class GroundLink:
         self.own, self.heard = own, heard
         self._sdk, self._direct, self._signing = sdk, direct, signing
         self.on_ack: Listeners[[Address, Fields]] = Listeners()
-        """Listeners for every COMMAND_ACK to us."""
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
@@ -124,7 +111,6 @@ class GroundLink:
             logger.debug("not sent: %s", error)
 
     async def parameters(self, target: Address) -> dict[str, float]:
-        """All parameters of a component; empty when it does not answer."""
         found = await asyncio.to_thread(self._client(target).get_all_params)
         return {one.name: one.value for one in (*found.float_params, *found.int_params)}
 
@@ -195,7 +181,7 @@ class _Log:
     callback: ClassVar[Any] = None
 
     def _take(self, level: int, message: bytes | None, *_: object) -> bool:
-        """In one of MAVSDK's threads; True: it is not to print this itself."""
+        """Run in one of MAVSDK's threads; True: it is not to print this itself."""
         words = (message or b"").decode(errors="replace")
         logger.debug("MAVSDK: %s", words)
         if level == self._error:
@@ -241,17 +227,15 @@ REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
 """Seconds without an answer after which progress is asked for again: two ACKs may be lost in a row before. The last
 leaves the radio the rest of the time for which the companion remembers its final answer."""
 assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
-ENDED_AFTER_S: Final = 5.0
-"""Silence, while heartbeats show no work, after which the end counts as missed."""
+ENDED_AFTER_S: Final = 5.0  # silence, while heartbeats show no work: the end was missed
 LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 
 
 class Exchange:
-    """A request; `run` it once, then read its end.
+    """A request; `run` it once, then read `result` (MAV_RESULT; None: no final answer) and `detail` (`result_param2`).
 
-    `busy`: whether the companion is at work, by a heartbeat later than a time; None: there was none. `on_progress` is
-    told how far it is and for how long nothing has come, several times a second.
+    `on_progress` is told how far it is and for how long nothing has come, several times a second.
     """
 
     def __init__(
@@ -260,18 +244,14 @@ class Exchange:
         target: Address,
         command: int,
         *parameters: float,
-        busy: Callable[[float], bool | None],
         on_progress: Callable[[int, float], None] = lambda percent, silent_s: None,
     ) -> None:
         self._link, self._target, self._command = link, target, command
-        self._busy, self._on_progress = busy, on_progress
+        self._on_progress = on_progress
         self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
         self.result: int | None = None
-        """MAV_RESULT of the final answer; None: none came."""
         self.detail = 0
-        """`result_param2` of the final answer."""
         self.unanswered = False
-        """No answer came to any attempt."""
         self._answered = asyncio.Event()
         self._heard_s = 0.0
         self._confirmation = 0
@@ -304,7 +284,8 @@ class Exchange:
             if repeats and silent_s >= repeats[0]:
                 del repeats[0]
                 self._send()
-            busy = self._busy(max(self._heard_s + ENDED_AFTER_S / 2, loop.time() - LOST_AFTER_S))
+            since_s = max(self._heard_s + ENDED_AFTER_S / 2, loop.time() - LOST_AFTER_S)
+            busy = self._link.heard.busy(self._target.system_id, since_s)
             if (busy is False and silent_s >= ENDED_AFTER_S) or (busy is None and silent_s >= LOST_AFTER_S):
                 return False
         self._on_progress(self.percent, 0.0)

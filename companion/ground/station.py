@@ -22,14 +22,10 @@ from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListen
 from companion.ground.link import Exchange, GroundLink
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
-EVERYBODY_WITHIN_S: Final = 1.3
-"""Time after the first heartbeat within which everybody in reach is heard: heartbeats come once a second."""
-WORDS_WITHIN_S: Final = 3.0
-"""Longest time by which the texts of an end may follow it."""
-QUIET_S: Final = 1.0
-"""Silence after which a sender has said everything: two lines a second pass."""
-CANCELLED_WITHIN_S: Final = 30.0
-"""A cancel waits for a safe point, and old values may have to be put back."""
+EVERYBODY_WITHIN_S: Final = 1.3  # after the first heartbeat: they come once a second
+WORDS_WITHIN_S: Final = 3.0  # the texts of an end may follow it by that
+QUIET_S: Final = 1.0  # silence after which a sender has said everything: two lines a second pass
+CANCELLED_WITHIN_S: Final = 30.0  # a cancel waits for a safe point, and old values may have to be put back
 SILENCE_WORTH_A_WORD_S: Final = 3.0
 _POLL_S: Final = 0.05
 
@@ -48,14 +44,11 @@ _DOING: Final[dict[int, tuple[State, str]]] = {
     mavlink.MAV_STATE_ACTIVE: ("idle", "nothing is running"),
     mavlink.MAV_STATE_CRITICAL: ("fault", "something needs attention: `companion status` on the aircraft says what"),
 }
-_SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}
-"""Severity of the text that has the reason."""
+_SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}  # severity of the text with the reason
 
 
 @dataclasses.dataclass(frozen=True)
 class RequestOutcome:
-    """Outcome of a request: for programs (`answer`, with `state` and `reason` first) and for people (`lines`)."""
-
     state: State
     reason: str
     good: bool
@@ -64,31 +57,24 @@ class RequestOutcome:
 
     @property
     def answer(self) -> dict[str, Any]:
-        """One JSON object."""
         return {"state": self.state, "reason": self.reason, **self.more}
 
 
 class Display:
-    """Progress and texts on stderr."""
-
     def __init__(self) -> None:
         self._shown: tuple[str, int] | None = None
 
     def progress(self, percent: int, stage: str) -> None:
-        """Print a line for each stage, and for every tenth of the way."""
         if (shown := (stage, percent // 10)) != self._shown:
             self._shown = shown
             self.text(f"[{percent:3d} %] {stage}")
 
     def text(self, words: str) -> None:
-        """Print a text of the companion, without characters that a terminal obeys."""
         sys.stderr.write(printable(words) + "\n")
         sys.stderr.flush()
 
 
 class Station:
-    """Speaks to the one companion that `find` found."""
-
     def __init__(self, link: GroundLink, url: str, display: Display) -> None:
         self._link, self._url, self._display = link, url, display
         self._heard: GroundListener = link.heard
@@ -99,7 +85,6 @@ class Station:
 
     @property
     def vehicle(self) -> AutopilotSeen:
-        """Autopilot beside the companion."""
         return self._heard.vehicle(self._target.system_id, asyncio.get_running_loop().time())
 
     def interrupt(self) -> None:
@@ -140,19 +125,17 @@ class Station:
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
-        exchange = Exchange(
-            self._link, self._target, CALIBRATE, float(what.value), float(reboot),
-            busy=self._is_busy, on_progress=self._show_progress,
-        )  # fmt: skip
+        asked = float(what.value), float(reboot)
+        exchange = Exchange(self._link, self._target, CALIBRATE, *asked, on_progress=self._show_progress)
         await self._cancellable(exchange, timeout_s)
         outcome = await self._judge(exchange, begun_s)
         more: dict[str, Any] = {"duration_s": round(loop.time() - begun_s, 1)}
         reason = outcome.reason
         if outcome.state == "done":
-            asked = {"CMP_GYR_SIG": what.gyros, "CMP_ACC_SIG": what.accelerometers}
+            wanted = {"CMP_GYR_SIG": what.gyros, "CMP_ACC_SIG": what.accelerometers}
             gyro, accel = [
-                (await self._link.get_parameter(self._target, name) or None) if wanted else None
-                for name, wanted in asked.items()
+                (await self._link.get_parameter(self._target, name) or None) if calibrated else None
+                for name, calibrated in wanted.items()
             ]
             more |= {"gyro_sigma_deg_h": gyro, "accel_sigma_mg": accel}
             reason = heard.figures(gyro, accel) or reason
@@ -161,14 +144,14 @@ class Station:
 
     async def undo(self) -> RequestOutcome:
         """Put the old values back; raises as `calibrate`."""
-        begun_s, exchange = asyncio.get_running_loop().time(), self._exchange(UNDO)
+        begun_s, exchange = asyncio.get_running_loop().time(), Exchange(self._link, self._target, UNDO)
         await self._cancellable(exchange, None)
         return await self._judge(exchange, begun_s)
 
     async def cancel(self) -> RequestOutcome:
         """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
         loop = asyncio.get_running_loop()
-        begun_s, exchange = loop.time(), self._exchange(CANCEL)
+        begun_s, exchange = loop.time(), Exchange(self._link, self._target, CANCEL)
         await exchange.run()
         if exchange.result != mavlink.MAV_RESULT_ACCEPTED:
             return await self._judge(exchange, begun_s)
@@ -182,7 +165,6 @@ class Station:
         return self._ended("cancelled", reason, begun_s, good=True)
 
     async def status(self) -> RequestOutcome:
-        """Describe what the companion is doing, its settings and its last result."""
         doing = self._heard.heartbeats[self._target].system_status
         state, reason = _DOING.get(doing, ("unknown", "it does not say what it is doing"))
         found, vehicle = await self._own_parameters(), self.vehicle
@@ -209,9 +191,6 @@ class Station:
 
     # --- asking
 
-    def _exchange(self, command: int) -> Exchange:
-        return Exchange(self._link, self._target, command, busy=self._is_busy)
-
     async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> None:
         """Run an exchange; Ctrl-C or the timeout cancel it, and its end is waited for all the same."""
         running = asyncio.create_task(exchange.run())
@@ -219,7 +198,7 @@ class Station:
             if not await self._ends(running, timeout_s):
                 self._why_cancelled = self._why_cancelled or f"not finished within {timeout_s:g} s"
                 self._display.text(f"{self._why_cancelled}: cancelling (Ctrl-C: do not wait)")
-                cancelling = asyncio.create_task(self._exchange(CANCEL).run())
+                cancelling = asyncio.create_task(Exchange(self._link, self._target, CANCEL).run())
                 try:
                     await self._ends(running, CANCELLED_WITHIN_S)
                 finally:
@@ -242,7 +221,6 @@ class Station:
         return running.done()
 
     async def _judge(self, exchange: Exchange, begun_s: float) -> RequestOutcome:
-        """Translate the end of an exchange into an outcome, with the companion's reason."""
         if exchange.unanswered:
             raise NobodyHeardError(
                 f"{self._name()} beats, but does not answer: nothing that is sent from here arrives"
@@ -262,7 +240,6 @@ class Station:
         return self._ended(state, reason, begun_s, said, good=state == "done")
 
     async def _judge_unheard_end(self, begun_s: float) -> RequestOutcome:
-        """Describe an end that was not heard, or not waited for."""
         busy = self._is_busy(asyncio.get_running_loop().time() - FRESH_S)
         if busy is False:
             ended = await self._last_result()
@@ -306,8 +283,8 @@ class Station:
 
     # --- words
 
-    def _on_text(self, system_id: int, text: Text) -> None:
-        if system_id == self._target.system_id:
+    def _on_text(self, text: Text) -> None:
+        if text.system_id == self._target.system_id:
             self._display.text(text.words)
 
     def _show_progress(self, percent: int, silent_s: float) -> None:
@@ -341,5 +318,4 @@ class Station:
 
 
 def _result(state: float | None) -> str | None:
-    """Name the end of the last calibration by CMP_STATE; None: there was none, or it is not known."""
     return RESULTS[int(state)] if state in (1.0, 2.0, 3.0) else None

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import (
     FAR_GYRO_RAD_S,
     ImuCalibration,

@@ -1,7 +1,15 @@
-"""ArduPilot: parameters of IMUs, level, heading, gate and ports, and what is odd about them.
+"""ArduPilot: parameters of IMUs, temperature, level, heading, gate and ports, and what is odd about them.
 
 R is the board orientation, AHRS_ORIENTATION (autopilots 1.2); AHRS_TRIM turns the reported attitude only, never IMU
 data. A calibration leaves `CALTEMP` alone, for then new = old + residual holds (recipe (a) of autopilots 1.6).
+
+INS_TCALn_* (AP_InertialSensor_tempcal.cpp, autopilots 10.1) takes this off a reading, in the IMU's axes, with d the
+temperature less 35 degC, both held between TMIN and TMAX:
+
+    raw - (P(d) - P(d at CALTEMP)) - offset,    P(d) = (c1 d + c2 d^2 + c3 d^3) 1e-6
+
+so a curve, CALTEMP and the offset belong together. Gyros and accelerometers have coefficients and a CALTEMP each, but
+one ENABLE, TMIN and TMAX.
 """
 
 from __future__ import annotations
@@ -14,49 +22,84 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware import ardupilot_calibration as own_calibration
-from companion.autopilot.firmware.ardupilot_calibration import (
-    AT_START,
-    INSTANCES,
-    ArduPilotParameters,
-)
-from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net
+from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net, SlotMemory
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
     SWITCH_RANGE,
     ImuCalibration,
+    ImuParameters,
     Range,
     Rival,
+    Thermal,
     offset_ranges,
+    vector_changes,
 )
 from companion.autopilot.firmware.imu_messages import HIGHRES, SCALED, SCALED2, SCALED3, SCRIPT
-from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters
+from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Names, Parameters
 from companion.errors import AutopilotError
-from companion.physics.frames import Matrix, rotation_matrix
+from companion.estimation.temperature.curve import ZERO, Polynomial
+from companion.physics.frames import Matrix, rotation_matrix, vector
 from companion.rotations import ROTATION_NAMES
+from companion.samples import Vector
+
+INSTANCES: Final = (1, 2, 3, 4, 5)
+"""4 and 5 exist from 4.4 on boards with auxiliary instances; no message carries them, so none can be measured."""
+
+AT_START: Final = "INS_GYR_CAL"  # 1: every start measures the gyros anew
+
+REFERENCE_DEGC: Final = 35.0
+_TCAL_UNIT: Final = 1e-6
+_TCAL_ON: Final = 1
+_TCAL_LEARNING: Final = 2
 
 TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
-"""Roll and pitch of the board against the aircraft, rad; taken off the attitude, never off IMU data."""
-_TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
-"""ArduPilot cuts it off there."""
-_TCAL_RANGE: Final = Range(-1e6, 1e6)
-"""Millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin."""
+_TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")  # ArduPilot cuts it off there
+_TCAL_RANGE: Final = Range(-1e6, 1e6)  # millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin
 
-_EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0
-"""EK3_SRCn_YAW: external navigation, the autopilot's compass, and none: gyros carry it on, GNSS holds it."""
+_EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0  # EK3_SRCn_YAW; gyros: none, GNSS holds it
 _HEADING_SCRIPT: Final = "CMPG_HEADING"
-_GATE_SCRIPT: Final = "CMPG_ENABLE"
-"""Parameters of the script (companion/lua): they exist while it runs."""
+_GATE_SCRIPT: Final = "CMPG_ENABLE"  # parameters of the script (companion/lua): they exist while it runs
 
-_ARDUPILOT_ONLY_DEG: Final = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
-"""PITCH_7, ROLL_45, ROLL_315 (ArduPilot's rotations.h)."""
+_ARDUPILOT_ONLY_DEG: Final = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}  # rotations.h
 _CUSTOM_NAMES: Final = {
     100: ("AHRS_CUSTOM_ROLL", "AHRS_CUSTOM_PIT", "AHRS_CUSTOM_YAW"),  # up to 4.1
     101: ("CUST_ROT1_ROLL", "CUST_ROT1_PITCH", "CUST_ROT1_YAW"),
     102: ("CUST_ROT2_ROLL", "CUST_ROT2_PITCH", "CUST_ROT2_YAW"),
 }
+
+
+class ArduPilotParameters(ImuParameters):
+    """Parameter names of one IMU, counting from 1; the first is irregular, 4 and 5 are again (autopilots 1.1)."""
+
+    def __init__(self, instance: int) -> None:
+        if instance not in INSTANCES:
+            raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
+        # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
+        ins, n = (f"INS{instance}_", "") if instance > 3 else ("INS_", "" if instance == 1 else str(instance))
+        tcal = f"INS{instance}_TCAL_" if instance > 3 else f"INS_TCAL{instance}_"
+        caltemp = f"INS{instance}_{{}}_CALTEMP" if instance > 3 else f"INS_{{}}{instance}_CALTEMP"
+        super().__init__(
+            gyro_offset=_xyz(f"{ins}GYR{n}OFFS_"),
+            accel_offset=_xyz(f"{ins}ACC{n}OFFS_"),
+            accel_scale=_xyz(f"{ins}ACC{n}SCAL_"),
+            gyro_id=f"{ins}GYR{n}_ID",
+            accel_id=f"{ins}ACC{n}_ID",
+        )
+        self.use = f"{ins}USE{n}"
+        self.gyro_caltemp, self.accel_caltemp = caltemp.format("GYR"), caltemp.format("ACC")
+        """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
+        self.tcal_enable, self.tcal_low, self.tcal_high = f"{tcal}ENABLE", f"{tcal}TMIN", f"{tcal}TMAX"
+        """ENABLE: 0 off, 1 on, 2 learning until the next boot."""
+        self.tcal_gyro = [_xyz(f"{tcal}GYR{power}_") for power in (1, 2, 3)]
+        self.tcal_accel = [_xyz(f"{tcal}ACC{power}_") for power in (1, 2, 3)]
+        coefficients = (name for names in (*self.tcal_accel, *self.tcal_gyro) for name in names)
+        self.tcal = (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
+        """All names but the CALTEMPs, which the firmware's own calibrations set; the switch comes last."""
+
+
+def _xyz(stem: str) -> Names:
+    return f"{stem}X", f"{stem}Y", f"{stem}Z"
 
 
 def _ranges() -> dict[str, Range]:
@@ -70,18 +113,13 @@ def _ranges() -> dict[str, Range]:
 
 
 class ArduPilot(Firmware):
-    """Copter, Plane and Rover with EKF3."""
-
     name: FirmwareName = "ardupilot"
     words = "ArduPilot"
     mav_autopilot = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-    heartbeat_rate_hz = 5.0
-    """A second is a long time not to know of an arming (autopilots 5.1)."""
+    heartbeat_rate_hz = 5.0  # a second is a long time not to know of an arming (autopilots 5.1)
     integers_bytewise = False
-    settle_s = 1.0
-    """The telemetry shows a new offset within 60 ms (its 20 Hz filter); a second covers slower links."""
-    write_s = 5.0
-    """4 s with its own gyro calibration in between."""
+    settle_s = 1.0  # new offsets show within 60 ms (20 Hz filter); the rest is for slower links
+    write_s = 5.0  # 4 s with its own gyro calibration in between
     ekf_reset_s = 3.0
     imu_messages = {1: (HIGHRES, SCRIPT[1], SCALED), 2: (SCRIPT[2], SCALED2), 3: (SCRIPT[3], SCALED3)}
     gyro_calibration_resets_ekf = True
@@ -114,7 +152,7 @@ class ArduPilot(Firmware):
         for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
             if found == 0:
                 raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
-        thermal = await own_calibration.read_thermal(parameters, instance)
+        thermal = await _read_thermal(parameters, instance)
         accel_offset = await parameters.read_vector(names.accel_offset)
         warnings: list[str] = []
         if not any(accel_offset):
@@ -139,7 +177,47 @@ class ArduPilot(Firmware):
             warnings=tuple(warnings),
         )
 
-    thermal_changes = staticmethod(own_calibration.thermal_changes)
+    async def thermal_changes(
+        self,
+        parameters: Parameters,
+        calibration: ImuCalibration,
+        gyro: Polynomial,
+        accel: Polynomial | None,
+        degc: float,
+    ) -> list[Change]:
+        """Plan curves about 35 degC; the offsets belong to `degc` from then on.
+
+        Without a curve of the accelerometers, one that is in force stays, held at the ends of the new span; one that is
+        not is cleared, for it would come into force with the gyros'.
+        """
+        assert gyro.reference_degc == REFERENCE_DEGC
+        names, thermal = ArduPilotParameters(calibration.instance), calibration.thermal
+        if not thermal.values:
+            raise AutopilotError(
+                f"{names.tcal_enable} does not exist: this firmware has no temperature calibration"
+                " (boards of 1 MB have none)"
+            )
+        acts = accel is not None or any(map(any, thermal.accel.coefficients))
+        caltemps = [names.gyro_caltemp, *([names.accel_caltemp] if acts else [])]
+        before = await parameters.read_many((*names.tcal, *caltemps))
+        wanted = {name: before[name] if thermal.enabled_by else 0.0 for each in names.tcal_accel for name in each}
+        for of, curve in ((names.tcal_gyro, gyro), *(((names.tcal_accel, accel),) if accel is not None else ())):
+            for each, values in zip(of, curve.coefficients[1:], strict=True):
+                wanted |= zip(each, (value / _TCAL_UNIT for value in values), strict=True)
+        wanted |= {names.tcal_low: gyro.low_degc, names.tcal_high: gyro.high_degc, names.tcal_enable: float(_TCAL_ON)}
+        wanted |= dict.fromkeys(caltemps, degc)
+
+        def moved(of: Names, offset: Vector, by: Vector) -> list[Change]:
+            return vector_changes(of, offset, vector(np.add(offset, by)))
+
+        taken_gyro, taken_accel = thermal.taken_off(degc)
+        changes = [
+            *moved(names.accel_offset, calibration.accel_offset_m_s2, vector(taken_accel)),
+            *moved(names.gyro_offset, calibration.gyro_offset_rad_s, vector(taken_gyro)),
+            # The switch comes last, and is restored first.
+            *(Change(name, before[name], wanted[name]) for name in (*caltemps, *names.tcal)),
+        ]
+        return [change for change in changes if change.before != change.after]
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
@@ -203,12 +281,39 @@ class ArduPilot(Firmware):
         return True, "none heard (none connected? or a link set not to forward: MAVn_OPTIONS bit 1)"
 
 
-async def _read_board_rotation(parameters: Parameters) -> Matrix:
-    """Read the 3x3 matrix from the board's axes to the vehicle's FRD.
+async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
+    """Read the temperature calibration of one IMU; one that is switched off, or not built in, takes nothing off."""
+    names = ArduPilotParameters(instance)
+    enable = await parameters.read_integer(names.tcal_enable)
+    if enable is None:
+        return Thermal()
+    if enable == _TCAL_LEARNING:
+        raise AutopilotError(
+            f"{names.tcal_enable} = 2: IMU {instance} is learning its temperature calibration;"
+            " let it finish, or set it to 0 or 1"
+        )
+    if enable != _TCAL_ON:
+        return Thermal(values={names.tcal_enable: float(enable)})
+    found = await parameters.read_many((*names.tcal, names.gyro_caltemp, names.accel_caltemp))
 
-    Raises:
-        AutopilotError: an unknown orientation, or a custom one that is not in force; or as `Parameters.read`.
-    """
+    def polynomial(coefficients: list[Names]) -> Polynomial:
+        one, two, three = (vector(np.array([found[name] for name in each]) * _TCAL_UNIT) for each in coefficients)
+        return Polynomial(
+            coefficients=(ZERO, one, two, three),
+            reference_degc=REFERENCE_DEGC,
+            low_degc=found[names.tcal_low],
+            high_degc=found[names.tcal_high],
+        )
+
+    return Thermal(
+        enabled_by=names.tcal_enable,
+        values={name: found[name] for name in names.tcal},
+        gyro=polynomial(names.tcal_gyro).zero_at(found[names.gyro_caltemp]),
+        accel=polynomial(names.tcal_accel).zero_at(found[names.accel_caltemp]),
+    )
+
+
+async def _read_board_rotation(parameters: Parameters) -> Matrix:
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1
     if 0 <= number < len(ROTATION_NAMES):

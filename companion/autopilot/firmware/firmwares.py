@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from companion.autopilot.firmware.ardupilot import ArduPilot
-from companion.autopilot.firmware.base import Firmware, OtherFirmware
+from companion.autopilot.firmware.base import Firmware, OtherFirmware, SlotMemory
 from companion.autopilot.firmware.imu_calibration import (
     ACCEL_OFFSET,
     ACCEL_SCALE_RANGE,
@@ -16,7 +16,6 @@ from companion.autopilot.firmware.imu_calibration import (
     Range,
 )
 from companion.autopilot.firmware.px4 import PX4
-from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import FirmwareName, Parameters
 from companion.config.sections import Profile
 from companion.estimation.records.record import Outcome, WrittenParameter
@@ -30,28 +29,20 @@ CALIBRATION: Final[Mapping[str, Mapping[str, Range]]] = {str(one.name): one.rang
 """Every parameter that the companion ever writes by a calibration or its undo, by firmware; nothing else is kept, or
 believed of a file."""
 
-_TYPE_SHIFT: Final = 16
-_BYTE: Final = 0xFF
-
 
 def firmware_named(name: FirmwareName | None) -> Firmware:
-    """Return the firmware of a name; None: not heard yet."""
     return UNHEARD if name is None else next((one for one in FIRMWARES if one.name == name), OTHER)
 
 
 def firmware_with(mav_autopilot: int) -> Firmware:
-    """Return the firmware of a heartbeat, by its MAV_AUTOPILOT."""
     return next((one for one in FIRMWARES if one.mav_autopilot == mav_autopilot), OTHER)
 
 
 async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory | None = None) -> ImuCalibration:
     """Read what the autopilot corrects one of its IMUs (1 to 3) with.
 
-    `memory`: what earlier writes have shown about PX4's slots.
-
     Raises:
-        AutopilotError: no such IMU, a value that cannot be worked with, or as `Parameters.read`; or the autopilot
-            restarted meanwhile (AutopilotRebootedError).
+        AutopilotError: no such IMU, a value that cannot be worked with, no answer, or a restart meanwhile.
     """
     boots, firmware, memory = parameters.boots, firmware_named(parameters.firmware), memory or SlotMemory()
     found = await firmware.read_calibration(parameters, instance, memory)
@@ -65,7 +56,6 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
 
 
 def port_needs(firmware: FirmwareName | None, baud: int) -> str:
-    """Say in one line what the autopilot's end of a serial line needs."""
     needs = firmware_named(firmware).port_needs(baud) or ", or ".join(
         f"{one.port_needs(baud)} ({one.words})" for one in FIRMWARES
     )
@@ -73,26 +63,25 @@ def port_needs(firmware: FirmwareName | None, baud: int) -> str:
 
 
 def outcomes_of(triad: Triad, written: Mapping[str, WrittenParameter]) -> set[Outcome]:
-    """Return the outcomes of one triad's offsets, among everything that was written for an IMU."""
     offset = GYRO_OFFSET if triad == "gyro" else ACCEL_OFFSET
     offsets = {name for each in CALIBRATION.values() for name, one in each.items() if one is offset}
     return {one.outcome for name, one in written.items() if name in offsets}
 
 
 def part_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int | None) -> Profile | None:
-    """Return the catalogue's name of the part whose two halves have these device ids; None: it is not known.
-
-    Both firmwares make an id of bus, address and type (8 bits from bit 16 on).
-    """
+    """Return the catalogue's name of the part whose two halves have these device ids; None: it is not known."""
     if gyro_id is None or accel_id is None:
         return None
-    types = (gyro_id >> _TYPE_SHIFT & _BYTE, accel_id >> _TYPE_SHIFT & _BYTE)
-    return firmware_named(firmware).parts.get(types)
+    return firmware_named(firmware).parts.get((_type_in(gyro_id), _type_in(accel_id)))
 
 
 def model_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int | None) -> str | None:
     """Return the model of an IMU: the catalogue's name, else firmware and types in hex; None: it is not known."""
     if not gyro_id or not accel_id or firmware is None:
         return None
-    types = "-".join(f"{each >> _TYPE_SHIFT & _BYTE:#04x}" for each in (gyro_id, accel_id))
+    types = f"{_type_in(gyro_id):#04x}-{_type_in(accel_id):#04x}"
     return part_of(firmware, gyro_id, accel_id) or f"{firmware}-{types}"
+
+
+def _type_in(device_id: int) -> int:
+    return device_id >> 16 & 0xFF  # both firmwares: bus and address below, the type in the third byte

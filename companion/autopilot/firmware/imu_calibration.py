@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.parameters.change import SCALES, Change, float32, same_float32
+from companion.autopilot.parameters.change import SCALES, Change, Names, float32, same_float32
 from companion.errors import CalibrationRefusedError
 from companion.estimation.solution.solve import ImuSolution
 from companion.estimation.temperature.curve import NOTHING, Polynomial
@@ -29,22 +29,22 @@ from companion.samples import Triad, Vector
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rival:
-    """A parameter that makes the autopilot overwrite our offsets, at any value but 0."""
+    """A parameter that makes the autopilot overwrite our gyro offsets, at any value but 0.
+
+    `at_start`: it acts at a start of the autopilot only. `from_boot`: only a boot reads it, so switching it off stops
+    nothing before the next one. `value`: as read; 0: it is off, and acts until the next boot. `accelerometers`: their
+    offsets as well.
+    """
 
     parameter: str
     what: str
     at_start: bool = False
-    """It acts at a start of the autopilot, and then only."""
     accelerometers: bool = False
-    """It overwrites accelerometer offsets as well as gyro offsets."""
     from_boot: bool = False
-    """Only a boot reads the parameter, so switching it off stops nothing before the next one."""
     value: int = 0
-    """Value read; 0: switched off, and active until the next boot."""
 
     @property
     def words(self) -> str:
-        """For people: the effect, and what helps."""
         if self.until_boot:
             return f"{self.parameter} is off from the next boot on: until then {self.what}; reboot the autopilot"
         remedy = "set it to 0 to keep them (push.stop_rivals = true does)"
@@ -52,17 +52,14 @@ class Rival:
 
     @property
     def name(self) -> str:
-        """For people: IMU_GYRO_CAL_EN=1."""
         return f"{self.parameter}={self.value}" if self.value else f"{self.parameter} (on until reboot)"
 
     @property
     def until_boot(self) -> bool:
-        """It is switched off, and acts until the next boot."""
         return self.value == 0
 
 
 def stop(rivals: Sequence[Rival]) -> list[Change]:
-    """Plan the changes that switch rivals off."""
     return [Change(rival.parameter, rival.value, 0.0) for rival in rivals if not rival.until_boot]
 
 
@@ -74,14 +71,11 @@ MAX_ACCEL_RESIDUAL_M_S2: Final = 1.0
 """The worst accelerometers still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis), ArduPilot refuses
 to arm at 0.75 m/s^2 between two accelerometers, and a wrong mounting or gradienter law soon exceeds it."""
 
-MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG
-"""Whole offset: the loosest zero-rate specification of a part still flown (MPU-6000, 20 deg/s)."""
+MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG  # the loosest zero-rate specification still flown (MPU-6000)
 
-MAX_ACCEL_OFFSET_M_S2: Final = 3.5
-"""Whole offset: ArduPilot's documented range of INS_ACCOFFS, which nothing enforces; PX4 has none."""
+MAX_ACCEL_OFFSET_M_S2: Final = 3.5  # ArduPilot's documented range of INS_ACCOFFS, which nothing enforces
 
-ACCEL_SCALE_RANGE: Final = (0.8, 1.2)
-"""ArduPilot's documented range of INS_ACCSCAL, which nothing enforces; PX4 has none."""
+ACCEL_SCALE_RANGE: Final = (0.8, 1.2)  # ArduPilot's documented range of INS_ACCSCAL, which nothing enforces
 
 FAR_GYRO_RAD_S: Final = 0.022
 """Step of a far value, 1.3 deg/s: more than twice what PX4 ignores, and 22 digits of SCALED_IMU.
@@ -91,12 +85,10 @@ the parameters between any two writes. So the value in use may differ by 0.01 fr
 steps by twice that brings the whole vector into use. It is the axis nearest to the vehicle's vertical: a wrong value
 there turns the heading, but tilts nothing.
 """
-FAR_ACCEL_M_S2: Final = 0.09
-"""9 digits of SCALED_IMU (9.2 mg): the least that `parameters.verify` can tell from no step."""
+FAR_ACCEL_M_S2: Final = 0.09  # 9 digits of SCALED_IMU: the least that `parameters.verify` can tell from no step
 FAR_SCALE: Final = 0.022
 
-NOT_ZERO_M_S2: Final = 1e-6
-"""Written where three offsets of exactly zero would mean "not calibrated": ArduPilot would refuse to arm."""
+NOT_ZERO_M_S2: Final = 1e-6  # in place of three zeros, which mean "not calibrated": ArduPilot would refuse to arm
 
 _AXES: Final = "XYZ"
 
@@ -111,7 +103,6 @@ class Range:
     unit: str = ""
 
     def holds(self, value: float) -> bool:
-        """Check that a value is allowed; NaN is not."""
         return self.low <= value <= self.high and not (self.whole and value != int(value))
 
     def __str__(self) -> str:
@@ -126,8 +117,7 @@ _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
 ACCEL_SCALE: Final = Range(*SCALES)
-DEGC_RANGE: Final = Range(-300.0, 400.0, unit="deg C")
-"""-300: not known. Up to what a thermometer in kelvin shows: the autopilot stores what its own one says."""
+DEGC_RANGE: Final = Range(-300.0, 400.0, unit="deg C")  # -300: not known; up to a thermometer in kelvin
 DEVICE_ID_RANGE: Final = Range(0.0, 2.0**24, whole=True)
 SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
 
@@ -136,15 +126,14 @@ SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
 class ImuParameters:
     """The names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2, an id of 0 is none."""
 
-    gyro_offset: tuple[str, str, str]
-    accel_offset: tuple[str, str, str]
-    accel_scale: tuple[str, str, str]
+    gyro_offset: Names
+    accel_offset: Names
+    accel_scale: Names
     gyro_id: str
     accel_id: str
 
 
 def offset_ranges(names: ImuParameters) -> dict[str, Range]:
-    """Return the allowed values of one IMU's offsets and scales."""
     return {
         **dict.fromkeys(names.gyro_offset, GYRO_OFFSET),
         **dict.fromkeys(names.accel_offset, ACCEL_OFFSET),
@@ -156,8 +145,7 @@ def offset_ranges(names: ImuParameters) -> dict[str, Range]:
 class Thermal:
     """Temperature calibration of one IMU: what the firmware takes off its readings, in the IMU's axes."""
 
-    enabled_by: str = ""
-    """Parameter that has switched it on; empty where it takes nothing off."""
+    enabled_by: str = ""  # parameter that has switched it on; empty where it takes nothing off
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
     gyro: Polynomial = NOTHING
     accel: Polynomial = NOTHING
@@ -171,31 +159,24 @@ class Thermal:
 class ImuCalibration:
     """Corrections of one IMU in the autopilot, as read."""
 
-    instance: int
-    """1 to 3: the IMU on whose telemetry they act."""
+    instance: int  # 1 to 3: the IMU on whose telemetry they act
     parameters: ImuParameters
     gyro_offset_rad_s: Vector
     accel_offset_m_s2: Vector
     accel_scale: Vector
     gyro_id: int | None
     accel_id: int | None
-    orientation: Matrix
-    """3x3, the IMU's axes to the vehicle's FRD: R."""
+    orientation: Matrix  # 3x3, the IMU's axes to the vehicle's FRD: R
     thermal: Thermal = Thermal()
-    zero_is_uncalibrated: bool = False
-    """Three accelerometer offsets of exactly zero mean "not calibrated"."""
-    far_axis: int | None = None
-    """Axis (0 to 2) of the far value by which small changes come into use; None where the firmware needs none."""
-    scale_unused_within: float = 0.0
-    """Scales whose vector is no farther than this from 1 are not in use after a start."""
-    accel_offset_may_be_unused: bool = False
-    """The parameters may hold other accelerometer offsets than those that the firmware uses."""
+    zero_is_uncalibrated: bool = False  # three accelerometer offsets of exactly zero mean "not calibrated"
+    far_axis: int | None = None  # of the far value by which small changes come into use; None: not needed
+    scale_unused_within: float = 0.0  # scales no farther than this from 1 are not in use after a start
+    accel_offset_may_be_unused: bool = False  # the firmware may use others than its parameters hold
     rivals: tuple[Rival, ...] = ()
     warnings: tuple[str, ...] = ()
 
     @property
     def offsets(self) -> dict[str, float]:
-        """Offsets by parameter, gyro offsets first."""
         names = self.parameters
         return {
             **dict(zip(names.gyro_offset, self.gyro_offset_rad_s, strict=True)),
@@ -204,7 +185,6 @@ class ImuCalibration:
 
     @property
     def corrections(self) -> dict[str, float]:
-        """Offsets and scales by parameter."""
         return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
 
     def in_use(self, accel_scale: Vector | None = None) -> Array:
@@ -226,7 +206,6 @@ class ImuCalibration:
         return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
 
     def corrects_like(self, other: ImuCalibration) -> bool:
-        """Check that both correct the same sensors alike."""
         return (
             self.corrections == other.corrections
             and self.thermal == other.thermal
@@ -235,7 +214,6 @@ class ImuCalibration:
         )
 
     def contradicts(self, values: Mapping[str, float]) -> bool:
-        """Check for a parameter that corrects this IMU and has another value here."""
         known = {**self.corrections, **self.thermal.values}
         return any(name in known and not same_float32(known[name], value) for name, value in values.items())
 
@@ -266,7 +244,7 @@ def changes_for(
     """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None: that triad stays.
 
     Raises:
-        CalibrationRefusedError: a value that is not plausible, see the limits at the top.
+        CalibrationRefusedError: a value beyond the limits at the top.
     """
     names, axis = calibration.parameters, calibration.far_axis
     changes: list[Change] = []
@@ -280,7 +258,7 @@ def changes_for(
 
 
 def vector_changes(
-    names: tuple[str, str, str], before: Vector, after: Vector, far_axis: int | None = None, step: float = 0.0
+    names: Names, before: Vector, after: Vector, far_axis: int | None = None, step: float = 0.0
 ) -> list[Change]:
     """Plan the changes of one vector; its `far_axis` goes by a value that is `step` above old and new."""
     vias = [

@@ -27,32 +27,23 @@ def all_zero(sample: ImuSample) -> bool:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuMessage:
-    """A message that may carry an IMU's samples."""
-
     name: str
     message: type[Message]
-    decode: Callable[[Message, float], ImuSample | str]
-    """Returns the sample in a message received at a time, or why there is none."""
-    integers: bool = False
-    """Values are cut toward zero to thousandths of rad/s and g."""
-    from_script: bool = False
-    """ArduPilot's script sends it, while disarmed and asked (`SCRIPT_ASK`)."""
-    lacks_bias: bool = False
-    """The bias of the EKF is to be added to it."""
+    decode: Callable[[Message, float], ImuSample | str]  # the sample in a message, or why there is none
+    integers: bool = False  # values are cut toward zero to thousandths of rad/s and g
+    from_script: bool = False  # ArduPilot's script sends it, while disarmed and asked (`SCRIPT_ASK`)
+    lacks_bias: bool = False  # the bias of the EKF is to be added to it
 
     @property
     def gyro_step_rad_s(self) -> float:
-        """Resolution; 0 for floats."""
         return MRAD if self.integers else 0.0
 
     @property
     def accel_step_m_s2(self) -> float:
-        """Resolution; 0 for floats."""
         return MG if self.integers else 0.0
 
 
 _ACCEL_AND_GYRO: Final = 0b111111
-"""HIGHRES_IMU.fields_updated: all three axes of both."""
 
 
 def _highres(message: Any, t_s: float) -> ImuSample | str:
@@ -84,8 +75,7 @@ SCALED: Final = ImuMessage("SCALED_IMU", mavlink.MAVLink_scaled_imu_message, _sc
 SCALED2: Final = ImuMessage("SCALED_IMU2", mavlink.MAVLink_scaled_imu2_message, _scaled, integers=True)
 SCALED3: Final = ImuMessage("SCALED_IMU3", mavlink.MAVLink_scaled_imu3_message, _scaled, integers=True)
 
-SCRIPT_ASK: Final = b"CMPF\x01"
-"""Payload that asks the script for floats; it sends them for 3 s."""
+SCRIPT_ASK: Final = b"CMPF\x01"  # payload that asks the script for floats; it sends them for 3 s
 _SCRIPT_NAME: Final = "CMP_IMU"
 _SCRIPT_FLOATS: Final = 7
 
@@ -115,10 +105,8 @@ PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias", lacks_
 """HIGHRES_IMU of the IMU that PX4 flies by. PX4 takes EKF2's own estimate of the bias off it, so at rest it tells
 nothing until that is known and added again (`telemetry.px4_console`)."""
 
-TEMPERATURE_AGE_S: Final = 5.0
-"""The longest that a temperature counts: HIGHRES_IMU has none of the IMU, so it comes with the integer messages."""
-_LATE_S: Final = 0.5
-"""A device time that goes back by less is a repeated or late message; by more, the autopilot has restarted."""
+TEMPERATURE_AGE_S: Final = 5.0  # HIGHRES_IMU has none of the IMU: it comes with the integer messages
+_LATE_S: Final = 0.5  # a device time that goes back by less is a late message; by more, a restart
 _WALK: Final = np.repeat([2.4e-6, 3e-5], 3)
 """Random walk of the EKF's bias estimate in one second at rest, rad/s and m/s^2: 0.5 deg/h and 3 micro-g (real PX4: 0.2
 to 0.5 deg/h)."""
@@ -129,13 +117,11 @@ Six = tuple[float, float, float, float, float, float]
 class EkfBiasReading(msgspec.Struct, frozen=True):
     """Bias that PX4's EKF takes off HIGHRES_IMU, as read at its console."""
 
-    bias: Six
-    """Gyro in rad/s, accelerometer in m/s^2."""
+    bias: Six  # gyro in rad/s, accelerometer in m/s^2
     variance: Six
     read_s: float
 
     def restored(self, sample: ImuSample) -> ImuSample:
-        """Return a HIGHRES_IMU as it was before the bias was taken off, with the variances of that bias."""
         gx, gy, gz, ax, ay, az = (np.array(sample.gyro_rad_s + sample.accel_m_s2) + self.bias).tolist()
         variance = (np.array(self.variance) + np.square(_WALK) * (sample.t_s - self.read_s)).tolist()
         return structs.replace(
@@ -147,8 +133,7 @@ class ImuSamples:
     """Completes the samples of one IMU's messages. Knows no clock: time comes in with the messages."""
 
     def __init__(self) -> None:
-        self.temperature: tuple[float, float] | None = None
-        """Temperature of the IMU in deg C and its time; None: none since the restart."""
+        self.temperature: tuple[float, float] | None = None  # deg C, and its time; None: none since the restart
         self._device_s: dict[str, float] = {}
 
     def accept(self, message: str, sample: ImuSample) -> bool:
@@ -162,11 +147,9 @@ class ImuSamples:
         return True
 
     def temperature_degc(self, now_s: float) -> float | None:
-        """Return the IMU's temperature, unless it is too old."""
         known = self.temperature
         return None if known is None or now_s - known[1] > TEMPERATURE_AGE_S else known[0]
 
     def complete(self, sample: ImuSample, bias: EkfBiasReading | None = None) -> ImuSample:
-        """Return a sample that was accepted with the IMU's temperature; `bias` is added to it."""
         restored = sample if bias is None else bias.restored(sample)
         return structs.replace(restored, temperature_degc=self.temperature_degc(sample.t_s))

@@ -3,14 +3,18 @@
     R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT)    of an internal sensor
     R = R(SENS_BOARD_X/Y/Z_OFF) R(CAL_*_ROT)         of an external one
 
-so the level adjustment, unlike ArduPilot's trim, turns IMU data.
+so the level adjustment, unlike ArduPilot's trim, turns IMU data. Thermal compensation, TC_* (autopilots 10.2), is
+neither read nor written: common boards are built without it. Where it acts, it counts as a part of the sensor.
 
-Thermal compensation, TC_* (autopilots 10.2), is neither read nor written: common boards are built without it. Where it
-acts, it counts as a part of the sensor.
+A sensor's offsets stand in the slot that holds its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3 show
+the pairs of gyro and accelerometer in the order in which their drivers started, and no message tells a device id
+(autopilots 4.1, 4.5). PX4 prefers the slot of the same number, so the order of the slots is a good guess; whether it
+was right shows only in the telemetry after a write, and `SlotMemory` keeps that by device id.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -18,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net
+from companion.autopilot.firmware.base import NO_IMU, Firmware, HeadingSetting, Net, SlotMemory
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
@@ -30,7 +34,6 @@ from companion.autopilot.firmware.imu_calibration import (
     offset_ranges,
 )
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
-from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Slot, SlotMemory, read_slots
 from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters
 from companion.errors import AutopilotError
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
@@ -38,38 +41,35 @@ from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Triad, Vector
 
+SLOTS: Final = 4
+PREFIX: Final[dict[Triad, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
+WORDS: Final[dict[Triad, str]] = {"gyro": "gyro", "accel": "accelerometer"}
+
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 _LEVEL_RANGE: Final = Range(-45.0, 45.0, unit="deg")
-_TC_RANGE: Final = Range(-10.0, 10.0)
-"""rad/s, and per kelvin, square kelvin, cubic kelvin."""
+_TC_RANGE: Final = Range(-10.0, 10.0)  # rad/s, and per kelvin, square kelvin, cubic kelvin
 
 IGNORED_STEP: Final = 0.01
 """A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2), and so is a
 vector of scales: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. After a start scales of 1 are in use."""
-MARGIN: Final = 1.05
-"""Both sides round to 32 bits."""
+MARGIN: Final = 1.05  # both sides round to 32 bits
 GATED_TILT_DEG: Final = 0.3
 """Tilt kept from before a write above which a restart is owed; a smaller one is what EKF2 shows of the biases of an
 uncalibrated sensor (autopilots 9.3)."""
 
 _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
-_MAYBE_INTERNAL_BUSES: Final = (1, 2)
-"""I2C and SPI; whether such a sensor is inside the autopilot is a fact of the board. PX4 keeps it in CAL_*_ROT."""
+_MAYBE_INTERNAL_BUSES: Final = (1, 2)  # I2C and SPI: a fact of the board, which PX4 keeps in CAL_*_ROT
 _PX4_ONLY_DEG: Final = {38: (90.0, 68.0, 293.0)}
 """Number 38: both firmwares' drivers know better angles, but PX4 turns calibrated data by these."""
 
-_EV_YAW: Final = 8
-"""Bit 3 of EKF2_EV_CTRL."""
-_MAGNETOMETER: Final = 1 << 10
-"""Bit 10 of EKF2_SENS_EN."""
-SHORTEST_TIMEOUT_S: Final = 0.5
-"""COM_ARM_AUTH_TO that leaves time for our answer."""
+_EV_YAW: Final = 1 << 3  # of EKF2_EV_CTRL
+_MAGNETOMETER: Final = 1 << 10  # of EKF2_SENS_EN
+SHORTEST_TIMEOUT_S: Final = 0.5  # COM_ARM_AUTH_TO that leaves time for our answer
 _LINKS: Final = 3
 
 
 def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
-    """Return one IMU's parameter names; its gyro and its accelerometer may stand in slots of different numbers."""
     gyro, accel = f"{PREFIX['gyro']}{gyro_slot}", f"{PREFIX['accel']}{accel_slot}"
     return ImuParameters(
         gyro_offset=(f"{gyro}_XOFF", f"{gyro}_YOFF", f"{gyro}_ZOFF"),
@@ -109,27 +109,20 @@ def _ranges() -> dict[str, Range]:
 
 
 class PX4(Firmware):
-    """PX4 with EKF2."""
-
     name: FirmwareName = "px4"
     words = "PX4"
     mav_autopilot = mavlink.MAV_AUTOPILOT_PX4
-    late_heartbeat_on_request = True
-    """It cannot be had faster than once a second, so a single lost one would leave the arm state unknown."""
+    late_heartbeat_on_request = True  # once a second at most: one lost leaves the arm state unknown
     integers_bytewise = True
     takes_nan_position = True
-    settle_s = 2.0
-    """It reads its parameters at most once a second (autopilots 9.2)."""
-    write_s = 8.0
-    """One vector after another: 7 s for one IMU."""
+    settle_s = 2.0  # it reads its parameters at most once a second (autopilots 9.2)
+    write_s = 8.0  # one vector after another: 7 s for one IMU
     imu_messages = {1: (PX4_FLOATS, SCALED), 2: (PX4_FLOATS, SCALED2), 3: (PX4_FLOATS, SCALED3)}
     tells_ekf_bias = True
     estimator_message = mavlink.MAVLink_estimator_status_message
     ranges = _ranges()
     rivals = _RIVALS
-    parts = {(0x26, 0x26): "icm42688p", (0x58, 0x58): "adis16470", (0x66, 0x6A): "bmi088"}
-    """drv_sensor.h."""
-    ignores_small_steps = True
+    parts = {(0x26, 0x26): "icm42688p", (0x58, 0x58): "adis16470", (0x66, 0x6A): "bmi088"}  # drv_sensor.h
     why_no_thermal_write = (
         "PX4's thermal compensation (TC_*) is not written: the firmware of common boards is built without it"
     )
@@ -141,8 +134,8 @@ class PX4(Firmware):
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
         boots = parameters.boots
-        accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
-        gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
+        accel = choose_slot(memory, "accel", instance, await read_slots(parameters, "accel"))
+        gyro = choose_slot(memory, "gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
         names = parameters_of(gyro.number, accel.number)
         offset = await parameters.read_vector(names.accel_offset)
         orientation = await _read_rotation(parameters, gyro, accel)
@@ -218,12 +211,13 @@ class PX4(Firmware):
         required, system, method, timeout_s = [await parameters.read_optional(name) for name in self.gate_parameters]
         if required is None:
             return "this PX4 has no arm authorisation"
-        wrong = [
-            *(["COM_ARM_AUTH_REQ 1"] if required != 1 else []),
-            *([f"COM_ARM_AUTH_ID {system_id}"] if system != system_id else []),
-            *(["COM_ARM_AUTH_MET 0"] if method not in (None, 0) else []),
-            *(["COM_ARM_AUTH_TO 1"] if timeout_s is not None and timeout_s < SHORTEST_TIMEOUT_S else []),
-        ]
+        wanted = {
+            "COM_ARM_AUTH_REQ 1": required == 1,
+            f"COM_ARM_AUTH_ID {system_id}": system == system_id,
+            "COM_ARM_AUTH_MET 0": method in (None, 0),
+            "COM_ARM_AUTH_TO 1": timeout_s is None or timeout_s >= SHORTEST_TIMEOUT_S,
+        }
+        wrong = [setting for setting, holds in wanted.items() if not holds]
         return f"set {', '.join(wrong)}" if wrong else None
 
     # --- ports
@@ -233,12 +227,10 @@ class PX4(Firmware):
 
     async def read_closed_links(self, parameters: Parameters) -> list[str]:
         closed: list[str] = []
-        for number in range(_LINKS):
-            # MAV_n_CONFIG = 0: there is no such link.
-            if await parameters.read_integer(f"MAV_{number}_CONFIG") == 0:
-                continue
-            if await parameters.read_integer(f"MAV_{number}_FORWARD") == 0:
-                closed.append(f"MAV_{number}")
+        for link in (f"MAV_{number}" for number in range(_LINKS)):
+            exists = await parameters.read_integer(f"{link}_CONFIG") != 0
+            if exists and await parameters.read_integer(f"{link}_FORWARD") == 0:
+                closed.append(link)
         return closed
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
@@ -253,7 +245,6 @@ class PX4(Firmware):
 
 
 def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) -> Vector:
-    """Return the accelerometer offsets after these changes."""
     after = {change.parameter: change.after for change in changes}
     names, before = calibration.parameters.accel_offset, calibration.accel_offset_m_s2
     x, y, z = (after.get(name, old) for name, old in zip(names, before, strict=True))
@@ -261,7 +252,6 @@ def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) ->
 
 
 def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
-    """Warn of changes that PX4 will not use after a restart."""
     after = accel_offset_with(calibration, changes)
     if calibration.far_axis is None or not _too_small_to_apply_at_boot(after):  # None: not PX4
         return ()
@@ -272,6 +262,61 @@ def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tu
 def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
     """Check whether PX4 will start without this vector: it compares with zero then, and ignores small differences."""
     return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Slot:
+    number: int
+    device_id: int
+    enabled: bool
+
+    @property
+    def bus(self) -> int:
+        return self.device_id & 0b111
+
+
+async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
+    found: list[Slot] = []
+    for number in range(SLOTS):
+        device_id = await parameters.read_integer(f"{PREFIX[sensor]}{number}_ID")
+        if device_id:
+            priority = await parameters.read_integer(f"{PREFIX[sensor]}{number}_PRIO")
+            found.append(Slot(number, device_id, enabled=priority != 0))
+    return tuple(found)
+
+
+def choose_slot(
+    memory: SlotMemory, sensor: Triad, instance: int, slots: Sequence[Slot], like: int | None = None
+) -> Slot:
+    """Choose the slot of an IMU (1 to 3) of all that hold a device id: the known one, else the best guess.
+
+    `like`: the device id of the IMU's other half, the same where one chip is both. Raise AutopilotError without a slot.
+    """
+    prefix, word = PREFIX[sensor], WORDS[sensor]
+    memory.enabled[sensor] = sum(slot.enabled for slot in slots)
+    if not slots:
+        raise AutopilotError(
+            f"PX4 has no {word} in {prefix}0_ID to {prefix}{SLOTS - 1}_ID: calibrate its {word}s once with the"
+            " ground station, so that it knows them"
+        )
+    own = next((slot for slot in slots if memory.known(sensor, slot.device_id) == instance), None)
+    if own is None:
+        free = [slot for slot in slots if memory.known(sensor, slot.device_id) is None] or [
+            slot for slot in slots if memory.known(sensor, slot.device_id) == NO_IMU
+        ]
+        own = next((slot for slot in free if slot.device_id == like), None)
+        if own is None and instance <= len(slots) and slots[instance - 1] in free:
+            own = slots[instance - 1]
+        if own is None and instance <= len(slots):
+            own = next((slot for slot in free if slot.enabled), None)
+    if own is None:
+        raise AutopilotError(
+            f"the autopilot has no IMU {instance}: only {len(slots)} of {prefix}0_ID to {prefix}{SLOTS - 1}_ID"
+            f" hold a {word}"
+        )
+    if not own.enabled:
+        raise AutopilotError(f"IMU {instance}: {prefix}{own.number}_PRIO = 0, so PX4 has this {word} switched off")
+    return own
 
 
 async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Matrix:

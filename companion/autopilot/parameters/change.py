@@ -6,6 +6,7 @@ PX4 ignores a small change of a vector of offsets, unless the vector makes a far
 from __future__ import annotations
 
 import abc
+import ctypes
 import dataclasses
 import math
 import re
@@ -19,16 +20,14 @@ from companion.samples import Vector
 
 FirmwareName = Literal["ardupilot", "px4", "other"]
 
-SCALES: Final = (0.5, 2.0)
-"""Accelerometer scales with which a calibration works: it divides by them."""
+Names = tuple[str, str, str]  # parameters of a vector: X, Y, Z
+
+SCALES: Final = (0.5, 2.0)  # accelerometer scales with which a calibration works: it divides by them
 
 
 def float32(value: float) -> float:
-    """The nearest 32 bit float; infinite when there is none."""
-    try:
-        return float(struct.unpack("<f", struct.pack("<f", value))[0])
-    except OverflowError:
-        return math.copysign(math.inf, value)
+    """Round to the nearest 32 bit float; infinite beyond their range."""
+    return ctypes.c_float(value).value
 
 
 def same_float32(one: float, other: float) -> bool:
@@ -45,35 +44,33 @@ def _rank(value: float) -> int:
 
 
 class Parameters(abc.ABC):
-    """Parameters read by name, of an autopilot that answers or of a log; `ParameterClient` says what they raise."""
+    """Parameters read by name, of an autopilot that answers or of a log; `ParameterClient` says what they raise.
+
+    `boots` counts the starts of the autopilot that have been seen; `firmware` is None before the first heartbeat.
+    """
 
     @property
     @abc.abstractmethod
-    def firmware(self) -> FirmwareName | None:
-        """None: not known yet."""
+    def firmware(self) -> FirmwareName | None: ...
 
     @property
     @abc.abstractmethod
-    def boots(self) -> int:
-        """Starts of the autopilot that have been seen."""
+    def boots(self) -> int: ...
 
     @abc.abstractmethod
-    async def read(self, name: str) -> float:
-        """Read one that must exist."""
+    async def read(self, name: str) -> float: ...
 
     @abc.abstractmethod
-    async def read_optional(self, name: str) -> float | None:
-        """Read one; None: there is no such parameter."""
+    async def read_optional(self, name: str) -> float | None: ...
 
     @abc.abstractmethod
-    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
-        """Read several; where `optional`, what does not exist is left out."""
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]: ...
 
     @abc.abstractmethod
     async def ensure_same_boot(self, boots: int, words: str) -> None:
         """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
 
-    async def read_vector(self, names: tuple[str, str, str], low: float = -math.inf, high: float = math.inf) -> Vector:
+    async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
         """Read three numbers within limits, such as `SCALES`; raise AutopilotError where one is outside."""
         x, y, z = [await self.read(name) for name in names]
         for name, value in zip(names, (x, y, z), strict=True):
@@ -131,7 +128,6 @@ class Change:
 
     @property
     def far(self) -> float:
-        """The far value, or the new one where it needs none."""
         return self.after if self.via is None else self.via
 
     @property
@@ -178,20 +174,16 @@ there is one.
 
 @dataclasses.dataclass(slots=True)
 class PendingChange:
-    """One parameter of a write, and its state."""
-
     change: Change
     sent: bool = False
-    confirmed: bool = False
-    """The autopilot has answered with a value of ours: another one found later is somebody else's."""
+    confirmed: bool = False  # it answered with a value of ours: another one found later is somebody else's
     is_far: bool = False
     read_back: float | None = None
     outcome: Outcome = "failed"
     left: bool = False
 
 
-PendingVector = tuple[PendingChange, list[PendingChange]]
-"""The axis with a far value, and the others of its vector."""
+PendingVector = tuple[PendingChange, list[PendingChange]]  # the axis with a far value, and the others
 
 
 def by_vector(items: Sequence[PendingChange]) -> tuple[list[PendingChange], list[PendingVector]]:

@@ -22,10 +22,8 @@ from companion.autopilot.firmware.base import Firmware
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 
-NOWHERE_VARIANCE_M2: Final = 1e4
-"""Variance of a position that is none: ArduPilot bounds its sigma to 100 m."""
-_X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20
-"""Indices of the diagonal in the upper right triangle, row by row."""
+NOWHERE_VARIANCE_M2: Final = 1e4  # variance of a position that is none: ArduPilot bounds its sigma to 100 m
+_X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20  # on the diagonal of the upper right triangle, row by row
 _U32: Final = 2**32
 
 
@@ -78,8 +76,6 @@ def attitude_messages(
 
 
 class TimesyncResponder:
-    """Answers the latched autopilot, with the clock that stamps what we send."""
-
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0
         self._link = link

@@ -27,37 +27,26 @@ from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
 
-SILENCE_S: Final = 2.0
-"""After this long without a sample the stream is asked for again."""
+SILENCE_S: Final = 2.0  # without a sample: the stream is asked for again
 
-SLOWER_RATES_HZ: Final = (100.0, 50.0, 40.0, 25.0, 10.0)
-"""Tried in turn when a rate is denied: ArduPilot allows 1.25 times its loop rate, Plane's 50 Hz loop 40 Hz."""
+SLOWER_RATES_HZ: Final = (100.0, 50.0, 40.0, 25.0, 10.0)  # ArduPilot allows 1.25 times its loop rate
 
-_ASKS: Final = 3
-"""Requests for a message that nobody refuses and that does not come."""
+_ASKS: Final = 3  # for a message that nobody refuses and that does not come
 
-_BETTER_AGAIN_S: Final = 30.0
-"""Time between requests for a better message that merely never came."""
+_BETTER_AGAIN_S: Final = 30.0  # between requests for a better message that merely never came
 
 _LOOK_S: Final = 0.25
 _TURN_S: Final = 1.0
-BEAT_WITHIN_S: Final = 20.0
-"""A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
-_BESIDE_CONSOLE: Final = 0.85
-"""Share of the rate that the bias' answers leave on a slow line."""
+BEAT_WITHIN_S: Final = 20.0  # a request may wait behind fifteen others that go unanswered
+_BESIDE_CONSOLE: Final = 0.85  # share of the rate that the bias' answers leave on a slow line
 _TEMPERATURE_RATE_HZ: Final = 2.0
-_ASK_SCRIPT_S: Final = 1.0
-"""Time between requests to ArduPilot's script, which sends for 3 s after one."""
-_SEEN_BY_RATE_HZ: Final = 4.0
-"""Rate of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
-_ABSENT_AFTER: Final = 10
-"""Readings of nothing but zeros in a row, and there is no such IMU."""
+_ASK_SCRIPT_S: Final = 1.0  # time between requests to ArduPilot's script, which sends for 3 s after one
+_SEEN_BY_RATE_HZ: Final = 4.0  # of PX4's integers beside floats: a write looks for 0.4 s (`px4_writes`)
+_ABSENT_AFTER: Final = 10  # readings of nothing but zeros in a row, and there is no such IMU
 
 
 @dataclasses.dataclass(slots=True)
 class _Source:
-    """A message that the samples may come in, and what is known of whether it does."""
-
     message: ImuMessage
     rates_hz: Sequence[float]
     rate: int = 0
@@ -69,7 +58,6 @@ class _Source:
 
     @property
     def absent(self) -> bool:
-        """There is no such IMU."""
         return self.zeros >= _ABSENT_AFTER
 
 
@@ -80,8 +68,9 @@ _RESTARTED: Final = "the autopilot restarted"
 class ImuStream:
     """Asks for one IMU's messages (1, 2 or 3), keeps them coming and hands on their samples in vehicle FRD.
 
-    Slower than `rate_hz` when the autopilot denies that. `on_kind_change` is called before the first sample of another
-    message (and with None when there is none any more), so that nobody mixes two resolutions in one mean.
+    Slower than `rate_hz` when the autopilot denies that; `may_be_slow`: the eleven samples a second of ArduPilot's
+    script will do. `on_kind_change` is called before the first sample of another message (and with None when there is
+    none any more), so that nobody mixes two resolutions in one mean.
     """
 
     def __init__(
@@ -96,13 +85,10 @@ class ImuStream:
         on_kind_change: Callable[[ImuMessage | None], None],
         may_be_slow: Callable[[], bool] = lambda: True,
     ) -> None:
-        """`may_be_slow`: whether the eleven samples a second of ArduPilot's script will do."""
         self.samples = 0
         self._starting = f"waiting for the autopilot to start IMU {instance}"
-        self.problem = self._starting
-        """Why there are no samples, one line; empty while there are."""
-        self.turns = 0
-        """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
+        self.problem = self._starting  # why there are no samples, one line; empty while there are
+        self.turns = 0  # turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not
         self._vehicle, self._instance = vehicle, instance
         self._on_sample, self._on_kind_change = on_sample, on_kind_change
         self._ekf_bias, self._may_be_slow = ekf_bias, may_be_slow
@@ -116,7 +102,6 @@ class ImuStream:
 
     @property
     def kind(self) -> ImuMessage | None:
-        """Message that brings the samples; None while there are none."""
         return None if self._current is None else self._current.message
 
     @property
@@ -136,11 +121,9 @@ class ImuStream:
 
     @property
     def rate_hz(self) -> float | None:
-        """The rate that was asked for last and not denied; None while nothing comes."""
         return None if self._current is None else self._current.rates_hz[self._current.rate]
 
     async def run(self) -> None:
-        """Keep the samples coming until cancelled; raises nothing else."""
         kinds = {each.message for firmware in FIRMWARES for each in firmware.imu_messages.get(self._instance, ())}
         subscriptions = [self._link.subscribe(kind, self._on_message) for kind in kinds]
         subscriptions.append(self._vehicle.on_event.add(self._on_event))
@@ -190,7 +173,6 @@ class ImuStream:
                 better = await self._keep(found)
 
     async def _find(self) -> _Source | None:
-        """The first source, best first, that sends."""
         for source in filter(self._usable, self._sources):
             for _ in range(_ASKS):
                 if self._restart.is_set() or source.refused or source.message.from_script:
@@ -223,7 +205,6 @@ class ImuStream:
             return result is not None
 
     async def _sends(self, source: _Source) -> bool:
-        """Wait for a sample of the source, `SILENCE_S` at most; False at once where it is refused."""
         loop = asyncio.get_running_loop()
         asked_s = loop.time()
         while not (self._restart.is_set() or source.absent or source.refused):
@@ -277,7 +258,6 @@ class ImuStream:
         return None
 
     def _better_than(self, source: _Source) -> _Source | None:
-        """A better source that has begun to send at a useful rate."""
         found = None
         for each in self._sources[: self._sources.index(source)]:
             if each.recent >= 10.0 * _LOOK_S and not each.absent and found is None:
@@ -388,7 +368,6 @@ class ImuStream:
 
 
 async def ask_script(link: MavlinkLink, streams: Sequence[ImuStream]) -> None:
-    """Ask ArduPilot's script for floats of every IMU as long as a stream wants them; runs until cancelled."""
     while True:
         if any(stream.wants_script for stream in streams):
             link.send(to_script(link.system_id, imu_messages.SCRIPT_ASK))

@@ -32,8 +32,7 @@ from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
 
-_ID: Final = r"(\d+)[^\n]*\n\s*"
-"""Pattern of a device id, to the start of the next line."""
+_ID: Final = r"(\d+)[^\n]*\n\s*"  # a device id, to the start of the next line
 _VECTOR: Final = r"\[(-?\d+\.\d+), (-?\d+\.\d+), (-?\d+\.\d+)\]\s*"
 _ANSWER_S: Final = 4.0
 _BYTES: Final = 70
@@ -44,8 +43,6 @@ _PROMPT: Final = re.compile("(nsh|pxh)> ")
 
 
 class Px4Console:
-    """Has the console print topics."""
-
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.text = ""
         self._link, self._vehicle = link, vehicle
@@ -76,22 +73,18 @@ class Px4Console:
                 self._answered.set()
 
 
-LOOK_EVERY_S: Final = 5.0
-"""In turn at the bias and at which EKF flies: 1300 bytes each, 4.5 % of a line of 57600 baud."""
+LOOK_EVERY_S: Final = 5.0  # at the bias and at which EKF flies, in turn: 1300 bytes, 4.5 % of 57600 baud
 _AT_FIRST_S: Final = 1.0
 MISSES: Final = 10
-_AGAIN_S: Final = 60.0
-"""After so many answers that did not come or were not understood."""
+_AGAIN_S: Final = 60.0  # after so many answers that did not come or were not understood
 _TURN_S: Final = 0.5
 _OLD_S: Final = 45.0
 _CALM_S: Final = 60.0
 """New offsets set the estimate to nothing, and it is some seconds until it is back. On a deck they are watched for 40 s
 by the integers, and floats that came back earlier would begin that anew."""
 _UNITS: Final = np.repeat([1e-3, 1e-2], 3)
-_JUMP: Final = 0.5 * _UNITS
-"""Largest step from one look to the next: 100 deg/h, 0.5 mg."""
-_STEADY: Final = 0.02 * _UNITS
-"""Within a second, before it is used: 4 deg/h, 0.02 mg."""
+_JUMP: Final = 0.5 * _UNITS  # largest step from one look to the next: 100 deg/h, 0.5 mg
+_STEADY: Final = 0.02 * _UNITS  # within a second, before it is used: 4 deg/h, 0.02 mg
 
 # Seventy bytes that are lost leave no other match: each value has its neighbours beside it.
 _PRIMARY: Final = re.compile(r"primary_instance: (\d+)\s|estimator_selector_status[^>]*never published")
@@ -107,22 +100,16 @@ _IMU: Final = re.compile(
 
 
 class EkfBias:
-    """Reads the bias again and again; `run` it."""
-
     def __init__(self, console: Px4Console, vehicle: Vehicle) -> None:
-        self.instance: int | None = None
-        """The IMU (1..) that HIGHRES_IMU shows; None while its bias is not known."""
-        self.settled = asyncio.Event()
-        """Set once the bias is known, or the first answer did not tell it."""
-        self.reading: EkfBiasReading | None = None
-        """Latest reading; `known_of` says whether it may be used."""
+        self.instance: int | None = None  # IMU (1..) that HIGHRES_IMU shows; None while its bias is not known
+        self.settled = asyncio.Event()  # set once the bias is known, or the first answer did not tell it
+        self.reading: EkfBiasReading | None = None  # latest reading; `known_of` says whether it may be used
         self.on_read: Listeners[EkfBiasReading] = Listeners()
         self._console, self._vehicle = console, vehicle
         self._held, self._misses = 0, 0
         self._woken = asyncio.Event()
         self._from_s = -math.inf
-        self._imus: dict[tuple[int, int], int] = {}
-        """IMUs (1..) by the device ids of accelerometer and gyro."""
+        self._imus: dict[tuple[int, int], int] = {}  # by device ids of accelerometer and gyro, from 1
         self._primary: int | None = None
         self._at_bias = False
 
@@ -131,7 +118,6 @@ class EkfBias:
         return self.instance == instance and not self._age_s > _OLD_S
 
     def forget(self) -> None:
-        """Start anew."""
         self.instance = self._primary = self.reading = None
 
     @contextlib.contextmanager
@@ -146,12 +132,11 @@ class EkfBias:
             self.step()
 
     def step(self) -> None:
-        """Other offsets have come into force."""
+        """Wait for the bias to come back: other offsets are in force."""
         self.forget()
         self._from_s = asyncio.get_running_loop().time() + _CALM_S
 
     async def run(self) -> None:
-        """Read until cancelled."""
         ignore = self._vehicle.on_event.add(self._on_event)
         try:
             while True:
@@ -162,7 +147,6 @@ class EkfBias:
 
     @property
     def may_look(self) -> bool:
-        """The console may be asked for the bias now."""
         return self.may_ask and asyncio.get_running_loop().time() >= self._from_s
 
     @property
@@ -237,14 +221,11 @@ class EkfBias:
             self.settled.clear()
 
 
-PAUSE_S: Final = 0.2
-"""Each answer costs the autopilot a task, and a console on the same port its calm."""
-SLOW_PAUSE_S: Final = 0.9
-"""On a line of 57600 baud, of which 1100 bytes an answer are then a fifth."""
+PAUSE_S: Final = 0.2  # each answer costs the autopilot a task, and a console on the same port its calm
+SLOW_PAUSE_S: Final = 0.9  # on a line of 57600 baud, of which 1100 bytes an answer are then a fifth
 _STATUS_IDLE_S: Final = 0.5
 _STATUS_MISSES: Final = 5
-_STATUS_AGAIN_S: Final = 30.0
-"""After so many answers in a row that did not come or were not understood."""
+_STATUS_AGAIN_S: Final = 30.0  # after so many answers in a row that did not come or were not understood
 _STATUS: Final = re.compile(
     rf"timestamp: (\d+) [^\n]*\n\s*accel_device_id: {_ID}gyro_device_id: {_ID}.*"
     rf"mean_accel: {_VECTOR}mean_gyro: {_VECTOR}var_accel: {_VECTOR}.*temperature_accel: (\S+)\s",
@@ -253,8 +234,6 @@ _STATUS: Final = re.compile(
 
 
 class ImuStatus:
-    """Has the console print the status of the IMUs that want it, in turn; `run` it."""
-
     def __init__(
         self,
         console: Px4Console,
@@ -273,7 +252,6 @@ class ImuStatus:
         self._seen: dict[int, str] = {}
 
     async def run(self) -> None:
-        """Ask until cancelled."""
         misses = 0
         while True:
             wanted = list(self._wanted()) if self._ekf_bias.may_ask else []

@@ -20,13 +20,11 @@ from companion.autopilot.parameters.change import FirmwareName
 from companion.links.mavlink.link import MavlinkLink, Message
 
 _COPY_S: Final = 0.5
-MAX_WAITING: Final = 16
-"""Commands of one kind that may wait; beyond that the newest is dropped, counted, and answered None at once."""
+MAX_WAITING: Final = 16  # commands of one kind; the newest beyond is dropped and answered None at once
 
 
 _Answer = asyncio.Future[int | None]
-_Request = tuple[tuple[float, ...], float, _Answer]
-"""Parameters of a command, how long its answer is awaited, and the answer."""
+_Request = tuple[tuple[float, ...], float, _Answer]  # parameters, timeout, answer
 
 
 def _settle(answer: _Answer, result: int | None) -> None:
@@ -38,8 +36,7 @@ class Commands:
     """COMMAND_LONG to one autopilot: to what `target` gives, None while it is not known."""
 
     def __init__(self, link: MavlinkLink, target: Callable[[], tuple[int, int] | None]) -> None:
-        self.results: Counter[str] = Counter()
-        """Answers by result's name, plus "no answer" and "dropped" (never sent)."""
+        self.results: Counter[str] = Counter()  # by result's name, and "no answer", "dropped" (never sent)
         self._link = link
         self._target = target
         self._queues: dict[int, deque[_Request]] = {}
@@ -65,15 +62,12 @@ class Commands:
         return answer
 
     def request_message_interval(self, message_id: int, rate_hz: float) -> _Answer:
-        """Ask for a message at a rate (MAV_CMD_SET_MESSAGE_INTERVAL)."""
         return self.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, round(1e6 / rate_hz))
 
     def request_message(self, message_id: int) -> _Answer:
-        """Ask for a message once (MAV_CMD_REQUEST_MESSAGE)."""
         return self.send(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
 
     def close(self) -> None:
-        """Stop; whoever waits gets None."""
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
@@ -129,7 +123,6 @@ class Commands:
 
 
 def result_name(result: int) -> str:
-    """Return the dialect's name of a MAV_RESULT."""
     known = mavlink.enums["MAV_RESULT"].get(result)
     return known.name if known is not None else str(result)
 
@@ -141,8 +134,7 @@ LONGEST_PAUSE_S: Final = 30.0
 @dataclasses.dataclass(slots=True)
 class _Wanted:
     message: type[Message]
-    rate_hz: float | None
-    """None: wanted once, and again after a restart."""
+    rate_hz: float | None  # None: wanted once, and again after a restart
     of: FirmwareName | None
     heard_s: float = -math.inf
     asked_s: float = -math.inf
@@ -161,7 +153,6 @@ class StandingRequests:
         self._wanted.append(_Wanted(message, rate_hz, of))
 
     def heard(self, message: Message, t_s: float) -> None:
-        """One has come."""
         for wanted in self._wanted:
             if wanted.message.msgname == message.get_type():
                 wanted.heard_s, wanted.pause_s = t_s, FIRST_PAUSE_S
@@ -174,7 +165,6 @@ class StandingRequests:
                 wanted.heard_s = -math.inf
 
     def ask_for_missing(self, now_s: float, firmware: FirmwareName | None) -> None:
-        """Ask for what has stayed away, unless it was asked for a short time ago."""
         for wanted in self._wanted:
             if wanted.of not in (None, firmware):
                 continue

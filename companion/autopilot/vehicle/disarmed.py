@@ -27,22 +27,17 @@ from companion.errors import NotDisarmedError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.events import comes
 
-PROOF_HOLDS_S: Final = 1.5
-"""The longest from the question to the write: a heartbeat that cannot be requested comes once a second."""
+PROOF_HOLDS_S: Final = 1.5  # from the question to the write: some heartbeats come once a second only
 
 LONGEST_PAUSE_S: Final = 0.1
 """After a longer pause of our own loop no earlier question counts: what is read then may have waited for that long."""
 
 ASK_AGAIN_S: Final = 0.3
-GIVE_UP_S: Final = 8.0
-"""With a fifth of all packets lost both ways 26 questions stay unanswered once in 10^11 times."""
+GIVE_UP_S: Final = 8.0  # with a fifth lost both ways 26 questions stay unanswered once in 10^11 times
 
-_LONGEST_WAIT_S: Final = 0.75
-"""Slower answers are not waited for, so that a proof holds for a while."""
-_PULSE_S: Final = 0.02
-"""Period of the check that our own loop runs while an answer is awaited."""
-_REMEMBERED: Final = 8
-"""Questions whose answers are still known, and answers whose times are."""
+_LONGEST_WAIT_S: Final = 0.75  # slower answers are not waited for, so that a proof holds for a while
+_PULSE_S: Final = 0.02  # our own loop is checked while an answer is awaited
+_REMEMBERED: Final = 8  # questions whose answers are still known, and answers whose times are
 
 
 class DisarmedProof:
@@ -76,13 +71,11 @@ class DisarmedProof:
         return not paused
 
     def asked(self, number: int, now_s: float) -> None:
-        """Note that a question leaves."""
         self._asked_s[number] = now_s
         if len(self._asked_s) > _REMEMBERED:
             del self._asked_s[next(iter(self._asked_s))]
 
     def answered(self, number: int, now_s: float) -> None:
-        """Note that an answer came."""
         asked_s = self._asked_s.get(number)
         if asked_s is not None:
             self._answers_s.append(now_s - asked_s)
@@ -90,7 +83,6 @@ class DisarmedProof:
                 self._answered_s = max(self._answered_s, asked_s)
 
     def heard(self, *, armed: bool) -> None:
-        """Note a heartbeat under the autopilot's ids."""
         if armed:
             self._answered_s = -math.inf
         self._proven_s = self._answered_s
@@ -147,12 +139,10 @@ class DisarmedCheck:
         return self._state() is ArmState.DISARMED and self._proof.holds(asyncio.get_running_loop().time())
 
     def answered(self, number: int) -> None:
-        """An answer to TIMESYNC came from it."""
         self._proof.answered(number, asyncio.get_running_loop().time())
         self._news.set()
 
     def heard(self, *, armed: bool) -> None:
-        """A heartbeat came under its ids."""
         self._proof.heard(armed=armed)
         self._news.set()
 

@@ -45,8 +45,6 @@ _AHRS_LOOK_S: Final = 0.25
 
 
 class EkfWatch:
-    """Asks for AHRS while somebody wants to know, and averages what comes over 2 s."""
-
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._seen: deque[tuple[float, float, float, float]] = deque(maxlen=2048)
@@ -98,9 +96,9 @@ class EkfWatch:
             await asyncio.sleep(_AHRS_LOOK_S)
 
     def stop(self) -> None:
-        """No more AHRS on our account: back to the autopilot's own rate."""
         if self._asked and self._vehicle.alive:
             self._asked = False
+            # 0: the firmware's own rate.
             self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _AHRS, 0.0)
 
     def _ask(self) -> None:
@@ -132,15 +130,14 @@ def _words(bias_rad_s: float | None) -> str:
 
 HEADING_SIGMA_DEG: Final = 10.0
 """Sigma of an autopilot's compass that agrees with its gyros; next to iron, or badly calibrated, it is off by more."""
-RATE_HZ: Final = 1.0
-STEADY_DEG: Final = 2.0
-"""Largest turn of yaw in `KEPT_S` while the aircraft stands: else the estimator is still looking for it."""
-KEPT_S: Final = 5.0
-QUICK_HZ: Final = 5.0
-LEAST: Final = 4
-LEAST_S: Final = 1.0
-LOOK_S: Final = 0.2
-OLD_S: Final = 5.0
+_RATE_HZ: Final = 1.0
+_STEADY_DEG: Final = 2.0  # turn of yaw in `_STEADY_S` at rest: beyond, the estimator still looks for it
+_STEADY_S: Final = 5.0
+_UP_RATE_HZ: Final = 5.0
+_UP_LEAST: Final = 4
+_UP_LEAST_S: Final = 1.0
+_UP_LOOK_S: Final = 0.2
+_OLD_S: Final = 5.0
 _MAGNETOMETER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
 
 
@@ -149,7 +146,7 @@ class OwnCompass:
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._has_compass_s = self._agrees_s = -math.inf
-        rate_hz = RATE_HZ if wanted else None
+        rate_hz = _RATE_HZ if wanted else None
         vehicle.hear(mavlink.MAVLink_sys_status_message, self._on_status, rate_hz)
         self._vehicle = vehicle
         for firmware in FIRMWARES:
@@ -157,8 +154,7 @@ class OwnCompass:
                 vehicle.hear(firmware.estimator_message, self._on_estimator, rate_hz, firmware.name)
 
     def agrees(self, now_s: float) -> bool:
-        """Check that the magnetometer was lately healthy and in agreement."""
-        return min(self._has_compass_s, self._agrees_s) >= now_s - OLD_S
+        return min(self._has_compass_s, self._agrees_s) >= now_s - _OLD_S
 
     def _on_status(self, message: mavlink.MAVLink_sys_status_message, t_s: float) -> None:
         fit = (
@@ -181,17 +177,17 @@ class OwnAttitude:
         self._vehicle, self._wanted = vehicle, wanted
         self._seen: deque[tuple[float, float, float, float]] = deque(maxlen=256)
         self._compass = OwnCompass(vehicle, wanted=wanted)
-        vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, RATE_HZ if wanted else None)
+        vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, _RATE_HZ if wanted else None)
 
     def heading(self) -> OwnHeading | None:
         """Return its yaw from true north; None while it has none that can be believed."""
         now_s = asyncio.get_running_loop().time()
-        seen = self._since(now_s - KEPT_S)
+        seen = self._since(now_s - _STEADY_S)
         if len(seen) < 2 or not self._compass.agrees(now_s):
             return None
         last = seen[-1][3]
         turned = [math.remainder(yaw - last, 2.0 * math.pi) for _, _, _, yaw in seen]
-        if max(turned) - min(turned) > STEADY_DEG * DEG:
+        if max(turned) - min(turned) > _STEADY_DEG * DEG:
             return None
         # Without a place it knows no declination.
         north_deg = 0.0 if self._vehicle.place.position is not None else UNKNOWN_DECLINATION_SIGMA_DEG
@@ -199,30 +195,28 @@ class OwnAttitude:
 
     @contextlib.contextmanager
     def asked(self) -> Iterator[None]:
-        """Meanwhile ATTITUDE comes several times a second."""
         commands, message_id = self._vehicle.commands, int(mavlink.MAVLINK_MSG_ID_ATTITUDE)
-        commands.request_message_interval(message_id, QUICK_HZ)
+        commands.request_message_interval(message_id, _UP_RATE_HZ)
         try:
             yield
         finally:
             # 0: the firmware's own rate.
-            interval_us = 1e6 / RATE_HZ if self._wanted else 0.0
+            interval_us = 1e6 / _RATE_HZ if self._wanted else 0.0
             commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
 
     def up(self, since_s: float) -> Array | None:
         """Mean direction of up in the vehicle's axes, (3,), of a second at least from then on; None before that."""
         seen = self._since(since_s)
-        if len(seen) < LEAST or seen[-1][0] - seen[0][0] < LEAST_S:
+        if len(seen) < _UP_LEAST or seen[-1][0] - seen[0][0] < _UP_LEAST_S:
             return None
         ups = [body_from_ned(roll, pitch, 0.0) @ (0.0, 0.0, -1.0) for _, roll, pitch, _ in seen]
         return np.asarray(np.mean(ups, axis=0))
 
     async def up_since(self, since_s: float) -> Array | None:
-        """Wait for it a few seconds; None: this autopilot does not tell."""
         loop = asyncio.get_running_loop()
-        give_up_s = loop.time() + OLD_S
+        give_up_s = loop.time() + _OLD_S
         while (found := self.up(since_s)) is None and loop.time() < give_up_s:
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(_UP_LOOK_S)
         return found
 
     def _since(self, t_s: float) -> list[tuple[float, float, float, float]]:

@@ -15,20 +15,17 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import INSTANCES, ArduPilotParameters
 from companion.autopilot.parameters.change import same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.errors import AutopilotError, NotDisarmedError
 
 logger = logging.getLogger(__name__)
 
-TIMEOUT_S: Final = 40.0
-"""Longest wait: ArduPilot gives up after some 30 s."""
-_LOST_AFTER_S: Final = 3.0
-"""Time after the command at which old offsets still in force mean that it was lost or refused."""
+TIMEOUT_S: Final = 40.0  # longest wait: ArduPilot gives up after some 30 s
+_LOST_AFTER_S: Final = 3.0  # old offsets still in force so long after the command: it was lost or refused
 _LOOK_S: Final = 0.25
-_AFTERWARDS_S: Final = 0.5
-"""Time from the last offset to the end of the command: the saving, and the EKF's reset."""
+_AFTERWARDS_S: Final = 0.5  # from the last offset to the end: the saving, and the EKF's reset
 
 GyroOutcome = Literal["reset", "not converged", "unanswered", "not run"]
 """End of the calibration.
@@ -40,11 +37,7 @@ and the answer was lost. "not run": refused or lost, nothing has changed.
 
 
 async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
-    """Read every parameter that the calibration writes, of all instances.
-
-    Raises:
-        AutopilotError: one cannot be read, or the autopilot restarted meanwhile.
-    """
+    """Read every parameter that the calibration writes, of all instances; raise AutopilotError after a restart."""
     boots, every = parameters.boots, [ArduPilotParameters(instance) for instance in INSTANCES]
     found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
     present = [names for names in every if names.gyro_offset[0] in found]
@@ -64,7 +57,6 @@ async def read_active_tcal(parameters: ParameterClient, values: Mapping[str, flo
 
 
 def changed(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Return old and new value of every parameter that differs, by name."""
     both = {name: (old, after[name]) for name, old in before.items() if name in after}
     return {name: pair for name, pair in both.items() if not same_float32(*pair)}
 

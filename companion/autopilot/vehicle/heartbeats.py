@@ -13,20 +13,16 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-ARMED_HOLDS_S: Final = 3.0
-"""Time for which an armed heartbeat outweighs disarmed ones: one comes a second at least, and two may be lost."""
+ARMED_HOLDS_S: Final = 3.0  # over disarmed heartbeats: one comes a second at least, and two may be lost
 
 _CHANGES: Final = 4
-_CHANGES_WITHIN_S: Final = 5.0
-"""Arming and disarming twice within this time is more than pilots and autopilots do."""
+_CHANGES_WITHIN_S: Final = 5.0  # arming and disarming twice within it is more than pilots do
 _ONLY_ARMED_S: Final = 10.0
 _ONLY_DISARMED_S: Final = 30.0
 """A contradiction is over when only "armed", or only "disarmed", has been heard for so long. The other sender may have
 been silenced; "armed" is believed earlier, as it permits nothing."""
-_RESTARTS_S: Final = 1.0
-"""Within this time no autopilot restarts twice; two whose times since boot alternate seem to."""
-_TWO_HOLDS_S: Final = 5.0
-"""Time after the last sign of a second autopilot under our vehicle's ids in which nothing is believed of either."""
+_RESTARTS_S: Final = 1.0  # none restarts twice within it; two whose times since boot alternate seem to
+_TWO_HOLDS_S: Final = 5.0  # after the last sign of a second autopilot nothing is believed of either
 
 
 class ArmState(enum.Enum):
@@ -38,15 +34,12 @@ class ArmState(enum.Enum):
 
     @property
     def why_not_written(self) -> str | None:
-        """Why nothing may be written, for people; None: it may."""
         if self is ArmState.DISARMED:
             return None
         return "the aircraft is armed" if self is ArmState.ARMED else "it is unknown whether the aircraft is armed"
 
 
 class ArmingWatch:
-    """Takes the heartbeats of one vehicle and says what may be believed of them."""
-
     def __init__(self) -> None:
         self._armed: bool | None = None
         self._armed_s = self._disarmed_s = self._two_s = self._restarted_s = -math.inf
@@ -54,7 +47,6 @@ class ArmingWatch:
         self._changes_s: deque[float] = deque(maxlen=_CHANGES)
 
     def heard(self, t_s: float, *, armed: bool) -> None:
-        """One heartbeat came."""
         self._contradicted = self.contradicts_itself(t_s)
         if armed:
             self._armed_s = t_s
@@ -84,7 +76,6 @@ class ArmingWatch:
         return self._armed
 
     def two_seen(self, t_s: float) -> None:
-        """Something else has shown that two autopilots have these ids."""
         self._two_s = t_s
 
     def conflict(self, t_s: float, system_id: int | None) -> str | None:
@@ -99,8 +90,7 @@ class ArmingWatch:
         return self._contradicted and not only_armed and t_s - self._armed_s < _ONLY_DISARMED_S
 
 
-ADOPT_OTHER_COMPONENT_S: Final = 2.0
-"""Time for which an autopilot on another component than 1 must have been heard before it is latched."""
+ADOPT_OTHER_COMPONENT_S: Final = 2.0  # heard for so long before it is latched
 
 _NOT_AIRCRAFT: Final = frozenset(
     getattr(mavlink, f"MAV_TYPE_{name}")
@@ -112,7 +102,6 @@ _NOT_AIRCRAFT: Final = frozenset(
 
 
 def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
-    """Check that a heartbeat claims to be of a vehicle with an autopilot, not of a ground station or a gimbal."""
     return message.type not in _NOT_AIRCRAFT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
 
 
@@ -131,14 +120,11 @@ def version_text(packed: int) -> str:
 
 
 class Latch:
-    """Decides which autopilot is taken."""
-
     def __init__(self, system_id: int | None) -> None:
         self._system_id = system_id
         self._candidates: dict[tuple[int, int], float] = {}
 
     def takes(self, message: mavlink.MAVLink_heartbeat_message, t_s: float, *, is_known: bool) -> bool:
-        """Check whether to latch the sender of this heartbeat of an aircraft, received at `t_s`."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         if self._system_id not in (None, system) or system == 0:
             return False
@@ -150,15 +136,12 @@ class Latch:
         return t_s - first_s >= ADOPT_OTHER_COMPONENT_S
 
 
-_BACK_S: Final = 0.5
-"""Late and repeated packets step back by milliseconds; a restart by all the time it was up."""
+_BACK_S: Final = 0.5  # late and repeated packets step back by milliseconds
 
 _GAP_S: Final = 2.0
 _CONFIRM_S: Final = 0.5
-_CLOCKS: Final = 1.01
-"""More than two quartz clocks ever differ by."""
-_WRAP_S: Final = 2**32 * 1e-3
-"""time_boot_ms is a 32 bit number: it starts again after 49.7 days."""
+_CLOCKS: Final = 1.01  # more than two quartz clocks ever differ by
+_WRAP_S: Final = 2**32 * 1e-3  # time_boot_ms is a 32 bit number: it starts again after 49.7 days
 
 
 class BootClock:
@@ -173,8 +156,7 @@ class BootClock:
     """
 
     def __init__(self) -> None:
-        self.latest: tuple[float, float] | None = None
-        """The time since boot that was heard last, and when."""
+        self.latest: tuple[float, float] | None = None  # the time since boot that was heard last, and when
         self._before_gap: tuple[float, float] | None = None
         self._suspected_s = 0.0
 

@@ -32,20 +32,17 @@ from companion.links.system.events import Listeners, comes
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
-_REMEMBERED_TYPES: Final = 4096
-"""More parameters than any firmware has; what is not remembered is asked for."""
+_REMEMBERED_TYPES: Final = 4096  # more parameters than any firmware has; what is not remembered is asked for
 
 _TIMEOUT_S: Final = 1.0
 _TRIES: Final = 4
 _TRIES_MORE: Final = 8
 """While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
 four tries fail once in sixty exchanges, which is once a calibration; eight once in 3500."""
-_LOSSY: Final = 0.05
-"""Share of answered requests that had to be repeated, above which silence says little about a name."""
+_LOSSY: Final = 0.05  # share of requests repeated, above which silence says little about a name
 _LOSS_MEMORY: Final = 0.1
 
-_AT_ONCE: Final = 6
-"""Requests in flight: ArduPilot queues some twenty and answers one every few milliseconds."""
+_AT_ONCE: Final = 6  # requests in flight: ArduPilot queues some twenty and answers one every few milliseconds
 
 
 _ERROR_WORDS: Final = {
@@ -61,11 +58,10 @@ _ERROR_WORDS: Final = {
 """MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
 
 _Answer = float | str
-"""Value of a PARAM_VALUE, or PARAM_ERROR in words."""
 
 
 class _Inbox:
-    """Answers about one name during one exchange; when full the oldest is dropped."""
+    """Answers about one name during one exchange, PARAM_ERROR in words; when full the oldest is dropped."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -73,16 +69,11 @@ class _Inbox:
         self._arrived = asyncio.Event()
 
     def put(self, item: _Answer | AutopilotRebootedError) -> None:
-        """Add an answer."""
         self._items.append(item)
         self._arrived.set()
 
     async def get(self, deadline_s: float) -> _Answer | None:
-        """Return the next answer, or None at the deadline (loop's clock); cancelled tasks may wait here too.
-
-        Raises:
-            AutopilotRebootedError: the autopilot restarted.
-        """
+        """Return the next answer, or None at the deadline; raise AutopilotRebootedError after a restart."""
         if not self._items:
             self._arrived.clear()
             await comes(self._arrived, deadline_s - asyncio.get_running_loop().time())
@@ -93,49 +84,38 @@ class _Inbox:
 
 
 class ParameterClient(Parameters):
-    """The parameters of one autopilot."""
-
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
-        self.writes = 0
-        """PARAM_SET messages sent, repetitions included."""
+        self.writes = 0  # PARAM_SET messages sent, repetitions included
         self._link = link
-        self._repeated = 0.0
-        """Share of requests that were answered only after a repetition, of late."""
+        self._repeated = 0.0  # share of requests that were answered only after a repetition, of late
         self._inboxes: list[_Inbox] = []
-        self.on_value: Listeners[[str, float]] = Listeners()
-        """Notified of every PARAM_VALUE of the autopilot, whoever caused it."""
+        self.on_value: Listeners[[str, float]] = Listeners()  # every PARAM_VALUE of the autopilot, whoever caused it
         self._answering: str | None = None
-        self._absent: set[str] = set()
-        """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
-        self._types: dict[str, int] = {}
-        """MAV_PARAM_TYPE by name, as heard since the last restart; so these exist, however silent it is about them."""
+        self._absent: set[str] = set()  # in this boot: told by silence, that takes seconds to learn
+        self._types: dict[str, int] = {}  # heard since the restart, so these exist, however silent it is
         vehicle.hear(mavlink.MAVLink_param_value_message, self._on_value)
         vehicle.hear(mavlink.MAVLink_param_error_message, self._on_error)
         vehicle.on_event.add(self._on_event)
 
     @property
     def firmware(self) -> FirmwareName | None:
-        """None before the first heartbeat."""
         return self.vehicle.firmware
 
     @property
     def boots(self) -> int:
-        """Starts of the autopilot that have been seen."""
         return self.vehicle.boots
 
     async def ensure_same_boot(self, boots: int, words: str) -> None:
-        """Ask for the time since boot, then as `require_same_boot`."""
         await self.vehicle.hear_boot_time()
         self.require_same_boot(boots, words)
 
     def require_same_boot(self, boots: int, words: str) -> None:
-        """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
         if self.boots != boots:
             raise AutopilotRebootedError(f"{self.vehicle.name} {words}")
 
     async def read(self, name: str) -> float:
-        """Ask for a parameter by name and return what comes.
+        """Read one that must exist.
 
         Raises:
             ParameterTimeoutError: no answer within all retries.
@@ -190,7 +170,6 @@ class ParameterClient(Parameters):
         return None
 
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
-        """Read several by name, a few requests at a time; where `optional`, what does not exist is left out."""
         wanted = list(names)
         read = self.read_optional if optional else self.read
         found: dict[str, float] = {}
@@ -253,7 +232,6 @@ class ParameterClient(Parameters):
 
     @property
     def answering(self) -> bool:
-        """The autopilot has answered a request since it started."""
         return self._answering is not None
 
     @property
@@ -371,8 +349,7 @@ _INTEGER_FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_UINT32: "<I",
     mavlink.MAV_PARAM_TYPE_INT32: "<i",
 }
-_HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}
-"""Length of the header of MAVLink 1 and 2, by the first byte of a packet."""
+_HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}  # MAVLink 1 and 2, by the first byte of a packet
 
 _REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 

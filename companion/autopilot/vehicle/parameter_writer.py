@@ -42,23 +42,18 @@ from companion.estimation.records.record import WrittenParameter
 
 logger = logging.getLogger(__name__)
 
-TAKEN_S: Final = 1.3
-"""Time until PX4 uses the last value; until then the far one acts."""
+TAKEN_S: Final = 1.3  # time until PX4 uses the last value; until then the far one acts
 
 _LATE_ECHO_S: Final = 0.3
 """Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""
 
-_RECOVERY_S: Final = 30.0
-"""Longest wait for a restarted or silent autopilot before its old values are given up."""
+_RECOVERY_S: Final = 30.0  # wait for a restarted or silent autopilot before its old values are given up
 
-_PUT_BACK_S: Final = 60.0
-"""Longest restore in all, of an autopilot whose heartbeat comes but who answers badly."""
+_PUT_BACK_S: Final = 60.0  # longest restore in all, where heartbeats come but answers are bad
 
-_TELL_REBOOT_S: Final = 2.0
-"""After heartbeats have come back: how long the time since boot is awaited."""
+_TELL_REBOOT_S: Final = 2.0  # for the time since boot, after heartbeats have come back
 
-_ROUNDS: Final = 2
-"""Attempts of a restore; a late echo may have passed for a confirmation the first time."""
+_ROUNDS: Final = 2  # attempts of a restore; a late echo may have passed for a confirmation the first time
 
 
 class _Failure(Exception):  # noqa: N818 - never leaves this module
@@ -68,14 +63,10 @@ class _Failure(Exception):  # noqa: N818 - never leaves this module
 
 
 class ParameterWriter:
-    """Writes sets of parameters to one autopilot, one set at a time."""
-
     def __init__(self, parameters: ParameterClient, vehicle: Vehicle) -> None:
-        self.written: dict[str, WrittenParameter] = {}
-        """Outcomes of the last operation, whatever its end: also when it was cancelled."""
+        self.written: dict[str, WrittenParameter] = {}  # by the last operation, whatever its end: also a cancel
         self.left_changed: tuple[str, ...] = ()
-        self.left_far: tuple[str, ...] = ()
-        """Parameters of `left_changed` that have their far value."""
+        self.left_far: tuple[str, ...] = ()  # parameters of `left_changed` that have their far value
         self._parameters = parameters
         self._vehicle = vehicle
         self._lock = asyncio.Lock()
@@ -102,7 +93,7 @@ class ParameterWriter:
                 await self._write_by_far(vectors, probe)
                 await self._read_back(items)
                 await self._check_end()
-            except _Failure as failure:
+            except (_Failure, AutopilotError) as failure:
                 await self._fail(items, failure)
             except asyncio.CancelledError:
                 # In a task of its own: in a cancelled one asyncio.timeout raises CancelledError when it expires, before
@@ -197,7 +188,6 @@ class ParameterWriter:
             raise _Failure("not as believed", "; ".join(wrong))
 
     async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
-        """Write the far value and wait until it is in use; why it is not as believed, if so."""
         verify = None if probe is None else probe(item.change.parameter)
         await self._write(item, item.change.far)
         item.is_far = True
@@ -216,8 +206,6 @@ class ParameterWriter:
         try:
             await self._parameters.write(name, value)
             item.confirmed = True
-        except AutopilotError as error:
-            raise _Failure(kind_of(error, self._vehicle, self._boots), str(error)) from error
         finally:
             item.sent |= self._parameters.writes > sent_before
         self._check_boot(f"after {name} was written")
@@ -248,17 +236,15 @@ class ParameterWriter:
             raise _Failure("rebooted in the middle", f"{self._vehicle.name} restarted {when}")
 
     async def _read(self, name: str) -> float:
-        try:
-            value = await self._parameters.read(name)
-        except AutopilotError as error:
-            raise _Failure(kind_of(error, self._vehicle, self._boots), str(error)) from error
+        value = await self._parameters.read(name)
         self._check_boot(f"before {name} was read")
         return value
 
     # --- back
 
-    async def _fail(self, items: list[PendingChange], failure: _Failure) -> None:
-        kind, reason = failure.kind, str(failure)
+    async def _fail(self, items: list[PendingChange], failure: _Failure | AutopilotError) -> None:
+        reason = str(failure)
+        kind = failure.kind if isinstance(failure, _Failure) else kind_of(failure, self._vehicle, self._boots)
         if not self._vehicle.alive and any(item.sent for item in items):
             # It fell silent: if it comes back, learn first whether it restarted.
             self._give_up_s = asyncio.get_running_loop().time() + _RECOVERY_S
@@ -322,7 +308,6 @@ class ParameterWriter:
             logger.warning("%s is not put back yet: %s", change.parameter, error)
 
     async def _read_in_force(self, name: str) -> float | None:
-        """Read the value in force; None when it cannot be known. A restart meanwhile only means asking again."""
         if not self._vehicle.alive or self._late():
             return None
         for _ in range(2):

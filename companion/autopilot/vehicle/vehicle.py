@@ -38,15 +38,13 @@ __all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 
 logger = logging.getLogger(__name__)
 
-HEARTBEAT_TIMEOUT_S: Final = 2.0
-"""Without a heartbeat for this long nobody knows whether the aircraft is armed (autopilots 8)."""
+HEARTBEAT_TIMEOUT_S: Final = 2.0  # older, nobody knows whether the aircraft is armed (autopilots 8)
 
 _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
-_SLOWEST: Final = 5.0
-"""The most of our seconds that are given for one of the autopilot's."""
+_SLOWEST: Final = 5.0  # the most of our seconds that are given for one of the autopilot's
 _POLL_S: Final = 0.05
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
@@ -72,14 +70,10 @@ class Vehicle:
         self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
         self.kind: Firmware = UNHEARD
         self.version: str | None = None
-        """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
         self.capabilities: int | None = None
-        """MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come."""
-        self.uid: str | None = None
-        """The board's unique id, hex digits (`unique_id`); None until AUTOPILOT_VERSION has come, or it tells none."""
+        self.uid: str | None = None  # the board's; like version and capabilities None until AUTOPILOT_VERSION has come
         self.system_status: int | None = None
         self.signs = False
-        """The autopilot signed its last heartbeat (MAVLink 2)."""
         self.boots = 0
         self.place = TimeAndPlace(is_carried)
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
@@ -121,7 +115,6 @@ class Vehicle:
 
     @property
     def firmware(self) -> FirmwareName | None:
-        """Name of its firmware; None before the first heartbeat."""
         return self.kind.name
 
     @property
@@ -145,20 +138,17 @@ class Vehicle:
 
     @property
     def alive(self) -> bool:
-        """The latched autopilot's heartbeat came within the last 2 s."""
         age_s = self.heartbeat_age_s
         return not self._lost and age_s is not None and age_s < HEARTBEAT_TIMEOUT_S
 
     @property
     def heartbeat_age_s(self) -> float | None:
-        """Seconds since the latched autopilot's last heartbeat; None before the first."""
         if self._heartbeat_s is None:
             return None
         return asyncio.get_running_loop().time() - self._heartbeat_s
 
     @property
     def name(self) -> str:
-        """For people: "ArduPilot 4.6.1, system 1"."""
         if self.system_id is None:
             return "no autopilot"
         return f"{self.kind.words}{' ' + self.version if self.version else ''}, system {self.system_id}"
@@ -169,7 +159,6 @@ class Vehicle:
         return "; it signs what it sends: does it refuse what is not signed?" if self.signs else ""
 
     def sent(self, message: Message) -> bool:
-        """Check that a message came from the latched autopilot."""
         header = message.get_header()
         return header.srcComponent == self.component_id and header.srcSystem == self.system_id
 
@@ -194,7 +183,6 @@ class Vehicle:
             request.cancel()
 
     def close(self) -> None:
-        """Hear no heartbeat any more; the arm state is UNKNOWN from here on."""
         self._lost = True
         self.found.clear()
         self._unsubscribe()
@@ -392,7 +380,6 @@ class VehicleTimer:
         return boot[0] - self._boot[0] >= seconds or gone_s >= _SLOWEST * seconds
 
     async def let_pass(self, seconds: float) -> None:
-        """Wait until `has_passed`."""
         await asyncio.sleep(self._t_s + seconds - asyncio.get_running_loop().time())
         while not self.has_passed(seconds):
             await asyncio.sleep(_POLL_S)

@@ -21,19 +21,15 @@ from companion.links.mavlink.signing import EARLIEST_S
 
 logger = logging.getLogger(__name__)
 
-LATEST_UNIX_TIME_S: Final = 4102444800.0
-"""2100: later is no time but a fault."""
+LATEST_UNIX_TIME_S: Final = 4102444800.0  # 2100: later is no time but a fault
 
 FAR_M: Final = 10_000.0
 """Less changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h at most, and is more than GNSS wanders."""
-FAR_HEIGHT_M: Final = 300.0
-"""0.1 mg of gravity, half of what a calibration aims at; GNSS and barometer wander by less."""
+FAR_HEIGHT_M: Final = 300.0  # 0.1 mg of gravity, half of what a calibration aims at; GNSS wanders by less
 
-CONFIRMED_AFTER_S: Final = 2.5
-"""A first place, which is sent once a second: what one packet says is not enough."""
+CONFIRMED_AFTER_S: Final = 2.5  # a first place: what one packet says is not enough
 SETTLED_AFTER_S: Final = 30.0
-SILENT_S: Final = 5.0
-"""Time for which a place counts after it was said last."""
+SILENT_S: Final = 5.0  # time for which a place counts after it was said last
 
 _OR_SET: Final = "(or set vehicle.latitude_deg, longitude_deg, height_m)"
 _EARTH_RADIUS_M: Final = 6_371_000.0
@@ -60,10 +56,8 @@ class TimeAndPlace:
     def __init__(self, is_carried: Callable[[], bool] = lambda: False) -> None:
         self.position: Position | None = None
         self._is_carried = is_carried
-        self._anchor: Position | None = None
-        """Place that others are compared with; it stays while the aircraft stands still."""
-        self._claim: Position | None = None
-        """Place that is said and not believed yet, first and last at these times; None: nowhere on Earth."""
+        self._anchor: Position | None = None  # that others are compared with; stays while the aircraft stands still
+        self._claim: Position | None = None  # said and not believed yet; None: nowhere on Earth
         self._since_s = self._heard_s = -math.inf
         self._unix_minus_loop_s: float | None = None
 
@@ -91,19 +85,16 @@ class TimeAndPlace:
         self._heard_s = -math.inf
 
     def hear_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
-        """Take the date, unless it cannot be one."""
         unix_s = message.time_unix_usec * 1e-6
         self._unix_minus_loop_s = unix_s - t_s if EARLIEST_S < unix_s < LATEST_UNIX_TIME_S else None
 
     def hear_estimate(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
-        """Take the place that the autopilot flies by."""
         place = _position(message.lat, message.lon, message.alt, _ESTIMATE)
         said = (self.position, self._claim)
         if place is not None or any(each is not None and each.source == _ESTIMATE for each in said):
             self._hear(place, t_s)
 
     def hear_receiver(self, message: mavlink.MAVLink_gps_raw_int_message, t_s: float) -> None:
-        """Take the place of the GNSS receiver, as long as there is no better one."""
         estimated = self.position is not None and self.position.source == _ESTIMATE
         if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and not estimated:
             self._hear(_position(message.lat, message.lon, message.alt, _RECEIVER), t_s)

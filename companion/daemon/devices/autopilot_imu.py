@@ -12,10 +12,10 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
 
+from companion.autopilot.firmware.base import SlotMemory
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.imu_messages import ImuMessage, Six
-from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ImuStream
 from companion.autopilot.telemetry.px4_console import EkfBias
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent

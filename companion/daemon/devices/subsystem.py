@@ -14,8 +14,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.base import SlotMemory
 from companion.autopilot.firmware.firmwares import port_needs
-from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ask_script
 from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console
 from companion.autopilot.vehicle.parameter_client import ParameterClient

@@ -22,7 +22,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.ardupilot_calibration import AT_START
+from companion.autopilot.firmware.ardupilot import AT_START
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle import gyro_calibration
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch

@@ -11,9 +11,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.autopilot.firmware.base import SlotMemory
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.px4 import warnings_about
-from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.gyro_calibration import GyroOutcome
 from companion.errors import AutopilotError

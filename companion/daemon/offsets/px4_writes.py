@@ -1,6 +1,6 @@
 """Far steps of a write to PX4: whose output each moves, and which offsets are in use at all.
 
-Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4_slots) until a far value is in use and seen in
+Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in use and seen in
 the telemetry of all IMUs. The far step is large beside noise and truncation, and only one sensor makes one at a time;
 the small change itself often could not be seen at all.
 """
@@ -20,10 +20,10 @@ from typing import Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.base import NO_IMU, SlotMemory
 from companion.autopilot.firmware.imu_calibration import FAR_ACCEL_M_S2, ImuCalibration, output_step, vector_changes
 from companion.autopilot.firmware.imu_messages import all_zero
-from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, accel_offset_with
-from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, SlotMemory
+from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, WORDS, accel_offset_with
 from companion.autopilot.parameters.change import Change, FarProbe, WriteFailedError
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer

@@ -12,9 +12,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.autopilot.firmware.base import SlotMemory
 from companion.autopilot.firmware.firmwares import firmware_named, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change, FirmwareName, Parameters, same_float32
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.noise.allan import PROFILES, noise_profile

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import whole_bias
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp

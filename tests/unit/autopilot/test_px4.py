@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from companion.autopilot.firmware.base import NO_IMU, SlotMemory
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4 import PX4, warnings_about
-from companion.autopilot.firmware.px4_slots import NO_IMU, Slot, SlotMemory
+from companion.autopilot.firmware.px4 import PX4, Slot, choose_slot, warnings_about
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
@@ -118,21 +118,23 @@ def test_the_slots_are_taken_in_order_and_gyro_and_accelerometer_may_stand_in_di
 def test_what_was_learned_about_a_device_goes_before_the_order_of_the_slots() -> None:
     slots = (Slot(0, 11, True), Slot(1, 22, True), Slot(3, 33, True))
     memory = SlotMemory()
-    assert memory.choose("gyro", 1, slots).number == 0
+    assert choose_slot(memory, "gyro", 1, slots).number == 0
     memory.learn("gyro", 11, 2)
-    assert memory.choose("gyro", 2, slots).number == 0
-    assert memory.choose("gyro", 1, slots).number == 1
-    assert memory.choose("accel", 1, slots).number == 0
+    assert choose_slot(memory, "gyro", 2, slots).number == 0
+    assert choose_slot(memory, "gyro", 1, slots).number == 1
+    assert choose_slot(memory, "accel", 1, slots).number == 0
     memory.learn("gyro", 22, NO_IMU)
-    assert memory.choose("gyro", 1, slots).number == 3
+    assert choose_slot(memory, "gyro", 1, slots).number == 3
     memory.learn("gyro", 33, NO_IMU)
-    assert memory.choose("gyro", 1, slots).number == 1  # what acted on nobody is tried again when nothing else is left
+    assert (
+        choose_slot(memory, "gyro", 1, slots).number == 1
+    )  # what acted on nobody is tried again when nothing else is left
     memory.learn("gyro", 22, 3)
     memory.learn("gyro", 33, 3)
     memory.learn("gyro", 22, 3)
     assert memory.known("gyro", 33) is None
-    assert memory.choose("gyro", 1, slots).number == 3
-    assert memory.choose("gyro", 2, slots).number == 0
+    assert choose_slot(memory, "gyro", 1, slots).number == 3
+    assert choose_slot(memory, "gyro", 2, slots).number == 0
 
 
 @pytest.mark.parametrize(

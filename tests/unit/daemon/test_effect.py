@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import EffectVerdict

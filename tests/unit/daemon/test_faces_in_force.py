@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, whole_accelerometer
 from companion.cli.client import sides_lines
 from companion.config import parse

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot_calibration import ArduPilotParameters
+from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.daemon.offsets.plan import as_good
 from companion.estimation.solution.solve import ImuSolution, Shared

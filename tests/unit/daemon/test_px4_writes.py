@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from companion.autopilot.firmware.base import NO_IMU, SlotMemory
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4_slots import NO_IMU, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter

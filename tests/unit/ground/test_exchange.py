@@ -33,7 +33,6 @@ def exchange(
         COMPANION,
         command,
         *parameters,
-        busy=lambda since_s: station.heard.busy(1, since_s),
         on_progress=on_progress,
     )
 

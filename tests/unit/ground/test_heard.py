@@ -23,7 +23,7 @@ def say(heard: GroundListener, text: str, *, component: int = 191) -> None:
 
 
 def said(heard: GroundListener) -> list[str]:
-    return [text.words for _, text in heard.texts]
+    return [text.words for text in heard.texts]
 
 
 def test_the_vehicle_as_its_heartbeats_show_it() -> None:
