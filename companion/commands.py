@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 import msgspec
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.request import LONGEST_S, What
+from companion.estimation.machine import LONGEST_S, What
 from companion.formats import Object, printable
 
 MAX_SHOWN: Final = 60

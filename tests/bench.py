@@ -24,9 +24,9 @@ from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from companion.component.service import Refusal
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from companion.storage.state import write_atomically
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario

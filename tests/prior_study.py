@@ -205,9 +205,8 @@ def one_trial(
                 effect=effect,
             )
         )
-    whole = {imu.name: (imu.gyro_rad_s, imu.accel_m_s2) for imu in found}
     expectation = Expectation(imus=tuple(expected), zero_is_known=True)
-    weighed = weigh(solution(found, shared), whole, expectation)
+    weighed = weigh(solution(found, shared), expectation)
     part = slice(0, 3) if case.triad == "gyro" else slice(3, 6)
 
     def of(imus: Sequence[ImuSolution]) -> Array:

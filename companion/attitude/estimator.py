@@ -49,13 +49,10 @@ LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
 """Largest deviation of specific force from g, as a share, at which a self-levelling compass is used."""
 STEADY_RAD_S: Final = math.radians(20.0)
-"""Largest rate at which the compass is used."""
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
 REST_SIGMAS: Final = 5.0
-"""Threshold beyond which a rest was a movement that began unnoticed."""
 KEPT_S: Final = 2.0
-"""Orientations kept for compass readings that come late."""
 FORCE_SMOOTHED_S: Final = 1.0
 """Averaging time of the length of specific force, longer than vibration and gusts."""
 DOUBTED_SHARE: Final = 0.03
@@ -69,7 +66,6 @@ GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
 FIRST_S: Final = 0.1
-"""Time that the first reading counts for."""
 BADLY: Final = 1.5
 """Sigma of a poorly known heading, in sigmas of the compass."""
 REFUSED_S: Final = 20.0
@@ -78,7 +74,7 @@ REFUSED_S: Final = 20.0
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class AttitudeSettings:
-    """Results of a calibration and data of the site; vectors in vehicle FRD."""
+    """Results of a calibration and data of the site; vehicle FRD, the covariance (3, 3)."""
 
     vehicle_from_sensor: Matrix
     gravity_m_s2: float
@@ -87,13 +83,15 @@ class AttitudeSettings:
     gyro_noise: AllanModel
     gyro_bias_rad_s: Triple
     gyro_covariance: Matrix
-    """(3, 3) covariance of the bias in the next minutes."""
     accel_bias_m_s2: Triple
     accel_sigma_m_s2: Triple
 
 
 class Attitude(msgspec.Struct, frozen=True, gc=False):
-    """Attitude at one instant, body FRD to NED and true north."""
+    """Attitude at one instant, body FRD to NED and true north, with one sigma of roll, pitch and yaw.
+
+    `rate_rad_s` is that of the body relative to the Earth, in FRD, without bias.
+    """
 
     t_s: float
     quaternion: Quaternion
@@ -101,11 +99,8 @@ class Attitude(msgspec.Struct, frozen=True, gc=False):
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
-    """In [-pi, pi], from true north."""
     rate_rad_s: Triple
-    """Rate of the body relative to the Earth in FRD, without bias."""
     sigma_rad: Triple
-    """One sigma of roll, pitch and yaw."""
 
 
 class Leveller:
@@ -150,8 +145,6 @@ class Leveller:
 
 
 class HeadingAid:
-    """Gain and gate of the heading correction."""
-
     def __init__(self) -> None:
         self._last_s: float | None = None
         self._refused_since_s: float | None = None
@@ -172,7 +165,6 @@ class HeadingAid:
         return max(trust, min(1.0, since_s / TAU_S))
 
     def refused_for_s(self, t_s: float) -> float:
-        """Return the time since which all readings were rejected."""
         return 0.0 if self._refused_since_s is None else t_s - self._refused_since_s
 
 
@@ -229,17 +221,14 @@ class AttitudeEstimator:
 
     @property
     def aligned(self) -> bool:
-        """Return whether there is an attitude."""
         return self._aligned and not self._strapdown.lost
 
     @property
     def heading_known(self) -> bool:
-        """Return whether the heading is known."""
         return self.aligned and self._uncertainty.heading_sigma_rad < 0.5 * HEADING_UNKNOWN_RAD
 
     @property
     def gyro_bias_rad_s(self) -> Triple:
-        """Return the bias in use in vehicle FRD: that of the calibration, refined at rest."""
         return rotate(conjugate(self._sensor_from_vehicle), self._strapdown.bias_rad_s)
 
     # --- samples
@@ -353,7 +342,6 @@ class AttitudeEstimator:
     # --- result
 
     def attitude(self) -> Attitude | None:
-        """Return the attitude at the last sample; None while there is none."""
         t_s = self._strapdown.last_s
         if not self.aligned or t_s is None:
             return None

@@ -32,7 +32,6 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """Return the inverse rotation."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
@@ -46,7 +45,6 @@ def normalised(q: Quaternion) -> Quaternion:
 
 
 def rotate(q: Quaternion, v: Triple) -> Triple:
-    """Return a vector's components in the other frame."""
     w, x, y, z = q
     a, b, c = v
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
@@ -54,7 +52,6 @@ def rotate(q: Quaternion, v: Triple) -> Triple:
 
 
 def from_rotation_vector(v: Triple) -> Quaternion:
-    """Return the rotation by |v| radians about v."""
     x, y, z = v
     angle = math.sqrt(x * x + y * y + z * z)
     scale = math.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
@@ -90,7 +87,6 @@ def from_matrix(matrix: Matrix) -> Quaternion:
 
 
 def to_matrix(q: Quaternion) -> Matrix:
-    """Convert to a 3x3 rotation matrix."""
     return np.array([rotate(q, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
 
 

@@ -29,7 +29,6 @@ from companion.physics.frames import Array, Matrix
 from companion.samples import ImuSample
 
 STEP_S: Final = 0.02
-"""Length of the steps over which specific force is averaged for levelling."""
 TURN_S: Final = 0.004
 """Longest time between rotations of the specific force into E: 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
@@ -43,17 +42,14 @@ LOST_S: Final = 1.0
 
 
 class MotionStep(NamedTuple):
-    """Motion in about `STEP_S` seconds."""
+    """Motion in about `STEP_S`: mean force in E, mean rate without bias in the sensor's axes, and those axes to E."""
 
     t_s: float
     span_s: float
     force_m_s2: Triple
-    """Mean specific force in E."""
     rate_rad_s: Triple
-    """Mean rate in the sensor's axes, bias removed."""
     missing_s: float
     orientation: Quaternion
-    """Sensor axes to E at its end."""
 
 
 class Strapdown:
@@ -72,7 +68,6 @@ class Strapdown:
         self._clear()
 
     def restart(self, orientation: Quaternion, t_s: float | None) -> None:
-        """Start from an orientation at `t_s`."""
         self.orientation, self.last_s, self.lost = orientation, t_s, False
         self._previous = (0.0, 0.0, 0.0)
         self._clear()
@@ -86,7 +81,6 @@ class Strapdown:
         self._turn_s = 0.0
 
     def integrate(self, samples: Sequence[ImuSample]) -> list[MotionStep]:
-        """Integrate samples in order of time; return the steps they complete."""
         done: list[MotionStep] = []
         for sample in samples:
             if (dt := self._since_last(sample)) is None:
@@ -117,7 +111,6 @@ class Strapdown:
         return done
 
     def _since_last(self, sample: ImuSample) -> float | None:
-        """Return the seconds since the last sample; None where this one cannot be used."""
         if self.last_s is None:
             self.last_s = sample.t_s
             return None
@@ -133,7 +126,6 @@ class Strapdown:
         return dt
 
     def _turn(self) -> None:
-        """Rotate the specific force since the last call into E."""
         (vx, vy, vz), (fx, fy, fz) = self._velocity, rotate(self.orientation, self._unturned)
         self._velocity = (vx + fx, vy + fy, vz + fz)
         self._unturned, self._turn_s = (0.0, 0.0, 0.0), 0.0
@@ -196,7 +188,6 @@ class Uncertainty:
         self._covariance[range(6), range(6)] += [white + guessed] * 3 + [wander] * 3
 
     def level(self, span_s: float, tau_s: float, believed: float, doubt: float, phase: str) -> None:
-        """Add a correction by the leveller over `span_s`."""
         gain = min(1.0, span_s * believed / tau_s)
         keep = np.eye(6)
         keep[0, 0] = keep[1, 1] = 1.0 - gain
@@ -208,7 +199,6 @@ class Uncertainty:
         self._levelled += (1.0 - self._levelled) * gain
 
     def head(self, gain: float, sigma_rad: float) -> None:
-        """Add a correction by a heading with this sigma."""
         keep = np.eye(6)
         keep[2, 2] = 1.0 - gain
         self._turned[2] *= 1.0 - gain
@@ -221,7 +211,6 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
-        """Return the sigma of the mean rate of a rest, (3,), sensor axes."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:
@@ -243,6 +232,5 @@ class Uncertainty:
 
     @property
     def heading_sigma_rad(self) -> float:
-        """Return one sigma of the heading, at most that of an unknown one."""
         variance = float(self._covariance[2, 2]) + (SCALE_SHARE * float(self._turned[2])) ** 2
         return min(math.sqrt(max(variance, 0.0)), HEADING_UNKNOWN_RAD)

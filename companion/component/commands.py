@@ -31,7 +31,7 @@ from companion.commands import Calibrate, Cancel, Undo
 from companion.component.service import AcceptedJob, CalibrationService, Refusal
 from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import Senders
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from typing import Final, Literal, Protocol
 
 import msgspec
 
-from companion.estimation.request import What
+from companion.estimation.machine import What
 
 MEASURED_PERCENT: Final = 70.0
 """Progress at which measuring ends, and estimating and writing begin."""

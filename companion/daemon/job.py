@@ -8,9 +8,9 @@ from typing import Final
 
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
+from companion.estimation.machine import What
 from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.estimation.records.record import Record
-from companion.estimation.request import What
 from companion.formats import Object
 from companion.links.system.events import comes
 from companion.storage.changes import BY_TEMPERATURE

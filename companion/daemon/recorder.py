@@ -26,9 +26,9 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
 from companion.errors import StorageError
+from companion.estimation.machine import What
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import to_json
-from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise

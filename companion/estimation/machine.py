@@ -1,14 +1,31 @@
-"""The states of one calibration, as one table: the diagram in docs/calibration.md is this table."""
+"""Kinds of calibration, and the states of one as a table: the diagram in docs/calibration.md is this table."""
 
 from __future__ import annotations
 
 import enum
 from typing import Final
 
+LONGEST_S: Final = 1e6
+"""Time limits of requests are shorter."""
+
+
+class What(enum.Enum):
+    """The biases to calibrate; the numbers are param1 of MAV_CMD_USER_1."""
+
+    BOTH = 0
+    GYROS = 1
+    ACCELEROMETERS = 2
+
+    @property
+    def gyros(self) -> bool:
+        return self is not What.ACCELEROMETERS
+
+    @property
+    def accelerometers(self) -> bool:
+        return self is not What.GYROS
+
 
 class State(enum.Enum):
-    """State of a calibration."""
-
     IDLE = "idle"
     WAITING = "waiting"
     COLLECTING = "collecting"
@@ -24,7 +41,6 @@ class State(enum.Enum):
 
     @property
     def busy(self) -> bool:
-        """True while work is under way."""
         return self not in RESTING
 
     @property
@@ -34,18 +50,15 @@ class State(enum.Enum):
 
     @property
     def shown(self) -> str:
-        """The coarser words that other programs rely on."""
+        """Coarser words, which other programs rely on."""
         return _SHOWN.get(self, self).value
 
     @property
     def word(self) -> str:
-        """Word shown to people."""
         return _WORDS.get(self, self.value)
 
 
 class Event(enum.Enum):
-    """Event in a calibration."""
-
     REQUEST = "request"
     UNDO = "undo"
     STILL = "still long enough"
@@ -104,8 +117,6 @@ class IllegalEventError(Exception):
 
 
 class Machine:
-    """One calibration's state."""
-
     def __init__(self) -> None:
         self.state = State.IDLE
 

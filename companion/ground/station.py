@@ -15,7 +15,7 @@ from companion.component.own_parameters import AT_ARM, RESULTS
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from companion.formats import printable
 from companion.ground import heard
 from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListener, Text

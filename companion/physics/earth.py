@@ -22,7 +22,6 @@ _FLATTENING: Final = 1 / 298.257223563
 _M: Final = 0.00344978650684
 
 WMM_VALID_YEARS: Final = (2025.0, 2030.0)
-"""The years for which the world magnetic model WMM2025 is made."""
 
 GAUSS_PER_NT: Final = 1e-5
 CompassUse = Literal["good", "poor", "none"]
@@ -47,27 +46,26 @@ def earth_rate_ned_rad_s(latitude_deg: float) -> Array:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class MagneticField:
-    """Field of the Earth at a place by WMM2025; the sigmas are the model's own, crust and sun included."""
+    """Field of the Earth at a place by WMM2025; the sigmas are the model's own, crust and sun included.
+
+    Declination is east positive (true heading = magnetic heading + declination), inclination down positive. Compass use
+    by the model's warning zones: "none" below 2000 nT of horizontal field, "poor" below 6000 nT.
+    """
 
     declination_deg: float
-    """East positive: true heading = magnetic heading + declination."""
     inclination_deg: float
-    """Down positive: 90 at the north magnetic pole, -90 at the south."""
     strength_gauss: float
     declination_sigma_deg: float
     inclination_sigma_deg: float
     strength_sigma_gauss: float
     compass_use: CompassUse
-    """The model's warning zones: "none" below 2000 nT of horizontal field, "poor" below 6000 nT."""
 
     @property
     def horizontal_gauss(self) -> float:
-        """Horizontal part, which turns a compass."""
         return self.strength_gauss * math.cos(self.inclination_deg * DEG)
 
     @property
     def down_gauss(self) -> float:
-        """Vertical part, down positive."""
         return self.strength_gauss * math.sin(self.inclination_deg * DEG)
 
 

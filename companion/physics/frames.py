@@ -50,7 +50,6 @@ def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
 
 
 def vector(values: Array) -> Vector:
-    """Return three axes as plain numbers."""
     x, y, z = values.tolist()
     return x, y, z
 
@@ -99,7 +98,6 @@ def running_products(turns: Floats) -> Floats:
 
 
 def wrap_deg(angle_deg: float) -> float:
-    """Return an angle in [-180, 180)."""
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 

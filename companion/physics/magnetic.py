@@ -24,7 +24,6 @@ _VERTICAL: Final = 1e-9
 
 
 def horizontal(vector: Array, up: Array) -> Array:
-    """Return the part of a vector across up, (3,)."""
     return vector - (vector @ up) * up
 
 
@@ -58,7 +57,6 @@ def heading_by_up(field: Array, up: Array) -> Array:
 
 
 def inclination_rad(field: Array, up: Array) -> float:
-    """Return the angle of the field below the horizon, in [-pi/2, pi/2]."""
     return math.atan2(-float(field @ up), float(np.linalg.norm(horizontal(field, up))))
 
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.alignment.align import turned
-from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
+from companion.estimation.alignment.align_model import Ground, StandMeans
 from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
@@ -81,16 +81,9 @@ class _Stood:
         return (np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
 
     def on_spot(self, turned: Counted, before: StandMeans | None) -> StandMeans:
-        window, heading_rad = self.window, turned.angle_rad + (0.0 if before is None else before.heading_rad)
-        means = ImuStand(
-            "imu",
-            np.array(window.accel_m_s2),
-            np.array(window.accel_sigma_use_m_s2),
-            np.array(window.gyro_rad_s),
-            np.array(window.gyro_sigma_use_rad_s),
-        )
-        is_turned = before is not None
-        return StandMeans((means,), None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
+        heading_rad = turned.angle_rad + (0.0 if before is None else before.heading_rad)
+        is_turned, imus = before is not None, (self.window,)
+        return StandMeans(imus, None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
 
 
 class _Spot:

@@ -16,10 +16,10 @@ import numpy as np
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.deck.deck import Deck
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import PROFILES, floor_variance, noise_profile
-from companion.estimation.request import What
 from companion.estimation.seconds.batch import summary, unrolled
 from companion.estimation.solution.solve import solve
 from sim.accuracy.experiments import many

@@ -19,9 +19,9 @@ import numpy as np
 
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
-from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.physics.gradienter import Law

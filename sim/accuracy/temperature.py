@@ -16,9 +16,9 @@ import numpy as np
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp, by_power_up, kept
+from companion.estimation.solution.curve import settling
 from companion.estimation.solution.joint import at_end, with_warm
 from companion.estimation.solution.prior import ExpectedImu, curve_of, expect, pose_effect
-from companion.estimation.temperature.curve import settling
 from sim.accuracy.figures import Claim, Errors, Section, covered, rms, stack
 from sim.accuracy.stand import POSTURES, References, collected, samples, sites, solved, stand
 from sim.earth import Array
@@ -229,22 +229,21 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
     for window in collected(standing, taken, times, rows, SPANS_S):
         solution = solved(standing, window, References.drawn(0.05, 0.5, random))
         plain = solution.imus[0]
-        assert plain.gyro_rad_s is not None
-        end = plain.gyro_rad_s
         path = None if plain.warming is None else plain.warming.path
         said, known = plain, ExpectedImu(name="imu")
         if curve is not None and path is not None:
             known = ExpectedImu(name="imu", along={"gyro": curve.along(path, settles, profile.gyro)})
-            said, shift, followed = at_end(plain, known, solution.shared)
-            end = end + shift[:3]
-            said = with_warm(said, (end, None), known, followed)
+            said, followed = at_end(plain, known, solution.shared)
+            said = with_warm(said, known, followed)
+        assert plain.gyro_rad_s is not None
+        assert said.gyro_rad_s is not None
         truth = standing.bias(window.end_s - 0.5, window.end_s + 0.5)[:3]
         late_s = window.end_s + _FLAT * board.time_constant_s
         warm = standing.bias(late_s - 0.5, late_s + 0.5)[:3]
         told = said.when_warm
         unknown = np.full(3, np.nan)
         found.append([
-            end - truth,
+            said.gyro_rad_s - truth,
             np.sqrt(np.diag(said.covariance)[:3]),
             unknown if told is None else np.array(told.gyro_bias_rad_s) - warm,
             unknown if told is None else np.array(told.gyro_sigma_rad_s),

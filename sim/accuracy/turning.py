@@ -19,10 +19,10 @@ import numpy as np
 from companion.config.sections import NoiseProfile
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import allan_model, noise_profile
-from companion.estimation.request import What
 from companion.estimation.solution.solve import solve
 from companion.physics.units import DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample

@@ -17,9 +17,9 @@ from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.alignment import ByHand
+from companion.estimation.machine import What
 from companion.estimation.records.align_record import FacesRecord
 from companion.estimation.records.record import Record
-from companion.estimation.request import What
 from sim.ardupilot.parameters import offset_names
 from sim.hands import Hands
 from sim.imu_model import MG

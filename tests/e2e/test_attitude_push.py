@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.daemon.heading.attitude_service import AttitudeService
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.motions import Turn
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -12,8 +12,7 @@ import pytest
 from companion.component.service import Refusal
 from companion.daemon.arming import automatic
 from companion.daemon.job import Job
-from companion.estimation.machine import State
-from companion.estimation.request import What
+from companion.estimation.machine import State, What
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import FC_PARAMETERS
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, CANCELLED, UNDO

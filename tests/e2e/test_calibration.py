@@ -13,8 +13,8 @@ import pytest
 
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
+from companion.estimation.machine import What
 from companion.estimation.records.record import Record
-from companion.estimation.request import What
 from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import Rig

@@ -15,8 +15,7 @@ import pytest
 from companion.daemon.interfaces.child import Child
 from companion.daemon.interfaces.control import ControlServer
 from companion.daemon.job import Job
-from companion.estimation.machine import State
-from companion.estimation.request import What
+from companion.estimation.machine import State, What
 from sim.motions import Handling
 from tests.support.broker import broker, peer
 from tests.support.mqtt_daemon import is_

@@ -11,8 +11,8 @@ import numpy as np
 
 from companion.commands import Align
 from companion.component.service import Refusal
+from companion.estimation.machine import What
 from companion.estimation.records.record import Record
-from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from sim.imu_model import DEG_H, MG
 from sim.motions import DAY_S, Sea, SlowTurn, Wave

@@ -22,9 +22,9 @@ from companion.config import parse
 from companion.configured import models
 from companion.daemon.job import Job
 from companion.daemon.process.service import Service
+from companion.estimation.machine import What
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.record import ImuRecord, Record
-from companion.estimation.request import What
 from companion.protocols.registry import PROTOCOLS
 from companion.storage.profiles import FORMAT_VERSION, ProfileSource, ProfileStore, SavedProfile, saved_profile
 from sim.aircraft import Pose, VirtualAircraft

@@ -14,8 +14,8 @@ import pytest
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.measuring import Measuring
+from companion.estimation.machine import What
 from companion.estimation.means.windows import Window
-from companion.estimation.request import What
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble
 from sim.ardupilot.parameters import offset_names

@@ -12,8 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import JobResult, Refusal
-from companion.estimation.machine import State
-from companion.estimation.request import What
+from companion.estimation.machine import State, What
 from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started

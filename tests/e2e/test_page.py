@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated, started
 from tests.support import page

@@ -11,9 +11,9 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import part_of
 from companion.config.sections import NoiseProfile
+from companion.estimation.machine import What
 from companion.estimation.means.windows import ImuWindow
 from companion.estimation.records.record import ImuRecord
-from companion.estimation.request import What
 from companion.estimation.solution.site import IN_CONFIGURATION
 from companion.estimation.solution.solve import wide_gyros
 from sim.imu_model import DEG_H

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from companion.storage.changes import ChangeLog
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import calibrated, started

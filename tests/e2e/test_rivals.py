@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.ardupilot.parameters import offset_names
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig

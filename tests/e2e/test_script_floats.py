@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config.sections import Imu
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.ardupilot.double import ArduPilotDouble
 from sim.ardupilot.parameters import offset_names
 from sim.imu_model import DEG_H, MG, AxisNoise, ImuModel, ImuSpec

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import parse
 from companion.configured import models
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import Rig
 

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.imu_model import MG
 from tests.support.rig import ACCEL_BIAS_MG, Rig
 from tests.support.virtual_time import run_virtual

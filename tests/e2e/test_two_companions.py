@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 from companion.component.service import Refusal
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.station import End
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_faults import values

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, TEMPORARILY_REJECTED
 from tests.support.rig import Rig
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from companion.component.service import Refusal
 from companion.daemon.process.service import watched_tasks
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 

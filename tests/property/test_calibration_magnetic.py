@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, FieldUnit
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import Magnetic
-from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
 from companion.physics.frames import wrap_deg

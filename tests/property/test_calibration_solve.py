@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.errors import CalibrationRefusedError
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import Window
-from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.physics.frames import Array

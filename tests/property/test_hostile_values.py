@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -15,7 +15,7 @@ from companion.component.own_parameters import Parameter
 from companion.component.service import AcceptedJob, ArmAnswer, JobResult, Refusal
 from companion.component.statustext import StatusText, Tunes
 from companion.config.sections import EVERYBODY, Senders
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.wire import Wire
 

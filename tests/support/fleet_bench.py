@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker
 from tests.support.light_aircraft import Fleet, Light

@@ -39,6 +39,28 @@ def readings(up: Array, law: Literal["axis", "slope", "euler"]) -> tuple[float, 
     return math.degrees(math.atan2(-up[1], -up[2])), math.degrees(math.asin(up[0]))
 
 
+def imu_means(gyro_rad_s: Array, gyro_sigma: float, accel_m_s2: Array, accel_sigma: float) -> ImuWindow:
+    """The means of one IMU, with one sigma of all axes."""
+
+    def axes(vector: Array) -> tuple[float, float, float]:
+        x, y, z = (float(value) for value in vector)
+        return x, y, z
+
+    return ImuWindow(
+        name="fc",
+        samples=1000,
+        duration_s=10.0,
+        gyro_rad_s=axes(gyro_rad_s),
+        accel_m_s2=axes(accel_m_s2),
+        gyro_sigma_stat_rad_s=(gyro_sigma,) * 3,
+        accel_sigma_stat_m_s2=(accel_sigma,) * 3,
+        gyro_sigma_use_rad_s=(gyro_sigma,) * 3,
+        accel_sigma_use_m_s2=(accel_sigma,) * 3,
+        temperature_degc=25.0,
+        warnings=(),
+    )
+
+
 def ideal_window(
     *,
     ned_body: Array,
@@ -56,28 +78,10 @@ def ideal_window(
     latitude = math.radians(latitude_deg)
     rate = ned_body.T @ np.array([RATE_RAD_S * math.cos(latitude), 0.0, -RATE_RAD_S * math.sin(latitude)])
     x_deg, y_deg = readings(body_gradienter.T @ up, law)
-
-    def axes(vector: Array) -> tuple[float, float, float]:
-        x, y, z = (float(value) for value in vector)
-        return x, y, z
-
-    imu = ImuWindow(
-        name="fc",
-        samples=1000,
-        duration_s=10.0,
-        gyro_rad_s=axes(rate + gyro_bias),
-        accel_m_s2=axes(gravity_m_s2 * up + accel_bias),
-        gyro_sigma_stat_rad_s=(sigma, sigma, sigma),
-        accel_sigma_stat_m_s2=(sigma, sigma, sigma),
-        gyro_sigma_use_rad_s=(sigma, sigma, sigma),
-        accel_sigma_use_m_s2=(sigma, sigma, sigma),
-        temperature_degc=25.0,
-        warnings=(),
-    )
     return Window(
         start_s=0.0,
         end_s=10.0,
-        imus=(imu,),
+        imus=(imu_means(rate + gyro_bias, sigma, gravity_m_s2 * up + accel_bias, sigma),),
         tilt=TiltWindow(x_deg=x_deg, y_deg=y_deg, x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None),
         heading=HeadingWindow(heading_deg=heading_deg % 360.0, sigma_deg=0.0),
     )

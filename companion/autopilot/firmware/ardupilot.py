@@ -38,7 +38,7 @@ from companion.autopilot.firmware.imu_calibration import (
 from companion.autopilot.firmware.imu_messages import HIGHRES, SCALED, SCALED2, SCALED3, SCRIPT
 from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Names, Parameters
 from companion.errors import AutopilotError
-from companion.estimation.temperature.curve import ZERO, Polynomial
+from companion.estimation.solution.curve import ZERO, Polynomial
 from companion.physics.frames import Matrix, rotation_matrix, vector
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Vector

@@ -17,7 +17,7 @@ from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.parameters.change import Change, FirmwareName, Names, Parameters, same_float32
 from companion.config.sections import Profile
 from companion.errors import AutopilotError
-from companion.estimation.temperature.curve import Polynomial
+from companion.estimation.solution.curve import Polynomial
 from companion.links.mavlink.link import Message
 from companion.physics.frames import Matrix
 from companion.samples import Triad, Vector

@@ -20,8 +20,7 @@ import numpy as np
 
 from companion.autopilot.parameters.change import SCALES, Change, Names, float32, same_float32
 from companion.errors import CalibrationRefusedError
-from companion.estimation.solution.solve import ImuSolution
-from companion.estimation.temperature.curve import NOTHING, Polynomial
+from companion.estimation.solution.curve import NOTHING, Polynomial
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector
@@ -199,6 +198,15 @@ class ImuCalibration:
         board = rotation.T @ np.asarray(accel_m_s2) - thermal_accel - self.accel_offset_m_s2
         return np.concatenate((gyro, rotation @ (self.in_use() * board)))
 
+    def subtracted(self, degc: float | None) -> Array:
+        """Return the bias that offsets and temperature calibration take off the output, (6,), vehicle FRD.
+
+        R (gyro_offset + gyro_thermal), and R diag(accel_scale) (accel_offset + accel_thermal), at this temperature.
+        """
+        rotation, (gyro, accel) = self.orientation, self.thermal.taken_off(degc)
+        force = np.asarray(self.accel_scale) * (accel + self.accel_offset_m_s2)
+        return np.concatenate((rotation @ (gyro + self.gyro_offset_rad_s), rotation @ force))
+
     def thermal_change(self, triad: Triad, degc: float, then_degc: float) -> Array:
         """Return how much less one triad's output is at another temperature, (3,), vehicle FRD."""
         half = 0 if triad == "gyro" else 1
@@ -313,28 +321,6 @@ def output_step(
     after = calibration.in_use(vector(calibration.accel_scale + stretch)) if stretch.any() else before
     unscaled = rotation.T @ np.asarray(accel_m_s2) / before
     return vector(-rotation @ gyro), vector(rotation @ ((after - before) * unscaled - after * accel))
-
-
-def whole_bias(
-    calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector, degc: float | None
-) -> tuple[Vector, Vector]:
-    """Return the sensor's whole bias: output without any correction (its scale kept) minus truth, vehicle FRD.
-
-    residual + R (gyro_offset + gyro_thermal), and residual + R diag(accel_scale) (accel_offset + accel_thermal), at the
-    temperature of the residual.
-    """
-    rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
-    gyro, accel = calibration.thermal.taken_off(degc)
-    gyro = np.asarray(gyro_residual_rad_s) + rotation @ (gyro + calibration.gyro_offset_rad_s)
-    accel = np.asarray(accel_residual_m_s2) + rotation @ (scale * (accel + calibration.accel_offset_m_s2))
-    return vector(gyro), vector(accel)
-
-
-def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
-    """Return the whole gyro and accelerometer bias of an IMU that the autopilot corrects already."""
-    rate, force = ((0.0, 0.0, 0.0) if one is None else _vector(one) for one in (found.gyro_rad_s, found.accel_m_s2))
-    gyro, accel = map(np.array, whole_bias(calibration, rate, force, found.temperature_degc))
-    return gyro if found.gyro_rad_s is not None else None, accel if found.accel_m_s2 is not None else None
 
 
 def _require_plausible(calibration: ImuCalibration, what: str, vector: Vector, limit: float) -> None:

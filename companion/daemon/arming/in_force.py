@@ -26,6 +26,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, OffsetWatch
 from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
+from companion.estimation.machine import What
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.records.validity import (
@@ -38,7 +39,6 @@ from companion.estimation.records.validity import (
     worst_axis,
     worth_writing,
 )
-from companion.estimation.request import What
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.solve import Solution
 from companion.physics.frames import vector

@@ -6,6 +6,7 @@ A change of sensor, profile or mounting voids them. The last calibration since t
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import math
 import time
@@ -15,7 +16,6 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import whole_of
 from companion.daemon.biases.identity import ImuIdentities, changed
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -25,8 +25,9 @@ from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import Point, by_power_up, kept
+from companion.estimation.solution.curve import Along, Curve, settling
 from companion.estimation.solution.doubt import Doubt
-from companion.estimation.solution.joint import Whole, weigh
+from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import (
     Expectation,
     ExpectedImu,
@@ -37,8 +38,7 @@ from companion.estimation.solution.prior import (
     pose_effect,
 )
 from companion.estimation.solution.results import points
-from companion.estimation.solution.solve import ImuSolution, Shared, Solution, moved
-from companion.estimation.temperature.curve import Along, Curve, settling
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.formats import Object
 from companion.physics.frames import Array, vector
 from companion.samples import TRIADS, Triad, Vector
@@ -139,13 +139,15 @@ class BiasMemory:
 
     # --- before a result is used
 
-    def whole(self, solution: Solution) -> Whole:
-        """Return the whole biases by the readings alone; AutopilotError while the active offsets are not known."""
-        imus = self._imus
-        return {
-            found.name: whole_of(imus[found.name].in_force, found) if found.name in imus else found.biases
-            for found in solution.imus
-        }
+    def with_offsets(self, solution: Solution) -> Solution:
+        """Add the offsets that the autopilot subtracts; AutopilotError while they are not known."""
+        imus = tuple(
+            dataclasses.replace(imu, subtracted=self._imus[imu.name].in_force.subtracted(imu.temperature_degc))
+            if imu.name in self._imus
+            else imu
+            for imu in solution.imus
+        )
+        return dataclasses.replace(solution, imus=imus)
 
     def device_ids(self) -> dict[str, tuple[int | None, int | None]]:
         """Return the known device ids of gyro and accelerometer, by IMU of the autopilot."""
@@ -228,25 +230,23 @@ class BiasMemory:
 
     # --- and afterwards
 
-    def measured(
-        self, solution: Solution, whole: Whole, doubts: Sequence[Doubt], started_at: str, unix_s: float
-    ) -> dict[str, Point]:
+    def measured(self, solution: Solution, doubts: Sequence[Doubt], started_at: str, unix_s: float) -> dict[str, Point]:
         """Make the points of the history from a solution by the readings alone."""
-        at_mean = dict(whole)
-        for imu in solution.imus:
-            degc, end_degc = imu.mean_degc, imu.temperature_degc
-            if degc is not None and end_degc is not None and degc != end_degc:
-                off = [self.curves.taken_off(imu.name, triad, degc, end_degc) for triad in TRIADS]
-                at_mean[imu.name] = moved(whole[imu.name], -np.concatenate(off))
         return points(
-            solution,
-            at_mean,
+            dataclasses.replace(solution, imus=tuple(map(self._at_mean, solution.imus))),
             doubts,
             started_at=started_at,
             unix_s=unix_s,
             power_ups={imu.name: self.identities.power_up(imu.name, unix_s) for imu in solution.imus},
             zero=self.identities.zero(),
         )
+
+    def _at_mean(self, imu: ImuSolution) -> ImuSolution:
+        """Subtract the offsets of the window's mean temperature, not those of its end."""
+        degc, end_degc = imu.mean_degc, imu.temperature_degc
+        if degc is None or end_degc is None or degc == end_degc:
+            return imu
+        return imu.shifted(-np.concatenate([self.curves.taken_off(imu.name, t, degc, end_degc) for t in TRIADS]))
 
     async def keep(self, found: Mapping[str, Point]) -> None:
         """Remember a good calibration; a failure of the disk is only logged."""
@@ -266,12 +266,12 @@ class BiasMemory:
         if not news:
             return
         try:
-            whole = self.whole(solution)
+            solution = self.with_offsets(solution)
         except AutopilotError:
             return
         expectation = await self._offload(self.expectation, solution, unix_s)
-        weighed: Solution = await self._offload(weigh, solution, whole, expectation)
-        found = self.measured(solution, whole, weighed.doubts, "", unix_s)
+        weighed: Solution = await self._offload(weigh, solution, expectation)
+        found = self.measured(solution, weighed.doubts, "", unix_s)
         for name in news:
             point = found[name]
             if any(of is not None and of.is_outlier for of in (point.gyro, point.accel)):

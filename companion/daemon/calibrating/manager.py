@@ -23,9 +23,8 @@ from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.stands.alignment import ByHand
 from companion.errors import CompanionError, StorageError
-from companion.estimation.machine import Event, State
+from companion.estimation.machine import Event, State, What
 from companion.estimation.records.record import Record
-from companion.estimation.request import What
 from companion.formats import utc_now
 from companion.links.system.connection import Budget
 from companion.links.system.events import Listeners

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from companion.autopilot.firmware.firmwares import read_calibration
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.component.service import WRITTEN_PERCENT, JobResult
 from companion.component.statustext import Severity, Tune
@@ -36,17 +36,16 @@ from companion.daemon.offsets.plan import (
 )
 from companion.daemon.offsets.subsystem import WATCHING, Offsets
 from companion.daemon.stands.measuring import Estimator, Measuring
-from companion.estimation.machine import Event
+from companion.estimation.machine import Event, What
 from companion.estimation.means.windows import Window
 from companion.estimation.records.history import Point
 from companion.estimation.records.record import AlignmentUsed, ImuRecord, Record
-from companion.estimation.request import What
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn
 from companion.estimation.solution.site import Whereabouts
-from companion.estimation.solution.solve import ImuSolution, Pair, Solution
+from companion.estimation.solution.solve import ImuSolution, Solution
 from companion.estimation.solution.truth import Otherwise
 from companion.links.system.events import Listeners
 from companion.physics.frames import vector
@@ -111,8 +110,6 @@ class CalibrationRun(Job):
         """Window of telemetry under the active offsets."""
         self.solution: Solution | None = None
         """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
-        self.whole: dict[str, Pair] = {}
-        """Whole biases by IMU, where the autopilot subtracts offsets."""
         self.points: dict[str, Point] = {}
         """Biases by IMU for later predictions, once this calibration has ended well."""
         self.unchanged: set[Key] = set()
@@ -199,14 +196,14 @@ class CalibrationRun(Job):
         expectation: Expectation = await core.offload(memory.expectation, solution, unix_s)
         self._parts.on_solved.tell(where, otherwise, self.what, expectation)
         self.device_ids = memory.device_ids()
-        whole = memory.whole(solution)
-        weighed: Solution = await core.offload(weigh, solution, whole, expectation)
+        solution = memory.with_offsets(solution)
+        weighed: Solution = await core.offload(weigh, solution, expectation)
         # From here on nobody can adopt this run: a request must not get half of a result.
         if self.automatic and core.wanted.push:
             written = {i.name for i in core.config.imu if i.source == "autopilot" or i.autopilot_instance}
             self.held_back = {key: doubt for key, doubt in weighed.doubted.items() if key[0] in written}
         self.solution = weighed
-        points = memory.measured(solution, whole, weighed.doubts, self.log.started, unix_s)
+        points = memory.measured(solution, weighed.doubts, self.log.started, unix_s)
         self.points = _less(points, self.held_back)
         for doubt in weighed.doubts:
             core.say(Severity.WARNING, doubt.words)
@@ -230,7 +227,6 @@ class CalibrationRun(Job):
             found = without(estimate, [triad for name, triad in self.held_back if name == estimate.name])
             if imu is not None:
                 calibration = imu.in_force
-                self.whole[estimate.name] = whole_of(calibration, estimate)
                 found = without(found, self._keep_as_good(calibration, found)) if push and not self.reboot else found
                 residual = found.gyro_rad_s, found.accel_m_s2
             elif instance is not None:
@@ -321,7 +317,7 @@ class CalibrationRun(Job):
                 gyro_id=self.device_ids.get(imu.name, (None, None))[0],
                 accel_id=self.device_ids.get(imu.name, (None, None))[1],
             ).confirming(before.get(imu.name))
-            for imu in imu_records(self.solution, self.whole)
+            for imu in imu_records(self.solution)
         )
 
 

@@ -30,13 +30,12 @@ from companion.daemon.stands.tasks import SidesTask, TurnTask, ZeroTask
 from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
-from companion.estimation.machine import Event
+from companion.estimation.machine import Event, What
 from companion.estimation.means.windows import Window
-from companion.estimation.request import What
+from companion.estimation.solution.curve import Curve, Polynomial, of_curve
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise
-from companion.estimation.temperature.curve import Curve, Polynomial, of_curve
 from companion.formats import Object
 from companion.links.system.events import Listeners, comes
 from companion.storage.changes import BY_TEMPERATURE

@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.attitude.quaternion import to_matrix
 from companion.attitude.strapdown import HEADING_UNKNOWN_RAD
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_bias
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.configured import models
 from companion.daemon.calibrating.subsystem import Calibrating
@@ -26,7 +26,6 @@ from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.physics.frames import vector
 from companion.physics.units import DEG
-from companion.samples import Vector
 
 AGREES_S: Final = 0.7
 """Time of agreement before the push, and of disagreement before a new start."""
@@ -36,7 +35,6 @@ LATEST: Final = 10
 """Records searched for one that is not cancelled or failed."""
 DECLINATION_SIGMA_DEG: Final = 1.0
 """Error of a stored declination: 0.3 to 0.5 deg of the model, and the distance flown since."""
-_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class Resume:
@@ -129,7 +127,7 @@ class Resume:
 
 def _left_by(in_force: ImuCalibration, found: ImuRecord) -> ImuRecord:
     whole = found.gyro_bias_rad_s, found.accel_bias_m_s2
-    taken_off = whole_bias(in_force, _ZERO, _ZERO, found.temperature_degc)
+    taken_off = np.split(in_force.subtracted(found.temperature_degc), 2)
     gyro, accel = (None if a is None else vector(np.subtract(a, b)) for a, b in zip(whole, taken_off, strict=True))
     return msgspec.structs.replace(found, written={}, residual_gyro_rad_s=gyro, residual_accel_m_s2=accel)
 

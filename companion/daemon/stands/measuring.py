@@ -20,9 +20,8 @@ from companion.daemon.job import Job
 from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.collector.outlook import CollectorStatus
-from companion.estimation.machine import Event, State
+from companion.estimation.machine import Event, State, What
 from companion.estimation.means.windows import Window
-from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
 from companion.estimation.solution.truth import Otherwise

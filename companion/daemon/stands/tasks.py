@@ -12,7 +12,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import changes_for, whole_accelerometer, whole_bias
+from companion.autopilot.firmware.imu_calibration import changes_for, whole_accelerometer
 from companion.autopilot.parameters.change import Change
 from companion.configured import models
 from companion.daemon.core import Core
@@ -22,7 +22,7 @@ from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
 from companion.daemon.stands.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
-from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
+from companion.estimation.alignment.align_model import Ground, StandMeans
 from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, mounting, seen_before
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
@@ -103,7 +103,7 @@ class SpotTask(PoseTask):
             x_sigma_deg, y_sigma_deg = (math.hypot(READING_SIGMA_DEG, each) for each in noise_deg)
             stands.append(
                 StandMeans(
-                    imus=tuple(_imu_stand(imus[name]) for name in names),
+                    imus=tuple(imus[name] for name in names),
                     tilt_deg=None if tilt is None else (tilt.x_deg - self.zero_deg[0], tilt.y_deg - self.zero_deg[1]),
                     tilt_sigma_deg=(x_sigma_deg, y_sigma_deg),
                     heading_rad=(pose.heading_deg + north_deg) * DEG,
@@ -247,9 +247,8 @@ class TurnTask(SpotTask):
         )
 
     def _imu_record(self, imu: ImuAlignment, temperature_degc: float | None) -> TurnImuRecord:
-        calibration, level = self._imus[imu.name].in_force, vector(imu.level_bias_m_s2)
-        _, whole = whole_bias(calibration, (0.0, 0.0, 0.0), level, temperature_degc)
-        return turn_imu_record(imu, temperature_degc, np.array(whole))
+        whole = imu.level_bias_m_s2 + self._imus[imu.name].in_force.subtracted(temperature_degc)[3:]
+        return turn_imu_record(imu, temperature_degc, whole)
 
     def changes(self) -> dict[str, list[Change]]:
         return {
@@ -264,11 +263,6 @@ class TurnTask(SpotTask):
             words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
         end = "level written" if request.level else "written" if request.write else "not written"
         return f"{words}: {end}"
-
-
-def _imu_stand(imu: ImuWindow) -> ImuStand:
-    figures = imu.accel_m_s2, imu.accel_sigma_use_m_s2, imu.gyro_rad_s, imu.gyro_sigma_use_rad_s
-    return ImuStand(imu.name, *map(np.array, figures))
 
 
 def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None = None) -> list[str]:

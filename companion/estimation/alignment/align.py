@@ -57,7 +57,6 @@ DETERMINED: Final = 0.2
 """A figure counts as determined where its sigma is below this share of its prior sigma."""
 _LEAST_REDUNDANCY: Final = 1e-3
 _NINETY_NINE: Final = 2.326
-"""Sigmas that a normal variable exceeds in one case of a hundred."""
 MOST_TURNED_DEG: Final = 30.0
 """Largest turn of an IMU against the base: more is another orientation than the one configured."""
 ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
@@ -75,19 +74,20 @@ class Figures:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuAlignment:
-    """Estimate of one IMU, vehicle FRD, without the offsets that an autopilot has subtracted already."""
+    """Estimate of one IMU, vehicle FRD, without the offsets that an autopilot has subtracted already.
+
+    The level bias (3,) is the effective one, scale and misalignment included, as a calibration of the level aircraft
+    finds it; `accel_bias_m_s2` is the bias proper. Shear: xy, xz, yz. `misalignment_rad`: rotation vector from the axes
+    of gradienter and base to those of this IMU.
+    """
 
     name: str
     level_bias_m_s2: Array
-    """Effective bias when level, scale and misalignment included, as a calibration there finds it; (3,)."""
     level_covariance_m2_s4: Matrix
     accel_bias_m_s2: Figures
-    """Bias proper, without scale, shear and misalignment."""
     scale: Figures
     shear: Figures
-    """xy, xz, yz."""
     misalignment_rad: Figures
-    """Rotation vector from the axes of gradienter and base to those of this IMU."""
     gyro_bias_rad_s: Figures
 
 
@@ -101,24 +101,23 @@ class Complaint(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Result of `align`."""
+    """The gradienter's zero (2,), on top of the configured offset, and all IMUs.
+
+    `checked`: a spot that moved between two stands would have been noticed.
+    """
 
     offset_deg: Array
-    """Zero of the gradienter on top of the configured offset; (2,)."""
     offset_covariance_deg2: Matrix
     imus: tuple[ImuAlignment, ...]
     slope_deg: float
-    """Slope of the spot; 0 without one."""
     attitudes: tuple[Matrix, ...]
     chi_square: float
     freedom: int
     checked: bool
-    """True if a spot that moved between two stands would have been noticed."""
     complaint: Complaint | None
 
     @property
     def offset_sigma_deg(self) -> Array:
-        """One sigma per axis, (2,)."""
         return np.sqrt(np.diag(self.offset_covariance_deg2))
 
 
@@ -221,7 +220,6 @@ def _first_attitude(law: Law, mounting: Matrix, stand: StandMeans) -> Matrix:
 
 
 def _worst(found: LeastSquares, model: Model) -> Complaint | None:
-    """Return the residual that is worst against its own sigma, if it is beyond its threshold."""
     residual, redundancy, labels = found.residual, found.redundancy, model.labels
     usable = redundancy > _LEAST_REDUNDANCY
     w = np.where(usable, residual / np.sqrt(np.where(usable, redundancy, 1.0)), 0.0)

@@ -28,6 +28,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from companion.estimation.means.windows import ImuWindow
 from companion.physics.frames import Array, Floats, Matrix, rotations, symmetric
 from companion.physics.gradienter import Law, readings_from_up
 from companion.physics.units import DEG, MG
@@ -51,15 +52,16 @@ _STEP: Final = 1e-5
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class LeastSquares:
-    """Result of `fit`."""
+    """Result of `fit`: unknowns, and their covariance by the sigmas of readings and priors.
+
+    The covariance is zero where an unknown is not estimated. Residuals are over their sigmas: readings, then the prior
+    of every unknown that is estimated. `redundancy`: share of the variance of each that the other rows leave in it.
+    """
 
     values: Array
     covariance: Matrix
-    """Covariance by the sigmas of readings and priors; zero where an unknown is not estimated."""
     residual: Array
-    """Residuals over their sigmas: readings, then the prior of every unknown that is estimated."""
     redundancy: Array
-    """Share of each residual's variance that the other rows leave in it."""
 
 
 def fit(
@@ -102,38 +104,26 @@ def fit(
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class ImuStand:
-    """Means of one IMU in one stand, vehicle FRD, with one sigma per axis (`sigma_use`); shapes (3,)."""
-
-    name: str
-    accel_m_s2: Array
-    accel_sigma_m_s2: Array
-    gyro_rad_s: Array
-    gyro_sigma_rad_s: Array
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandMeans:
-    """Means of one still window."""
+    """Means of one still window.
 
-    imus: tuple[ImuStand, ...]
+    `tilt_deg`: the gradienter's readings less the configured offset; None out of its range, or without one. The heading
+    is from a north common to all stands, which need not be the true one. `counted`: it is that of the stand before plus
+    the turn that the gyros counted since (`seconds.counting`), not wrapped; its sigma is that of this turn, without the
+    gyros' scale (`Priors.turn_scale`).
+    """
+
+    imus: tuple[ImuWindow, ...]
     tilt_deg: tuple[float, float] | None
-    """The gradienter's readings less the configured offset; None out of its range, or without one."""
     tilt_sigma_deg: tuple[float, float]
     heading_rad: float
-    """Heading from a north common to all stands, which need not be the true one."""
     heading_sigma_rad: float
     on_spot: bool
-    """On the one spot on which the aircraft is turned."""
     counted: bool = False
-    """The heading is that of the stand before plus the turn that the gyros counted since (`seconds.counting`), not
-    wrapped; its sigma is that of this turn, without the gyros' scale (`Priors.turn_scale`)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """Gravity and the Earth's rate at the place, with their uncertainty."""
-
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     rate_rad_s: Array
@@ -143,18 +133,19 @@ class Ground:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
-    """One sigma of each unknown before any reading; 0: known and not estimated (method 3.4, joint MAP covariance)."""
+    """One sigma of each unknown before any reading; 0: known and not estimated (method 3.4, joint MAP covariance).
+
+    `placement_deg`: tilt of each placement on the spot, each axis. `turn_scale`: of all gyros that count turns.
+    """
 
     offset_deg: float = 1.0
     placement_deg: float = 0.02
-    """Tilt error of each placement on the spot, each axis."""
     scale: float = 0.005
     shear: float = 0.002
     misalignment_deg: float = 1.0
     accel_bias_m_s2: float = 30.0 * MG
     gyro_bias_rad_s: float = 5.0 * DEG
     turn_scale: float = 0.01
-    """Scale error of the gyros that count turns, common to all of them."""
 
 
 MISALIGNMENT, PART_SCALE, PART_SHEAR, ACCEL_BIAS, GYRO_BIAS = range(5)
@@ -194,7 +185,6 @@ class Model:
 
         angle, bias = priors.misalignment_deg * DEG, (priors.accel_bias_m_s2, priors.gyro_bias_rad_s)
         self.sigma = np.full(self._first_imu + 15 * len(names), _ANYHOW_RAD)
-        """Sigma of every unknown before any reading; 0: not estimated."""
         self.sigma[self.offset] = priors.offset_deg * DEG if self._tilted else 0.0
         self.sigma[self.spot] = _ANYHOW_RAD if self._on_spot else 0.0
         self.sigma[self.gravity] = ground.gravity_sigma_m_s2
@@ -206,10 +196,8 @@ class Model:
         if self._on_spot:
             self.start[self.spot] = self._first_guess[self._on_spot, 2, :2].mean(axis=0)
         self.damped = [*range(2, 4), *range(self.turn.stop, self._first_imu)]
-        """Unknowns that only the readings determine."""
 
         self.labels: list[ResidualLabel] = []
-        """Labels of the residuals, in their order, and of the priors."""
         sigmas: list[float] = []
 
         def add(group: Group, k: int, sigma: Iterable[float], name: str = "") -> None:
@@ -221,9 +209,9 @@ class Model:
             add("gradienter", k, np.array(stands[k].tilt_sigma_deg) * DEG)
         imus = [(k, imu) for k in numbers for imu in stands[k].imus]
         for k, imu in imus:
-            add("accelerometer", k, imu.accel_sigma_m_s2, imu.name)
+            add("accelerometer", k, imu.accel_sigma_use_m_s2, imu.name)
         for k, imu in imus:
-            add("gyro", k, imu.gyro_sigma_rad_s, imu.name)
+            add("gyro", k, imu.gyro_sigma_use_rad_s, imu.name)
         for k in self._headed:
             add("compass", k, [stands[k].heading_sigma_rad])
         for k in self._turned:
@@ -234,10 +222,8 @@ class Model:
             group: Group = "zero" if part < self.offset.stop else "nothing" if part in self.damped else "prior"
             add(group, -1, [self.sigma[part]])
         self.row_sigma = np.array(sigmas)
-        """Sigma of every row of `labels`, SI units."""
 
     def imu(self, imu: int, part: int) -> slice:
-        """Place of one part of an IMU, counted from 0."""
         start = self._first_imu + 15 * imu + 3 * part
         return slice(start, start + 3)
 
@@ -277,7 +263,6 @@ class Model:
         return np.asarray(found / self.row_sigma[: found.shape[1]])
 
     def _imus(self, at: Floats) -> Floats:
-        """Return the parts of every IMU, (..., imus, 5, 3)."""
         return at[..., self._first_imu :].reshape(*at.shape[:-1], -1, 5, 3)
 
 

@@ -47,9 +47,7 @@ ENOUGH_WANDER: Final = 0.8
 SAME_DEG: Final = 20.0
 """Two stands within this angle tell hardly more than one."""
 FACE_DEG: Final = 30.0
-"""A stand within this angle of a face has seen it."""
 _STAND_SIGMA_M_S2: Final = 0.03 * MG
-"""Predicted sigma of the mean of a coming stand."""
 _AXES: Final = "xyz"
 _SIDES: Final = {
     "level": (0, 0, -1),
@@ -67,34 +65,35 @@ Face = tuple[Array, Array]
 
 
 class Sides(msgspec.Struct, frozen=True):
-    """Errors of one IMU's accelerometers, known from all sides, under the offsets and scales that are active."""
+    """Errors of one IMU's accelerometers, known from all sides, under the offsets and scales that are active.
+
+    Figures (9,) as in `FacesEstimate`, one sigma of each: time and temperature have widened those of the biases.
+    """
 
     figures: Array
-    """(9,), as in `FacesEstimate`, in the sensor's axes; m/s^2 and no unit."""
     sigma: Array
-    """One sigma of each; time and temperature have widened those of the biases."""
     vehicle_from_sensor: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class FacesEstimate:
-    """Estimate from all stands: figures (9,), bias x y z, scale x y z, shear xy xz yz, with their covariance."""
+    """Estimate from all stands: figures (9,), bias x y z, scale x y z, shear xy xz yz.
+
+    `by_stands` (9, 9): their covariance during the stands. `wander_m_s2` (3,): one sigma of the change of the biases
+    until they are used. `up` (stands, 3): in the sensor's axes, corrected. `off_m_s2` (stands,): length of each
+    corrected reading less gravity. Stands, counted from 0: those `left_out` do not fit the others; of those `in_doubt`
+    one does not, and the next stand will tell which.
+    """
 
     figures: Array
     by_stands: Matrix
-    """Covariance of the figures during the stands, (9, 9)."""
     wander_m_s2: Array
-    """One sigma, (3,), of the change of the biases until they are used."""
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     up: Matrix
-    """(stands, 3), up in the sensor's axes, corrected."""
     left_out: tuple[int, ...]
-    """Stands, counted from 0, that do not fit the others."""
     off_m_s2: Array
-    """(stands,) length of each corrected reading less gravity."""
     in_doubt: tuple[int, ...]
-    """Stands of which one does not fit; the next stand will tell which."""
 
     @property
     def covariance(self) -> Matrix:
@@ -105,7 +104,6 @@ class FacesEstimate:
 
     @property
     def sigma(self) -> Array:
-        """One sigma of each figure, (9,)."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -165,7 +163,6 @@ def _fit(
         inside = (force - at[:, None, BIAS]) @ inverse
         lengths = np.linalg.norm(inside, axis=-1)
         across = inside / lengths[..., None] @ inverse
-        """Derivative of each length by its reading."""
         sigma = np.sqrt(np.einsum("mki,ki->mk", across**2, sigmas**2))
         return np.asarray((lengths - gravity[0] - at[:, FIGURES:]) / sigma)
 
@@ -227,7 +224,6 @@ def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) ->
 
 
 def _not_seen(found: FacesEstimate, vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
-    """Return faces that no stand so far was near, else edges between them; up in the sensor's axes."""
     kept = np.delete(found.up, found.left_out, axis=0)
     sides = _all_sides(vehicle_from_sensor)
     new = [(name, up) for name, up in sides if (kept @ up).max() < np.cos(np.radians(FACE_DEG))]
@@ -245,14 +241,12 @@ def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
 
 
 def _told(found: FacesEstimate, up: Array) -> Array:
-    """Return the share of each figure's variance, (9,), that a stand with `up` upwards would take away."""
     by = np.concatenate([up, found.gravity_m_s2 * up**2, found.gravity_m_s2 * 2.0 * up[[0, 0, 1]] * up[[1, 2, 2]]])
     gain = found.by_stands @ by
     return np.asarray(gain**2 / (by @ gain + _STAND_SIGMA_M_S2**2) / np.diag(found.by_stands))
 
 
 def _figure(sigma: Array, which: int) -> str:
-    """Name a bias or a scale, with its sigma."""
     axis = _AXES[which % 3]
     if which < SCALE.start:
         return f"{axis} bias uncertain by {_two_digits(sigma[which] / MG)} mg"

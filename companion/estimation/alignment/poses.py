@@ -21,7 +21,6 @@ QUARTER_DEG: Final = 90.0
 LEAST_TILT_DEG: Final = 15.0
 """Least tilt that separates scale and misalignment from bias: they differ by the tilt's cosine."""
 APART_DEG: Final = 45.0
-"""The least angle between two tilts to different sides."""
 MOST_ASKEW_DEG: Final = 30.0
 """Largest tilt on the base: a slope, an aircraft that sits on its tail, and a board put in by eye."""
 TILTS: Final = 4
@@ -41,15 +40,11 @@ BY_EYE_SIGMA_DEG: Final = 10.0
 
 
 class AlignmentRequest(NamedTuple):
-    """One alignment, as the operator asked for it."""
-
     action: Literal["zero", "tilts", "turn", "faces"]
     headings: int = 2
     """2: there, turned by 180 degrees, and on the same way to the first marks; 4: every quarter turn."""
     write: bool = False
-    """Write offsets (and scales, where all sides tell them) to the autopilot."""
     level: bool = False
-    """Write how the board sits as the autopilot's level."""
 
     @property
     def on_spot(self) -> int:
@@ -60,37 +55,36 @@ class AlignmentRequest(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Number of stands of an alignment on a spot."""
         return self.on_spot + (TILTS if self.action == "tilts" else 0)
 
 
 class Wish(NamedTuple):
-    """The pose that is asked for next."""
+    """The pose that is asked for next: `up` (length 1) in the aircraft's axes, forward, right, down.
+
+    `words` are spoken up to a colon; the rest need not be heard. `unknown`: figures that are still open, the worst
+    first.
+    """
 
     words: str
-    """Spoken up to a colon; the rest need not be heard."""
     up: Vector = LEVEL
-    """Up in the aircraft's axes, forward, right, down; length 1."""
     turn_deg: float = 0.0
-    """Turn on its spot, clockwise from above."""
     unknown: tuple[str, ...] = ()
-    """Figures that the stands so far leave open, the worst first."""
 
 
 class HeldPose(NamedTuple):
-    """Attitude of the aircraft in one stand."""
+    """Attitude of the aircraft in one stand: `up` (3,) in its axes.
+
+    The heading is from the compass' own north, else from the first stand; not wrapped where the gyros counted it.
+    `counted`: the sigma is that of the turn since the stand before.
+    """
 
     up: Array
-    """Up in its axes, (3,)."""
     heading_deg: float = 0.0
-    """Heading from the compass' own north, else from the first stand; not wrapped where the gyros counted it."""
     heading_sigma_deg: float = 0.0
     counted: bool = False
-    """The sigma is that of the turn since the stand before."""
 
 
 def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> Wish:
-    """Return what the operator should do after these poses of an alignment on a spot."""
     if not poses:
         return Wish("stand it on a firm, marked spot")
     if len(poses) >= request.on_spot:
@@ -107,7 +101,6 @@ def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> Wish:
 
 
 def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> float:
-    """Return the turn that is asked for after these poses; 0 for a tilt."""
     if len(poses) >= request.on_spot:
         return 0.0
     return _to_next_deg(poses, poses[-1]) if request.on_spot >= HEADINGS else 180.0
@@ -154,7 +147,6 @@ def _quarters(first: HeldPose, now: HeldPose) -> int:
 
 
 def _to_next_deg(poses: Sequence[HeldPose], now: HeldPose) -> float:
-    """Return the turn, clockwise, to the next heading that is still open: the first one, after all others."""
     done = {_quarters(poses[0], pose) for pose in poses}
     open_ones = {0} if len(done) == HEADINGS else set(range(HEADINGS)) - done
     at = _quarters(poses[0], now)
@@ -172,7 +164,6 @@ def _azimuth(level: Array, up: Array) -> float:
 
 
 def _side(level: Array, up: Array) -> str:
-    """Name the side that is down."""
     sides = ("nose down", "right side down", "nose up", "left side down")
     return sides[round(_azimuth(level, up) / QUARTER_DEG) % 4]
 

@@ -43,7 +43,6 @@ KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
 LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
 _KEPT_SHOWN: Final = 4
-"""Seconds that wait for the gradienter's readings."""
 _FALLS: Final = 2.5
 """Power of the time with which the white part of a variance falls: a slope's through waves falls with the third, a
 sensor's own white noise with the first."""
@@ -51,8 +50,6 @@ _IN_MINUTES_S: Final = 90.0
 
 
 class Stream:
-    """One IMU's seconds without a gap, beside the gradienter."""
-
     def __init__(self, imu: ImuInput, gradienter: GradienterModel | None) -> None:
         self.imu, self._gradienter = imu, gradienter
         self.seconds: deque[ImuSecond] = deque(maxlen=KEPT_S)
@@ -60,7 +57,6 @@ class Stream:
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew."""
         self.seconds.clear()
         self.levels.clear()
         self._last: Floats | None = None
@@ -91,7 +87,6 @@ class Stream:
         return True
 
     def compare(self, slot: int, times: Floats, tilts: Floats) -> None:
-        """Add the gradienter's readings of a second."""
         shown = self._shown.get(slot)
         if shown is None or shown[0][0] < self._settled_s:
             return
@@ -125,7 +120,6 @@ class Deck(WindowSource):
         self._is_good = True
 
     def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
-        """Add an IMU, or begin anew with one whose stream is another now."""
         self._streams[imu.name] = Stream(imu, self._gradienter)
         if batches is not None:
             batches.on_second = functools.partial(self.take_imu, imu.name)
@@ -146,12 +140,10 @@ class Deck(WindowSource):
         """Do nothing: a movement ends nothing here."""
 
     def add(self, slot: int, *, good: bool) -> bool:
-        """Note whether a source was faulty."""
         self._is_good = good
         return True
 
     def take_imu(self, name: str, batch: Batch, times: Floats, rows: Floats) -> None:
-        """Add the samples (n, 6) of one second of an IMU, in its own axes."""
         stream = self._streams[name]
         if not stream.add(batch, times, rows):
             self.clear()
@@ -159,25 +151,21 @@ class Deck(WindowSource):
             stream.compare(batch.slot, *self._tilts[batch.slot])
 
     def take_tilt(self, batch: Batch, times: Floats, rows: Floats) -> None:
-        """Add the readings (n, 2) of one second of the gradienter."""
         self._tilts[batch.slot] = times, rows
         _trim(self._tilts, _KEPT_SHOWN)
         for stream in self._streams.values():
             stream.compare(batch.slot, times, rows)
 
     def take_heading(self, batch: Batch, times: Floats, rows: Floats) -> None:
-        """Add the headings (n, 1) of one second, degrees."""
         self._headings[batch.slot] = float(batch.mean[0]) * DEG
         _trim(self._headings, KEPT_S)
 
     @property
     def seconds(self) -> int:
-        """Number of seconds that the IMUs have in common, to the last."""
         return min((len(stream.seconds) for stream in self._streams.values()), default=0)
 
     @property
     def stillness(self) -> CollectorStatus:
-        """Every second counts."""
         seconds = float(self.seconds)
         return CollectorStatus(still_s=seconds, steady_s=seconds, good_now=self._is_good)
 
@@ -274,12 +262,10 @@ def aim(span_s: float, known: TriadVariances, target: float) -> tuple[float, flo
 
 
 def progress(sigma: float, goal: float, unit: str) -> str:
-    """Give '12 deg/h, goal 6.1'."""
     return f"{_figure(sigma)} {unit}, goal {_figure(goal)}"
 
 
 def more(left_s: float) -> str:
-    """Give a time for a pilot."""
     if left_s < _IN_MINUTES_S:
         return f"some {math.ceil(left_s / 10.0) * 10} s more"
     return f"some {left_s / 60.0:.0f} min more"
@@ -290,6 +276,5 @@ def _figure(value: float) -> str:
 
 
 def _trim(kept: dict[int, Any], most: int) -> None:
-    """Drop the oldest."""
     while len(kept) > most:
         del kept[next(iter(kept))]

@@ -38,7 +38,6 @@ RAMP_T: Final = 5.0
 """Sigmas from which on a ramp is believed, as at rest (`noise.robust`)."""
 _ROUNDS: Final = 7
 _NEAR: Final = 0.1
-"""Change of the biases in the last round, in sigmas."""
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
 _UNKNOWNS: Final = 14
 _NO_RAMP: Final = 11
@@ -46,57 +45,46 @@ _NO_RAMP: Final = 11
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Believed:
-    """Priors; one sigma each."""
+    """Priors, one sigma each; noise of the worst axis: N in SI * sqrt(s), K in rad/s / sqrt(s)."""
 
     accel_m_s2: Array
-    """(3,) of the accelerometers' bias, from the comparison with the gradienter."""
     accel_sigma_m_s2: float
     compass_sigma_rad: float
-    """Part of the compass' error that changes with the heading."""
     gyro_white: float
-    """N of the gyros, rad/s * sqrt(s): the largest of the axes."""
     gyro_walk: float
-    """K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)."""
     gyro_slope: float
     """One sigma of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
     compass_lag_s: float
     accel_white: float
-    """N of the accelerometers, m/s^2 * sqrt(s)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Rates in the body's axes (FRD), attitudes in NED."""
+    """Means over the window and attitudes; rates (3,) in the body's axes (FRD).
+
+    `gyro_rad_s`: bias at the end of the window, were there no rotation of the Earth; with it, it is the bias and
+    `by_earth` (3, 3) times the Earth's rate (NED). `body_to_ned` (n + 1, 3, 3): at the knots; north is the compass'.
+    `heading_sigma_rad`: at the end, by averaging alone.
+    """
 
     gyro_rad_s: Array
-    """(3,) bias at the end of the window, were there no rotation of the Earth."""
     gyro_covariance: Matrix
-    """(3, 3) of that."""
     by_earth: Matrix
-    """(3, 3): `gyro_rad_s` is the bias and this times the Earth's rate (NED)."""
     ramp_rad_s2: Array
-    """(3,) zero where none is plain."""
     turn_rad_s: Array
-    """(3,) how fast it turned on the mean."""
     force_m_s2: float
-    """Mean specific force along the vertical, up."""
     force_sigma_m_s2: float
     body_to_ned: Floats
-    """(n + 1, 3, 3) at the knots; north is the compass'."""
     heading_sigma_rad: float
-    """Sigma of the heading at the end, by averaging alone."""
 
 
 class _Stretch:
-    """The passages as arrays."""
-
     def __init__(self, passages: Sequence[Passage]) -> None:
         columns = zip(*passages, strict=True)
         self.spans, self.turn, self.turned, self.velocity, self.by_bias, _ = map(np.array, columns)
 
     @property
     def ends(self) -> Floats:
-        """(n + 1,) times of the knots, from zero."""
         return np.concatenate([[0.0], np.cumsum(self.spans)])
 
     @property
@@ -107,13 +95,11 @@ class _Stretch:
         return np.asarray(turned / self.spans.sum())
 
     def attitudes(self, start: Matrix, bias: Array) -> Floats:
-        """(n + 1, 3, 3) body to NED, by gyros with this bias."""
         steps = rotations(-(self.turned @ bias)) @ self.turn
         earth = rotations(-np.outer(self.ends, [EARTH_RATE_NORTH_RAD_S, 0.0, 0.0]))
         return np.asarray(earth @ running_products(np.concatenate([start[None], steps])))
 
     def forces(self, attitudes: Floats, gyro: Array, accel: Array) -> Floats:
-        """(n, 3) mean specific force of every passage, NED."""
         # The second order in the bias of gravity's own part: 0.6 mg at 3 deg/s.
         bent = np.cross(gyro, np.cross(gyro, self.velocity)) * np.square(self.spans[:, None]) / 6.0
         felt = self.velocity + self.by_bias @ gyro + bent - self.turned @ accel
@@ -135,7 +121,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
     for _ in range(_ROUNDS):
         attitudes = stretch.attitudes(start, bias)
         forces = stretch.forces(attitudes, bias, believed.accel_m_s2)
-        system = _System.of(stretch, attitudes, forces, (headings_rad, compass_forward), believed.compass_lag_s)
+        system = _System(stretch, attitudes, forces, (headings_rad, compass_forward), believed.compass_lag_s)
         values, covariance, by_earth = system.solve(noise, believed, _NO_RAMP)
         noise = system.noise(values)
         start = rotations(values[_START]) @ start
@@ -176,20 +162,16 @@ def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Arra
     return np.asarray(stretch.rate - turn * start[2])
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _System:
-    """Regressors and readings of the three channels: force to the north, to the east (over g), and heading; rad."""
+    """Regressors (3, n, unknowns + 3) and readings (3, n) of three channels, rad.
 
-    columns: Floats
-    """(3, n, unknowns + 3): the last three are the Earth's rate."""
-    readings: Floats
-    """(3, n)."""
-    step_s: float
+    The channels are the force to the north and to the east, over g, and the heading; the last three regressors are the
+    Earth's rate.
+    """
 
-    @classmethod
-    def of(
-        cls, stretch: _Stretch, attitudes: Floats, forces: Floats, compass: tuple[Floats, Array], lag_s: float
-    ) -> _System:
+    def __init__(
+        self, stretch: _Stretch, attitudes: Floats, forces: Floats, compass: tuple[Floats, Array], lag_s: float
+    ) -> None:
         headings_rad, forward = compass
         up = -float(forces[:, 2].mean())
         turned = attitudes[:-1] @ stretch.turned
@@ -211,7 +193,8 @@ class _System:
         columns[:2, :, _ACCEL] = (turned[:, :2] / stretch.spans[:, None, None] / up).transpose(1, 0, 2)
         columns[2, :, _COMPASS] = np.column_stack([np.sin(azimuth), np.cos(azimuth)])
         off = np.remainder(headings_rad - azimuth + math.pi, 2.0 * math.pi) - math.pi
-        return cls(columns, np.array([forces[:, 0] / up, forces[:, 1] / up, off]), float(stretch.spans.mean()))
+        self.columns, self.readings = columns, np.array([forces[:, 0] / up, forces[:, 1] / up, off])
+        self.step_s = float(stretch.spans.mean())
 
     def solve(
         self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int
@@ -244,7 +227,6 @@ class _System:
         return values, covariance_found, covariance @ (regressors.T @ earth)
 
     def noise(self, values: Array) -> tuple[Waves, Waves]:
-        """Fit the residuals as waves: the two levels together, the heading."""
         left = self.readings - self.columns[..., :_UNKNOWNS] @ values
         heading = left[2][np.isfinite(left[2])]
         if len(heading) == 0:
@@ -269,19 +251,20 @@ def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
 
 
 class Passage(NamedTuple):
-    """A second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning."""
+    """A second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning.
+
+    `turn` (3, 3): from the body's axes at the end to those at the start, by the gyros. `turned` (3, 3): its integral
+    over the time, in s; a bias b turns the start by -turned @ b. `velocity_m_s` (3,): integral of the specific force in
+    the axes of the start, and `velocity_by_bias` (3, 3) its derivative by the gyro bias, m/s per rad/s. `white2`: N^2
+    of the gyros from second differences of neighbouring samples, mean of the axes.
+    """
 
     span_s: float
     turn: Matrix
-    """(3, 3) from the body's axes at the end to those at the start, as the gyros have it."""
     turned: Matrix
-    """(3, 3) integral of that over the time, in s: a bias b turns the start by -turned @ b."""
     velocity_m_s: Floats
-    """(3,) integral of the specific force in the axes of the start."""
     velocity_by_bias: Matrix
-    """(3, 3) d velocity / d (gyro bias): m/s per rad/s."""
     white2: float
-    """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
 
 
 def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:

@@ -104,7 +104,6 @@ def whitened(columns: Floats, waves: Waves, wander: tuple[float, float] = (0.0, 
 
 
 def _stationary(move: Matrix, kick: Matrix) -> Matrix:
-    """Return the stationary covariance (Lyapunov's equation, by doubling)."""
     covariance, power = kick.copy(), move.copy()
     for _ in range(_DOUBLINGS):
         covariance = covariance + power @ covariance @ power.T
@@ -119,12 +118,9 @@ class Level(msgspec.Struct, frozen=True):
     difference: Floats
     """Gradienter minus what it would show by the accelerometer."""
     slope: Floats
-    """Slope of what it would show, degrees a second."""
 
 
 class Fluid:
-    """The gradienter's reading of one IMU's specific force."""
-
     def __init__(self, model: GradienterModel) -> None:
         self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
         self._last: tuple[float, float, float] | None = None

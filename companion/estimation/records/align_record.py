@@ -20,7 +20,6 @@ from companion.samples import Vector
 
 FORMAT_VERSION = 1
 _MOST_DEG = 90.0
-"""Limit of a gradienter's zero and of its sigma."""
 SAME_START_S = 30.0
 """Drift between two clocks in weeks; a restart moves the start by at least the time that it had been on."""
 
@@ -47,31 +46,32 @@ class Determined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, vehicle FRD; an autopilot has subtracted its own offsets already."""
+    """One IMU, vehicle FRD; an autopilot has subtracted its own offsets already.
+
+    The level bias is the effective one of the accelerometers when the base is level, as a calibration there finds it.
+    """
 
     name: str
     temperature_degc: float | None
     level_bias_mg: Vector
-    """Effective accelerometer bias when the base is level, as a calibration there finds it."""
     level_sigma_mg: Vector
     gyro_bias_deg_h: Determined
 
 
 class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
-    """One IMU beside a gradienter."""
+    """One IMU beside a gradienter; the small misalignment is from the gradienter's axes to this IMU's.
+
+    `accel_bias_mg` is the bias proper, without scale, shear and misalignment, each of which looks like a bias in one
+    pose. Shear: xy, xz, yz.
+    """
 
     accel_bias_mg: Determined
-    """Bias proper, without scale, shear and misalignment, each of which looks like a bias in one pose."""
     accel_scale: Determined
     accel_shear: Determined
-    """xy, xz, yz."""
     misalignment_deg: Determined
-    """Small rotation from the gradienter's axes to this IMU's."""
 
 
 class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One still window, as it was measured."""
-
     x_deg: float | None
     y_deg: float | None
     roll_deg: float
@@ -82,13 +82,10 @@ class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Keys that all alignments on one spot have."""
-
     format_version: int = FORMAT_VERSION
     measured_at: str
     slope_deg: float
     checked: bool
-    """True if a spot that moved between the stands would have been noticed."""
     chi_square: float
     freedom: int
     stands: tuple[StandRecord, ...]
@@ -96,8 +93,6 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
-    """The gradienter's zero, measured by turning."""
-
     kind: Kind
     gradienter: GradienterSettings
     offset_deg: Pair
@@ -109,8 +104,6 @@ class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
 
 
 class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One stand: up in the aircraft's axes, forward, right, down."""
-
     up: Vector
     seconds: float
 
@@ -119,17 +112,20 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     """One power-up of a sensor; another one has other biases."""
 
     host: str
-    """Identity of the companion computer's start, whose clock counts."""
     started_s: float
     up_s: float
 
     def is_same(self, other: Running) -> bool:
-        """Return whether the power has surely been on in between."""
         return self.host == other.host != "" and abs(self.started_s - other.started_s) < SAME_START_S
 
 
 class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, in its own axes; the autopilot has subtracted its offsets already."""
+    """One IMU, in its own axes; the autopilot has subtracted its offsets already.
+
+    Shear: xy, xz, yz; no firmware corrects it. `left_out`: stands, from 1, that do not fit the others. `scatter_mg`:
+    rms by which the stands' readings, corrected, miss the length of gravity. `whole_bias_mg`: bias without any offset,
+    as it is written; None: of an earlier version.
+    """
 
     name: str
     accel_id: int | None
@@ -139,19 +135,13 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     accel_bias_mg: Determined
     accel_scale: Determined
     accel_shear: Determined
-    """xy, xz, yz; no firmware corrects it."""
     left_out: tuple[int, ...]
-    """Stands, from 1, that do not fit the others."""
     scatter_mg: float
-    """Rms by which the stands' readings, corrected, miss the length of gravity."""
     written: dict[str, WrittenParameter]
     whole_bias_mg: Vector | None = None
-    """Bias of the sensor without any offset, as it is written; None: of an earlier version."""
 
 
 class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Accelerometers measured on all sides."""
-
     format_version: int = FORMAT_VERSION
     kind: Literal["faces"] = "faces"
     measured_at: str
@@ -178,18 +168,17 @@ def check(record: AlignmentRecord | FacesRecord) -> None:
 
 
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
-    """One IMU, turned on a spot without a gradienter."""
-
     written: dict[str, WrittenParameter] = {}
     whole_bias_mg: Vector | None = None
-    """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Tilt of the board against the base: the attitude (roll right side down) that it shows on a level base."""
+    """Tilt of the board against the base: the attitude (roll right side down) that it shows on a level base.
+
+    The accelerometers of `imu` showed it, whose bias and scale are known from all sides.
+    """
 
     imu: str
-    """IMU whose accelerometers showed it; their bias and scale are known from all sides."""
     faces_measured_at: str
     roll_deg: float
     pitch_deg: float
@@ -198,19 +187,15 @@ class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TurnRecord(SpotRecord, frozen=True, kw_only=True):
-    """A turn on one spot without a gradienter."""
-
     kind: Literal["turn"] = "turn"
     imus: tuple[TurnImuRecord, ...]
     board: BoardRecord | None = None
-    """None where the accelerometers are not known from all sides."""
 
 
 HandRecord = AlignmentRecord | FacesRecord | TurnRecord
 
 
 def stand_record(stand: StandMeans, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
-    """Return the record of one stand, with its estimated attitude (body from ground)."""
     roll, pitch = roll_pitch_from_up(-attitude[:, 2])
     tilt = stand.tilt_deg
     return StandRecord(
@@ -225,7 +210,6 @@ def stand_record(stand: StandMeans, attitude: Matrix, seconds: float, configured
 
 
 def imu_record(imu: ImuAlignment, temperature_degc: float | None) -> ImuAlignmentRecord:
-    """Return one IMU in the units of the record."""
     return ImuAlignmentRecord(
         name=imu.name,
         temperature_degc=temperature_degc,
@@ -240,13 +224,11 @@ def imu_record(imu: ImuAlignment, temperature_degc: float | None) -> ImuAlignmen
 
 
 def turn_imu_record(imu: ImuAlignment, temperature_degc: float | None, whole_m_s2: Array) -> TurnImuRecord:
-    """Return one IMU in the units of the record, before anything is written."""
     level = msgspec.convert(imu_record(imu, temperature_degc), TurnImuRecord, from_attributes=True)
     return msgspec.structs.replace(level, whole_bias_mg=_axes(whole_m_s2 / MG))
 
 
 def board_record(board: Mounting, imu: str, faces_measured_at: str) -> BoardRecord:
-    """Return the tilt of the board in degrees, before anything is written."""
     roll_sigma, pitch_sigma = np.round(board.sigma_rad / DEG, 4).tolist()
     return BoardRecord(
         imu=imu,
@@ -267,8 +249,6 @@ def faces_imu_record(
     running: Running | None,
     whole_m_s2: Array,
 ) -> FacesImuRecord:
-    """Return one IMU in the units of the record, before anything is written."""
-
     def part(place: slice, unit: float, prior: float) -> Determined:
         sigma = found.sigma[place]
         return _determined(Figures(found.figures[place], sigma, sigma < DETERMINED * prior), unit)

@@ -15,10 +15,8 @@ HEADS: Final = {
     "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
     "vibration": "vibration", "trend": "per minute",
 }  # fmt: skip
-"""Terms of a `Split`, as tables name them (docs/flight.md)."""
 UNSEEN: Final = "accel x, y: not counted, in the air nothing tells them from tilt"
 _WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
-"""Smaller findings are nobody's worry."""
 
 
 class Term(msgspec.Struct, frozen=True):
@@ -29,33 +27,31 @@ class Term(msgspec.Struct, frozen=True):
 
 
 class Split(msgspec.Struct, frozen=True, kw_only=True):
-    """One axis of one IMU, over what the offsets in force left; None: the log does not carry it."""
+    """Parts of one axis' bias, over what the offsets in force left; None: the log does not carry it.
+
+    `in_flight`: mean from take-off to landing. `ekf`: the EKF's estimate in the latter half of the flight. `turn_on`:
+    mean while standing, before the motors start. `temperature`: change from there into the air, by the learned curve.
+    `motors`: step at the motors' start, by vibration rectification, and by temperature where no curve is known.
+    `vibration`: change for each m/s^2 of vibration level. `trend`: change in a minute of flight.
+    """
 
     axis: str
     in_flight: Term | None
-    """Mean from take-off to landing."""
     ekf: Term | None
-    """The EKF's own estimate in the latter half of the flight."""
     turn_on: Term | None
-    """Mean while standing, before the motors start."""
     temperature: Term | None
-    """Change from there into the air, by the learned curve."""
     motors: Term | None
-    """Step at the motors' start: vibration rectification, and temperature where no curve is known."""
     vibration: Term | None
-    """Change for each m/s^2 of vibration level."""
     trend: Term | None
-    """Change in a minute of flight."""
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """Distance of free inertial navigation from the solution after a time."""
+    """Distance of free inertial navigation from the solution after a time; one start in twenty exceeds `worst_m`."""
 
     seconds: float
     starts: int
     median_m: float
     worst_m: float
-    """Exceeded by one start in twenty."""
 
 
 class Stages(msgspec.Struct, frozen=True):
@@ -69,26 +65,21 @@ class Stages(msgspec.Struct, frozen=True):
 
 
 class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one flight."""
+    """One IMU with the offsets that were in force, in its own axes, by the record that began at `calibration`."""
 
     imu: int
     rate_hz: float
     calibration: str | None
-    """`started_at` of the record whose offsets it flew with."""
     gyro_id: int | None = None
     accel_id: int | None = None
     set_gyro_rad_s: tuple[float, ...] | None
     set_accel_m_s2: tuple[float, ...] | None
-    """Offsets in force, in the IMU's own axes."""
     axes: tuple[Split, ...]
     drift: dict[str, list[Drift]]
-    """Drift without aid, by whose offsets: `flown`, `before`."""
     notes: tuple[str, ...]
 
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
-    """One flight, from arming to disarming."""
-
     key: str
     """Identity of this arming of this start of this autopilot, whichever file it is read from."""
     system_id: int | None
@@ -101,8 +92,6 @@ class Flight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class KeptFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """One file of the flights."""
-
     log: str
     read_at: str
     flight: Flight
@@ -110,7 +99,6 @@ class KeptFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def drift_lines(imu: ImuFlight) -> list[str]:
-    """Say the drift in words, a line for each time."""
     lines = []
     for flown in imu.drift.get("flown", ()):
         others = [
@@ -126,7 +114,6 @@ def drift_lines(imu: ImuFlight) -> list[str]:
 
 
 def figure(imus: Sequence[ImuFlight]) -> str | None:
-    """Summarise a flight by the drift of its first IMU at 30 s, or next to that; None: it did not fly."""
     first = next((imu for imu in imus if imu.drift.get("flown")), None)
     if first is None:
         return None
@@ -135,7 +122,6 @@ def figure(imus: Sequence[ImuFlight]) -> str | None:
 
 
 def next_flight(found: Flight) -> str:
-    """Name the largest significant part of a bias, and its remedy."""
     worst: tuple[float, str] = (0.0, "nothing to do: what the offsets left is small or not surely there")
     for imu in found.imus:
         for axis in imu.axes:

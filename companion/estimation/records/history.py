@@ -30,9 +30,7 @@ NEW_AFTER: Final = 3
 """Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor was replaced."""
 KEEP_POWER_UPS: Final = 48
 KEEP_POINTS: Final = 8
-"""Most points of a power-up."""
 NEAR_K: Final = 2.0
-"""Temperatures that tell the same."""
 _LATEST: Final = 10
 """Power-ups that are kept whatever their temperature: a sensor ages."""
 SAME_START_S: Final = 60.0
@@ -40,15 +38,13 @@ SAME_START_S: Final = 60.0
 
 
 class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """Start of a sensor's power, as well as it is known.
+    """Start of the companion computer (`host`) and of the sensor's own device, by the wall clock.
 
     Two are taken for one where either says so: too few points make a prior cautious, one counted twice makes it bold.
     """
 
     host: str
-    """One and the same as long as the companion computer runs."""
     since_unix_s: float | None
-    """Start of the sensor's own device, by the wall clock; None: unknown."""
 
     def is_same(self, other: PowerUp) -> bool:
         """Return False only if the power was surely off in between."""
@@ -61,48 +57,47 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
 
 
 class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it."""
+    """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it.
+
+    `sigma_use` is that of the sensor alone, `sigma_shared` that by place and heading, without the gradienter's zero.
+    `suspect`: it contradicts what was known. `chosen`: it was written on request all the same; earlier points count no
+    more.
+    """
 
     bias: tuple[_Bias, _Bias, _Bias]
     sigma_stat: _Sigmas
     sigma_use: _Sigmas
-    """Sigma of the sensor alone, without the pose's part."""
     sigma_shared: _Sigmas
-    """Sigma by place and heading; for an accelerometer without the gradienter's zero."""
     suspect: bool = False
-    """It contradicted what was known."""
     chosen: bool = False
-    """It contradicted, and was written on request: earlier points count no more."""
 
     @property
     def is_outlier(self) -> bool:
-        """True for a contradiction that nobody has decided for."""
         return self.suspect and not self.chosen
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """One calibration of one IMU, or one still window."""
+    """One calibration of one IMU, or one still window that no calibration used (`started_at` is empty).
+
+    `up`: in the vehicle's axes, where the accelerometers were measured. `zero`: the gradienter's behind them; None
+    without.
+    """
 
     started_at: str
-    """Start of its record; empty for a still window that no calibration used."""
     unix_s: float
     power_up: PowerUp
     temperature_degc: float | None
     k_s: float = 0.0
     up: Vector
-    """Unit vector in the vehicle's axes: the attitude at which the accelerometers' bias was measured."""
     zero: str | None = None
-    """Zero of the gradienter behind the accelerometers' bias; None without them."""
     zero_sigma_rad: float = 0.0
     gyro: MeasuredBias | None = None
     accel: MeasuredBias | None = None
 
     def of(self, triad: Triad) -> MeasuredBias | None:
-        """Return one triad."""
         return self.gyro if triad == "gyro" else self.accel
 
     def measured(self, triad: Triad) -> MeasuredBias:
-        """Return one triad that is known to have been measured."""
         found = self.of(triad)
         assert found is not None
         return found
@@ -115,7 +110,6 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
 
 
 def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
-    """Group points by power-up, in the order in which they were measured."""
     groups: list[list[Point]] = []
     for point in points:
         for group in reversed(groups):

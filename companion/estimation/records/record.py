@@ -24,13 +24,10 @@ HeadingFrom = Literal["compass", "autopilot"]
 
 
 def outcome_word(outcome: str) -> str:
-    """Say an `Outcome` to people."""
     return "put back" if outcome == "rolled_back" else outcome
 
 
 class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
-    """One-sigma uncertainty of the pose."""
-
     theta: float | None
     gamma: float | None
     psi: float | None
@@ -44,13 +41,10 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     psi_deg: float | None
     sigma_deg: PoseSigma
     tilt_from: TiltFrom | None = None
-    """"accelerometers": those of an IMU that was held on all sides before."""
     heading_from: HeadingFrom | None = None
 
 
 class SiteRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Place of the aircraft, and its source."""
-
     latitude_deg: float | None
     height_m: float | None
     gravity_m_s2: float | None
@@ -59,25 +53,23 @@ class SiteRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
-    """Magnetic field at the compass, and the quality of the heading."""
+    """Magnetic field at the compass and the Earth's by WMM2025; inclinations down positive. None: unknown.
+
+    The heading's error exceeds its bound in one case of twenty; 180: the field shows no heading. `heading_from`: with
+    the device's own tilt compensation, or with ours by the gradienter. `device_minus_field_deg`: the one less the
+    other, where the device gives both.
+    """
 
     heading_bound_deg: float | None
-    """The heading's error exceeds this in one case of twenty; None where the device tells no field, or no place is
-    known. 180: the field shows no heading."""
     heading_from: Literal["device", "field"]
-    """Tilt compensation: the device's own, or ours with the gradienter."""
     field_gauss: float | None
     field_expected_gauss: float | None
-    """Field and inclination of the Earth by WMM2025."""
     inclination_deg: float | None
-    """Down positive; needs a gradienter."""
     inclination_expected_deg: float | None
     device_minus_field_deg: float | None
-    """The device's own heading less that from its field and the gradienter, where it gives both."""
     wander_deg: float | None
 
     def in_words(self) -> str:
-        """One line for people."""
         bound = "heading error bound unknown"
         if self.heading_bound_deg is not None:
             useless = self.heading_bound_deg >= 180.0
@@ -98,15 +90,17 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
-    """Platform under the aircraft, and its own turn; the gyros' sigma allows for it."""
+    """Platform under the aircraft, and its own turn; the gyros' sigma allows for it.
+
+    It turns about the vertical, clockwise seen from above; that is not taken off. None: nothing told, and the ground
+    was taken for fixed to the Earth. Told by gyros: by their level at an earlier rest; by earlier calibrations: by the
+    biases that they have led to expect.
+    """
 
     platform: Literal["ground", "deck"]
     turn_deg_s: float | None
-    """About the vertical, clockwise seen from above; not taken off. None: nothing told, and the ground was taken for
-    fixed to the Earth."""
     turn_sigma_deg_s: float | None
     told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
-    """Gyros: by their level at an earlier rest; earlier calibrations: by the biases that they have led to expect."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,16 +126,17 @@ alone. `shift_sigma`: their difference in sigmas.
 
 
 class Effective(msgspec.Struct, frozen=True, kw_only=True):
-    """Sigma of the accelerometers' bias at another attitude: scale errors times 1 g are in it."""
+    """Sigma of the accelerometers' bias at another attitude: scale errors times 1 g are in it.
+
+    The scale is told by an alignment with tilts, or assumed (0.5 %). An axis' bias moves by `scale_sigma_m_s2`, one
+    sigma, times the change of its share of gravity; the vertical one's of a level aircraft that is tilted, times
+    1 - cos(tilt). `sensor_sigma_m_s2` is that of the sensor's own bias, in its own axes, whatever its attitude.
+    """
 
     scale_from: Literal["assumed", "alignment"]
-    """An alignment with tilts has told the scale; else 0.5 % is assumed."""
     scale_sigma_m_s2: Vector
-    """Scale error times 1 g, one sigma an axis: an axis' bias moves by it times the change of its share of gravity;
-    the vertical one's of a level aircraft that is tilted, times 1 - cos(tilt)."""
     level_sigma_m_s2: Vector
     sensor_sigma_m_s2: Vector
-    """Sigma of the bias as the sensor's own, in its own axes, whatever its attitude."""
 
 
 class WhenWarm(msgspec.Struct, frozen=True):
@@ -153,12 +148,9 @@ class WhenWarm(msgspec.Struct, frozen=True):
     accel_bias_m_s2: Vector | None
     accel_sigma_m_s2: Vector | None
     words: tuple[str, ...] = ()
-    """Words for people on the axes that will move most; empty: not worth saying."""
 
 
 class TriadFigures(NamedTuple):
-    """Figures of the gyros or accelerometers of one IMU; None: not determined, or not applicable."""
-
     bias: Vector | None
     sigma_stat: Vector | None
     sigma_use: Vector | None
@@ -168,7 +160,13 @@ class TriadFigures(NamedTuple):
 
 
 class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written."""
+    """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written.
+
+    The covariance is 6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None where that half was not determined.
+    The warm-up's part of sigma_use is too small to see, and only time removes it. Triads `held_back` contradict earlier
+    calibrations and were not requested; `unchanged` are those whose offsets in force are as good, with their sigma in
+    force. Device ids are the autopilot's; None: it has none, or the record is of an older version.
+    """
 
     name: str
     samples: int
@@ -180,7 +178,6 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_stat_m_s2: Vector | None
     accel_sigma_use_m_s2: Vector | None
     covariance: tuple[tuple[float | None, ...], ...] | None
-    """6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None where that half was not determined."""
     residual_gyro_rad_s: Vector | None
     residual_accel_m_s2: Vector | None
     warnings: tuple[str, ...] = ()
@@ -188,23 +185,16 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     prior: Prior | None = None
     effective: Effective | None = None
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
-    """Measured, not written: it contradicts earlier calibrations and was not requested."""
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
-    """Measured, not written: the offsets in force are as good."""
     gyro_sigma_warm_up_rad_s: Vector | None = None
-    """Part of sigma_use for a warm-up too small to see; only time removes it."""
     accel_sigma_warm_up_m_s2: Vector | None = None
     when_warm: WhenWarm | None = None
-    """None: the board was warm, or the end of its warm-up is unknown."""
     gyro_id: int | None = None
-    """Device ids in the autopilot; None: it has none, or the record is of an older version."""
     accel_id: int | None = None
     gyro_sigma_in_force_rad_s: Vector | None = None
-    """One sigma of the offsets that this calibration left unchanged; None where it wrote them."""
     accel_sigma_in_force_m_s2: Vector | None = None
 
     def of(self, triad: Triad) -> TriadFigures:
-        """Return the figures of one triad."""
         if triad == "gyro":
             sigmas = self.gyro_sigma_stat_rad_s, self.gyro_sigma_use_rad_s, self.gyro_sigma_warm_up_rad_s
             return TriadFigures(self.gyro_bias_rad_s, *sigmas, self.residual_gyro_rad_s, self.gyro_sigma_in_force_rad_s)
@@ -252,7 +242,6 @@ def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: fl
 
 
 def _each(function: Callable[..., float], *vectors: Vector | None) -> Vector:
-    """Apply a function axis by axis."""
     x, y, z = map(function, *vectors)  # type: ignore[arg-type]
     return x, y, z
 
@@ -269,10 +258,8 @@ class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
     at_arm: Literal["gate", "warn", "off"]
     calibration: str | None
-    """`started_at` of the record that was in force, wholly or in part."""
     calibrated_ago_s: float | None
     confirmed_ago_s: float | None
-    """Time since a still window last agreed with the offsets in force."""
     gyro_sigma_use_rad_s: float | None
     accel_sigma_use_m_s2: float | None
 
@@ -286,42 +273,38 @@ class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """One calibration, finished in whatever way."""
+    """One calibration, finished in whatever way; times are UTC, ISO 8601, by the host's clock, which may be wrong.
+
+    `alignment` None: the gradienter's zero and sigma were those of the configuration. `armings` is empty in the file,
+    and filled in by the history.
+    """
 
     format_version: int = FORMAT_VERSION
     state: Literal["done", "failed", "cancelled"]
     reason: str
     warnings: tuple[str, ...]
     started_at: str
-    """UTC, ISO 8601; the host's clock, which on a field computer may be wrong."""
     duration_s: float
     pose: Pose | None
     site: SiteRecord | None
     imus: tuple[ImuRecord, ...]
     system_id: int | None = None
-    """MAVLink system of the vehicle; None while it had not been heard."""
     alignment: AlignmentUsed | None = None
-    """None: the gradienter's zero and sigma were those of the configuration."""
     undone_at: str | None = None
-    """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
     standing: PlatformTurn | None = None
     armings: tuple[ArmingRecord, ...] = ()
-    """Armings while this calibration was in force; empty in the file, filled in by the history."""
 
     @property
     def written(self) -> dict[str, float]:
-        """Values written to the autopilot, by parameter."""
         return {name: one.after for imu in self.imus for name, one in imu.written.items()}
 
     @property
     def is_worth_keeping(self) -> bool:
-        """False for a calibration that was cancelled before anything was measured."""
         return self.state != "cancelled" or bool(self.imus or self.warnings)
 
 
 def to_json(record: Record) -> bytes:
-    """Encode a record as JSON, every key present."""
     return msgspec.json.encode(record)
 
 

@@ -55,24 +55,21 @@ class Why(enum.Enum):
 
 
 class Held(msgspec.Struct, frozen=True, kw_only=True):
-    """The gyros or accelerometers of one IMU: what its output must show while the calibration is good."""
+    """The gyros or accelerometers of one IMU while its calibration is good; rad/s or m/s^2.
+
+    `calibrated_s` None: the offsets were only measured to be right. `sigma_use` was promised; `sigma` leaves out the
+    warm-up to come, for comparisons: that moves old and new offsets alike. `expected` is the output minus truth: zero
+    where the autopilot corrects, else the whole bias. `seen`: in the telemetry. `averaged_s`: T of V(T, H).
+    """
 
     calibrated_s: float | None
-    """Time of the calibration; None: the offsets were only measured to be right."""
     confirmed_s: float
-    """Time of the last confirmation."""
     temperature_degc: float | None
-    """Temperature at the confirmation."""
     sigma_use: Vector
-    """rad/s or m/s^2; what was promised."""
     sigma: Vector
-    """Sigma without the warm-up to come, for comparisons: a warm-up moves old and new offsets alike."""
     expected: Vector
-    """Output minus truth while all is well: zero where the autopilot corrects, else the whole bias."""
     seen: bool
-    """True if the effect was seen in the telemetry."""
     averaged_s: float
-    """T of V(T, H)."""
 
 
 def held_of(
@@ -96,17 +93,14 @@ def held_of(
 
 
 class Present(msgspec.Struct, frozen=True, kw_only=True):
-    """Rolling window now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD)."""
+    """Rolling window now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD), sigmas as in `Held`."""
 
     residual: Vector
     sigma_use: Vector
     sigma: Vector
-    """Both as in `Held`."""
 
 
 class Objection(NamedTuple):
-    """One reason against the calibration; `words` fit one line at the flight line."""
-
     why: Why
     words: str
 
@@ -135,15 +129,8 @@ def judge(
 ) -> list[Objection]:
     """List the reasons against one triad's calibration; empty while it is good.
 
-    Args:
-        key: name of the IMU, and the triad.
-        held: the calibration.
-        model: noise of the sensor.
-        limits: largest age and change of temperature.
-        now_s: time on the clock of `held`.
-        temperature_degc: temperature now.
-        present: still window, if there is one.
-        drift: change of the bias with the temperature since `held`, and its variance; None: unknown.
+    `now_s` is on the clock of `held`; `present` is a still window, if there is one. `drift`: change of the bias with
+    the temperature since `held`, and its variance; None: unknown.
     """
     name, triad = key
     (unit, words, _), digits = UNITS[triad], _DIGITS[triad]

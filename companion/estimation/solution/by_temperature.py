@@ -16,10 +16,9 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 
 if TYPE_CHECKING:
-    from companion.estimation.temperature.curve import Curve
+    from companion.estimation.solution.curve import Curve
 
 STEP_K: Final = 1.0
-"""Distance between the rows of a curve."""
 MOST_ROWS: Final = 60
 _ENOUGH_K: Final = 5.0
 """Least span of temperatures for a curve (method 3.3)."""
@@ -27,57 +26,45 @@ _DAY_S: Final = 86400.0
 
 
 class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
-    """One still window; vehicle FRD."""
+    """One still window, vehicle FRD; `started_at` of the calibration that used it, if one did.
+
+    Power-ups are counted from 0. Accelerometers None: the tilt was unknown.
+    """
 
     at_unix_s: float
     started_at: str
-    """Start of the calibration that used the window; empty: none did."""
     power_up: int
-    """Number of the power-up, from 0."""
     degc: float
     gyro_deg_h: Vector
     sigma_deg_h: Vector
     accel_mg: Vector | None
-    """None: the tilt was unknown."""
     accel_sigma_mg: Vector | None
 
 
 class Expected(msgspec.Struct, frozen=True):
-    """Expected gyro biases at a temperature; one sigma."""
-
     degc: float
     gyro_deg_h: Vector
     sigma_deg_h: Vector
 
 
 class ExpectedForces(msgspec.Struct, frozen=True):
-    """Expected accelerometer biases at a temperature; one sigma."""
-
     degc: float
     accel_mg: Vector
     sigma_mg: Vector
 
 
 class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
-    """Biases of one IMU over temperature."""
-
     imu: str
     summary: str = ""
     power_ups: int = 0
     days: int = 0
     points: tuple[WindowBias, ...] = ()
     curve: tuple[Expected, ...]
-    """Expected gyro biases of the next power-up; empty: not known yet."""
     accel_curve: tuple[ExpectedForces, ...] = ()
-    """Expected accelerometer biases of the next power-up; empty: not known yet."""
     needs: str | None = None
-    """Reason why there is no curve, and what will make one; None: there is one."""
     today: int | None = None
-    """Number of the present power-up; None: nothing is known of it yet."""
     now: Expected | None = None
-    """Bias now: as last measured in this power-up, moved along the curve since."""
     at_power_up: Expected | None = None
-    """Bias that the curve expects of a power-up at the temperature now."""
 
 
 def by_temperature(
@@ -138,7 +125,6 @@ def _at(curve: Curve, degc: float, unit: float) -> tuple[float, Vector, Vector]:
 
 
 def _moved(last: WindowBias, curve: Curve | None, degc: float) -> Expected:
-    """Move the last measured bias to another temperature; without a curve it stays at its own."""
     if curve is None:
         return Expected(last.degc, last.gyro_deg_h, last.sigma_deg_h)
     change, variance = curve.change((last.degc, 0.0), (degc, 0.0))

@@ -31,49 +31,43 @@ _OF_ALL: Final[dict[Cause, str]] = {
     "gravity": "gravity differs",
     "turn": "it turns",
 }
-"""Causes that concern a triad of all IMUs, in a few words."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Witness:
-    """One triad of one IMU, measured and predicted."""
+    """One triad of IMU number `imu`, measured and predicted.
+
+    `own_variance` (3,) of the difference is this IMU's own, `common` (3, 3) is shared by all.
+    """
 
     imu: int
-    """Index of the IMU in the solution."""
     name: str
     triad: Triad
     expected: Prediction
     measured: Array
     own_variance: Array
-    """Variance of the difference that other IMUs do not share, (3,)."""
     common: Matrix
-    """Covariance of the difference that all IMUs share, (3, 3)."""
 
     @property
     def difference(self) -> Array:
-        """Measurement less prediction, (3,)."""
         return np.asarray(self.measured - np.array(self.expected.value))
 
     @property
     def sigma(self) -> Array:
-        """One sigma of the difference, (3,)."""
         return np.sqrt(self.own_variance + np.diag(self.common))
 
     @property
     def contradicts(self) -> bool:
-        """Return True if an axis is beyond the gate."""
         return bool((np.abs(self.difference) > self.expected.limit * self.sigma).any())
 
     @property
     def may_weigh(self) -> bool:
-        """Return True if the prediction may take part in the estimate."""
         if not self.expected.weighs:
             return False
         covariance = np.diag(self.own_variance) + self.common
         return float(self.difference @ np.linalg.solve(covariance, self.difference)) < AGREES
 
     def along(self, up: Array) -> tuple[float, float]:
-        """Give the difference about the vertical, and one sigma."""
         variance = np.square(up) @ self.own_variance + up @ self.common @ up
         return float(up @ self.difference), math.sqrt(variance)
 
@@ -82,28 +76,22 @@ class Witness:
         return float(np.sum((np.square(self.difference) - np.square(self.difference - shift)) / self.own_variance))
 
     def is_explained(self, shift: Array) -> bool:
-        """Return True if the difference is within the gate once a common shift is subtracted."""
         return bool((np.abs(self.difference - shift) <= self.expected.limit * np.sqrt(self.own_variance)).all())
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Doubt:
-    """A contradiction: its cause, and one line for a pilot."""
-
     triad: Triad
     cause: Cause
     names: tuple[str, ...]
-    """IMUs whose readings are not to be believed."""
     words: str
 
     @property
     def of_all(self) -> bool:
-        """Return True if it concerns this triad of all IMUs, not only of those named."""
         return self.cause in _OF_ALL
 
     @property
     def in_short(self) -> str:
-        """The cause in a few words."""
         return _OF_ALL.get(self.cause, "unlike before")
 
 
@@ -157,7 +145,6 @@ def _common(witnesses: Sequence[Witness], directions: Matrix) -> tuple[Array, Ar
 def _alone(
     witness: Witness, others: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool
 ) -> Doubt:
-    """Judge one IMU that contradicts: do the others rule out the common causes?"""
     triad, name, expected = witness.triad, witness.name, witness.expected
     unit, words, digits = UNITS[triad]
     axis = int(np.argmax(np.abs(witness.difference) / witness.sigma))

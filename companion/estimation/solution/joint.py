@@ -23,7 +23,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 import numpy as np
@@ -32,45 +32,36 @@ from companion.estimation.means.warming import NEXT_S
 from companion.estimation.records.record import Prior, WhenWarm
 from companion.estimation.solution.doubt import Witness, contradictions
 from companion.estimation.solution.prior import Expectation, ExpectedImu
-from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solution, moved
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.estimation.turning.turn import CHANCE_SIGMAS, Turn
-from companion.physics.frames import Array, vector
+from companion.physics.frames import vector
 from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS, Triad, Vector, rows_of
-
-Whole = Mapping[str, Pair]
-"""Whole gyro and accelerometer bias by IMU, by the readings alone, (3,) each, vehicle FRD."""
 
 BOUNDS_RAD_S: Final = 0.1 * DEG
 """Largest sigma of a gyro's prediction that says something of a turn."""
 _CONTRADICTS: Final = 4.0
-"""Sigmas between the slope of the readings and that of the curve."""
 _WORTH_SAYING: Final = 2.0
-"""Least change until warm that is reported, in sigma_use."""
 _END_OF_RAMP: Final = 0.25
 """Variance of a mean over that of the end of a line through the same values (`robust.Line.end_leverage`)."""
 
 
-def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Solution:
+def weigh(solution: Solution, expectation: Expectation) -> Solution:
     """Check a solution against earlier calibrations, and let them take part where they may."""
     shared, by_name = solution.shared, {each.name: each for each in expectation.imus}
     expected = [by_name.get(imu.name) or ExpectedImu(name=imu.name) for imu in solution.imus]
     ends = [at_end(imu, known, shared) for imu, known in zip(solution.imus, expected, strict=True)]
-    whole = {imu.name: moved(whole[imu.name], shift) for imu, shift, _ in ends if imu.name in whole}
-    imus = tuple(_with_effect(imu, known, shared) for (imu, _, _), known in zip(ends, expected, strict=True))
-    earlier, today = (_witnesses(imus, shared, whole, expected, today=today) for today in (False, True))
+    imus = tuple(_with_effect(imu, known, shared) for (imu, _), known in zip(ends, expected, strict=True))
+    earlier, today = (_witnesses(imus, shared, expected, today=today) for today in (False, True))
     doubts = tuple(contradictions(earlier, today, len(imus), shared.up, shared.by_reading))
     solution = dataclasses.replace(solution, imus=imus, doubts=doubts)
     used = [one for one in earlier if one.may_weigh and (one.name, one.triad) not in solution.doubted]
-    combined, shift = _combined(solution, used, zero_is_known=expectation.zero_is_known)
-    combined = _grounded(combined, earlier, today)
+    combined = _grounded(_combined(solution, used, zero_is_known=expectation.zero_is_known), earlier, today)
     final = []
-    for k, (imu, (_, _, followed)) in enumerate(zip(combined.imus, ends, strict=True)):
+    for k, (imu, (_, followed)) in enumerate(zip(combined.imus, ends, strict=True)):
         own = [doubt.words for doubt in doubts if not doubt.of_all and imu.name in doubt.names]
         prior = _prior([one for one in earlier if one.imu == k], used)
-        if imu.name in whole:
-            now = moved(whole[imu.name], shift[6 * k : 6 * k + 6])
-            imu = with_warm(imu, now, expected[k], followed)
+        imu = with_warm(imu, expected[k], followed)
         final.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
     common = [doubt.words for doubt in doubts if doubt.of_all]
     return dataclasses.replace(combined, imus=tuple(final), warnings=(*solution.warnings, *common))
@@ -79,8 +70,8 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Solutio
 # --- a window that warmed
 
 
-def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[ImuSolution, Array, tuple[Triad, ...]]:
-    """Move an estimate to the end of its window; also give the shift, (6,), and the triads that followed a curve."""
+def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[ImuSolution, tuple[Triad, ...]]:
+    """Move an estimate to the end of its window; also give the triads that followed a curve."""
     shift, stat, warm_up = np.zeros(6), imu.sigma_stat.copy(), imu.warm_up_variance.copy()
     covariance, followed = imu.covariance.copy(), list[Triad]()
     for triad, bias in zip(TRIADS, imu.biases, strict=True):
@@ -103,18 +94,15 @@ def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[Imu
         stat[rows] = np.sqrt(np.square(stat[rows]) * np.where(ramp != 0.0, _END_OF_RAMP, 1.0) + variance)
         # The slope may go on, or end now.
         warm_up[rows] = (np.square(slope + share * more) / 3.0 + share * of_line) * (NEXT_S / 2.0) ** 2
-    gyro, accel = moved(imu.biases, shift)
-    at_its_end = dataclasses.replace(
-        imu, gyro_rad_s=gyro, accel_m_s2=accel, covariance=covariance, sigma_stat=stat, warm_up_variance=warm_up
-    )
-    return at_its_end, shift, tuple(followed)
+    moved = imu.shifted(shift)
+    at_its_end = dataclasses.replace(moved, covariance=covariance, sigma_stat=stat, warm_up_variance=warm_up)
+    return at_its_end, tuple(followed)
 
 
-def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu, followed: Collection[Triad]) -> ImuSolution:
-    """Add the biases that are predicted for when the IMU is warm, from the `whole` biases now."""
+def with_warm(imu: ImuSolution, expected: ExpectedImu, followed: Collection[Triad]) -> ImuSolution:
     figures: dict[Triad, tuple[Vector, Vector]] = {}
     words, degc = [], 0.0
-    for triad, now in zip(TRIADS, whole, strict=True):
+    for triad, now in zip(TRIADS, imu.whole, strict=True):
         along = expected.along.get(triad) if triad in followed else None
         if along is None or along.warm is None or now is None:
             continue
@@ -141,7 +129,6 @@ def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu, followed: Co
 
 
 def _with_effect(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> ImuSolution:
-    """Add what the accelerometers' bias is worth at another attitude."""
     effect = expected.effect
     if imu.accel_m_s2 is None or effect is None:
         return imu
@@ -152,13 +139,12 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> Imu
 
 
 def _witnesses(
-    imus: Sequence[ImuSolution], shared: Shared, whole: Whole, expected: Sequence[ExpectedImu], *, today: bool
+    imus: Sequence[ImuSolution], shared: Shared, expected: Sequence[ExpectedImu], *, today: bool
 ) -> list[Witness]:
-    """Pair each prediction with its measurement."""
     found = []
     for triad, (k, imu) in itertools.product(TRIADS, enumerate(imus)):
         known = (expected[k].today if today else expected[k].earlier).get(triad)
-        measured = whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
+        measured = imu.whole[TRIADS.index(triad)]
         if measured is None or known is None:
             continue
         part = rows_of(triad)
@@ -171,11 +157,10 @@ def _witnesses(
     return found
 
 
-def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: bool) -> tuple[Solution, Array]:
-    """Combine measurements and predictions by the equations at the top; also give the shift of all biases, (6 n,)."""
+def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: bool) -> Solution:
     shared, count = solution.shared, len(solution.imus)
     if not used:
-        return solution, np.zeros(6 * count)
+        return solution
     index = np.concatenate([6 * one.imu + np.arange(6)[rows_of(one.triad)] for one in used])
     innovation = -np.concatenate([one.difference for one in used])
     parts = [slice(6 * k, 6 * k + 6) for k in range(count)]
@@ -208,12 +193,11 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
     stat = np.sqrt(np.diag(rest @ np.diag(np.square(stat)) @ rest.T + gain @ s_p @ gain.T))
     stat = np.minimum(stat, np.sqrt(np.diag(covariance)))
     shift = gain @ innovation
-    imus = []
-    for imu, part in zip(solution.imus, parts, strict=True):
-        gyro, accel = moved(imu.biases, shift[part])
-        found = {"covariance": covariance[part, part], "sigma_stat": stat[part]}
-        imus.append(dataclasses.replace(imu, gyro_rad_s=gyro, accel_m_s2=accel, **found))
-    return dataclasses.replace(solution, imus=tuple(imus)), shift
+    imus = tuple(
+        dataclasses.replace(imu.shifted(shift[part]), covariance=covariance[part, part], sigma_stat=stat[part])
+        for imu, part in zip(solution.imus, parts, strict=True)
+    )
+    return dataclasses.replace(solution, imus=imus)
 
 
 def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Witness]) -> Solution:
@@ -243,7 +227,6 @@ def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Wi
 
 
 def _prior(known: Sequence[Witness], used: Sequence[Witness]) -> Prior | None:
-    """Make the record's entry of one IMU's predictions."""
     found: Prior = dict.fromkeys(TRIADS)
     for one in known:
         expected, unit = one.expected, "rad_s" if one.triad == "gyro" else "m_s2"

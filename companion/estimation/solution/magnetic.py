@@ -46,13 +46,11 @@ _NINETY_FIVE: Final = 1.96
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassHeading:
-    """True heading of the vehicle by the compass, and its error."""
+    """True heading, its sigma at an exact tilt, and its gradient by up (3,): zero for a device's own heading."""
 
     heading_rad: float
     sigma_rad: float
-    """One sigma at an exact tilt; `heading_by_up` gives the effect of a wrong one."""
     heading_by_up: Array
-    """Gradient by up in the vehicle's axes, (3,): zero for a device's own heading."""
     is_usable: bool
     magnetic: Magnetic
     warnings: tuple[str, ...]
@@ -63,9 +61,7 @@ class _MeanField:
     strength_gauss: float | None = None
     inclination_rad: float | None = None
     heading_rad: float | None = None
-    """Heading of the vehicle by the compass' north, with our tilt compensation."""
     bound_deg: float | None = None
-    """Largest turn of the heading by a disturbance."""
 
 
 def assess(
@@ -175,7 +171,6 @@ def _judge(
 def _disturbed(
     found: _MeanField, earths: MagneticField, bound_deg: float | None, *, useless: bool, near_pole: bool
 ) -> list[str]:
-    """Warn of a field that is not the Earth's."""
     warnings, parts = [], []
     if found.strength_gauss is not None:
         off = found.strength_gauss / earths.strength_gauss - 1.0
@@ -200,7 +195,6 @@ def _disturbed(
 
 
 def _unsteady(window: HeadingWindow, difference: float | None, may_turn_deg: float) -> list[str]:
-    """Warn of a heading that moves, or that contradicts the field."""
     warnings = []
     if window.wander_deg is not None and window.wander_deg > WANDER_WARNING_DEG:
         moves = f"compass moves by {window.wander_deg:.1f} deg"

@@ -1,7 +1,7 @@
 """Prediction of today's bias from earlier calibrations (method 3.3), with a sigma.
 
 Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
-mean of the earlier power-ups, or their cubic over temperature (`temperature.curve`). Its sigma is that of *one more*
+mean of the earlier power-ups, or their cubic over temperature (`curve`). Its sigma is that of *one more*
 power-up: the scatter, widened as Student's for few points, and the error of the mean.
 
 From three power-ups on the prediction guards (`joint`), from five on it may take part in the estimate. Within one
@@ -28,7 +28,7 @@ from companion.estimation.alignment.align_model import Priors
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
 from companion.estimation.records.history import WEIGHS_FROM, Point, believed
 from companion.estimation.records.record import Effective
-from companion.estimation.temperature.curve import CATALOGUE_PER_K, Along, Curve, PowerUpNodes, fit, in_run_variance
+from companion.estimation.solution.curve import CATALOGUE_PER_K, Along, Curve, PowerUpNodes, fit, in_run_variance
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG, G
@@ -73,7 +73,6 @@ class PoseEffect:
         return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """Make the entry of the record; `up` (3,) is the attitude of the calibration, `sigma_use_m_s2` (3,) there."""
         here = np.square(sigma_use_m_s2)
         scale = np.sqrt(np.diag(np.square(self.mean) + np.square(self.sigma)))
         return Effective(
@@ -84,7 +83,6 @@ class PoseEffect:
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
-        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
         moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
             return None
@@ -95,8 +93,6 @@ class PoseEffect:
 
 
 def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
-    """Give the known scale, shear and misalignment of one IMU."""
-
     def known(found: Determined | None, unit: float, assumed: float) -> tuple[Array, Array]:
         if found is None:
             return np.zeros(3), np.full(3, assumed)
@@ -116,36 +112,32 @@ def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
 
 
 class Prediction(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2."""
+    """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2.
+
+    The variance is that of today's bias about it, without the gradienter's zero. `limit` of the gate in sigmas: 4, or
+    an equally improbable one where the scatter is known from few points. `same_zero`: share that was measured with
+    today's zero of the gradienter, so that its error is in both; `other_zero_rad`: one sigma of the others' error.
+    """
 
     value: Vector
     variance: Vector
-    """Variance of today's bias about the prediction, without the gradienter's zero."""
     limit: float
-    """Limit of the gate in sigmas: 4, or an equally improbable one where the scatter is known from few points."""
     power_ups: int
     weighs: bool
     by_temperature: bool = False
     same_zero: float = 0.0
-    """Share that was measured with today's zero of the gradienter, so that its error is in both."""
     other_zero_rad: float = 0.0
-    """One sigma of the error from other zeros."""
 
 
 class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
-    """Predictions for one IMU."""
-
     name: str
     earlier: dict[Triad, Prediction | None] = {}
     today: dict[Triad, Prediction | None] = {}
     along: dict[Triad, Along | None] = {}
-    """Prediction by the curve for a window in which the temperature changed."""
     effect: PoseEffect | None = None
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """Predictions for all IMUs of a calibration."""
-
     imus: tuple[ExpectedImu, ...] = ()
     zero_is_known: bool = False
     """True if the sigma of the gradienter's zero was measured or configured, and is no cautious guess."""
@@ -241,7 +233,6 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
 
 
 def _states(groups: Sequence[Sequence[Point]]) -> list[Floats] | None:
-    """Give the temperature and its rate of every point by power-up, (n, 2) each; None: one is not known."""
     if any(point.temperature_degc is None for group in groups for point in group):
         return None
     return [np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64) for group in groups]
@@ -259,7 +250,6 @@ def _here(points: Sequence[Point], triad: Triad, up: Vector, effect: PoseEffect)
 
 
 def _zeros(points: Sequence[Point], share: Floats, today: str | None) -> tuple[float, float]:
-    """Give the share that was measured with today's zero, and one sigma of the error of the others."""
     shares = dict.fromkeys((point.zero for point in points), 0.0)
     for point, part in zip(points, share.tolist(), strict=True):
         shares[point.zero] += part

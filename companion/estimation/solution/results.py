@@ -11,7 +11,7 @@ import numpy as np
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import ImuRecord, PlatformTurn, Record
 from companion.estimation.solution.doubt import Doubt
-from companion.estimation.solution.solve import ImuSolution, Pair, Solution
+from companion.estimation.solution.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import TRIADS, Triad, Vector, rows_of
@@ -31,7 +31,7 @@ def record_of(
 
     `reason` None: the figures in words. `imus`: their records, where the plain ones of the solution are not all.
     """
-    imus = imu_records(solution, {}) if imus is None else tuple(imus)
+    imus = imu_records(solution) if imus is None else tuple(imus)
     standing = None
     if solution is not None:
         turn = solution.turn if solution.turn.is_told else None
@@ -55,14 +55,13 @@ def record_of(
     )
 
 
-def imu_records(solution: Solution | None, whole: Mapping[str, Pair]) -> tuple[ImuRecord, ...]:
-    """Build the records of all IMUs; `whole`: sums of residual and offsets, by IMU whose owner subtracts offsets."""
-    return () if solution is None else tuple(_imu(imu, whole.get(imu.name)) for imu in solution.imus)
+def imu_records(solution: Solution | None) -> tuple[ImuRecord, ...]:
+    return () if solution is None else tuple(_imu(imu) for imu in solution.imus)
 
 
-def _imu(estimate: ImuSolution, whole: Pair | None) -> ImuRecord:
-    gyro, accel = whole or estimate.biases
-    has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
+def _imu(estimate: ImuSolution) -> ImuRecord:
+    (gyro, accel), is_corrected = estimate.whole, estimate.subtracted is not None
+    has_gyro, has_accel = gyro is not None, accel is not None
     return ImuRecord(
         name=estimate.name,
         samples=estimate.samples,
@@ -76,8 +75,8 @@ def _imu(estimate: ImuSolution, whole: Pair | None) -> ImuRecord:
         covariance=_where_known(estimate.use_covariance, [has_gyro] * 3 + [has_accel] * 3),
         gyro_sigma_warm_up_rad_s=_axes(np.sqrt(estimate.warm_up_variance[:3]) if has_gyro else None),
         accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
-        residual_gyro_rad_s=_axes(estimate.gyro_rad_s if whole else None),
-        residual_accel_m_s2=_axes(estimate.accel_m_s2 if whole else None),
+        residual_gyro_rad_s=_axes(estimate.gyro_rad_s if is_corrected else None),
+        residual_accel_m_s2=_axes(estimate.accel_m_s2 if is_corrected else None),
         warnings=(*estimate.warnings, *estimate.drifting),
         prior=estimate.prior,
         effective=estimate.effective,
@@ -90,7 +89,6 @@ def _axes(values: Array | None) -> Vector | None:
 
 
 def unseen_turn(solution: Solution) -> tuple[str, ...]:
-    """Warn that a platform which turned from the start looks still without a compass."""
     if solution.platform == "deck" or all(imu.gyro_rad_s is None for imu in solution.imus):
         return ()
     turn = solution.turn
@@ -130,7 +128,6 @@ def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
 
 def points(
     solution: Solution,
-    whole: Mapping[str, Pair],
     doubts: Iterable[Doubt],
     *,
     started_at: str,
@@ -145,7 +142,7 @@ def points(
     common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
 
     def measured(imu: ImuSolution, triad: Triad) -> MeasuredBias | None:
-        bias = whole[imu.name][TRIADS.index(triad)]
+        bias = imu.whole[TRIADS.index(triad)]
         if bias is None:
             return None
         part = rows_of(triad)
@@ -165,16 +162,14 @@ def points(
             temperature_degc=imu.mean_degc,
             k_s=imu.k_s,
             up=_short(shared.up),
-            zero=zero if whole[imu.name][1] is not None else None,
+            zero=zero if imu.accel_m_s2 is not None else None,
             zero_sigma_rad=shared.zero_sigma_rad,
             gyro=measured(imu, "gyro"),
             accel=measured(imu, "accel"),
         )
         for imu in solution.imus
-        if imu.name in whole
     }
 
 
 def _short(values: Array) -> Vector:
-    """Round to 9 decimals, 2e-4 deg/h."""
     return vector(np.round(values, 9))

@@ -48,8 +48,6 @@ IN_CONFIGURATION: Final = Remedies()
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Whereabouts:
-    """Place and date, and their source ("configuration", "autopilot", ...)."""
-
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     height_m: float | None = None
@@ -70,7 +68,6 @@ class LocalEarth:
     declination_sigma_deg: float
     warnings: tuple[str, ...]
     field: earth.MagneticField | None = None
-    """The Earth's magnetic field by its model; None without position and date."""
     remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> tuple[Array, Matrix]:
@@ -84,7 +81,6 @@ class LocalEarth:
 
 
 def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:
-    """Compute everything that the equations need of a place."""
     warnings: list[str] = []
     covariance, gravity, field = np.zeros((3, 3)), None, None
     if where.latitude_deg is None:

@@ -20,11 +20,11 @@ import numpy as np
 
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.warming import Warming
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, SiteRecord, WhenWarm
-from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Remedies
 from companion.estimation.solution.truth import NOTHING, Otherwise, Truth, truth_of
 from companion.estimation.stillness.plausible import implausible
@@ -46,8 +46,10 @@ _ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks
 class ImuSolution:
     """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, (3,); None: not asked for or unknown.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes. A warm-up is not in
-    it, as that moves the bias under old and new offsets alike. `temperature_degc` and its rate are those of the end.
+    The whole bias is that of the sensor without any offset: the residual and what an autopilot has `subtracted`.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, `sigma_stat` (6,)
+    what averaging left. A warm-up is not in it, as that moves the bias under old and new offsets alike.
+    `temperature_degc` and its rate are those of the end. `drifting`: words on its drift, or on its biases when warm.
     """
 
     name: str
@@ -56,11 +58,11 @@ class ImuSolution:
     gyro_rad_s: Array | None
     accel_m_s2: Array | None
     sigma_stat: Array
-    """Sigma that averaging left, (6,), in the order of the covariance."""
     covariance: Matrix
     warnings: tuple[str, ...]
+    subtracted: Array | None = None
+    """Offsets in force, (6,), in the order of the covariance; None: nobody subtracts any from this output."""
     drifting: tuple[str, ...] = ()
-    """Words on its drift, or on its biases when warm."""
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     k_s: float = 0.0
     warming: Warming | None = None
@@ -70,26 +72,29 @@ class ImuSolution:
 
     @property
     def biases(self) -> Pair:
-        """Both biases."""
         return self.gyro_rad_s, self.accel_m_s2
 
+    @property
+    def whole(self) -> Pair:
+        return self.biases if self.subtracted is None else _moved(self.biases, self.subtracted)
+
+    def shifted(self, by: Array) -> ImuSolution:
+        gyro, accel = _moved(self.biases, by)
+        return dataclasses.replace(self, gyro_rad_s=gyro, accel_m_s2=accel)
+
     def own_variance(self, shared: Shared) -> Array:
-        """Give the variance of the sensor alone, (6,)."""
         return np.maximum(np.diag(self.covariance) - np.diag(shared.covariance), 0.0)
 
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
-        """One sigma per axis, shape (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[:3])
 
     @property
     def accel_sigma_use_m_s2(self) -> Array:
-        """One sigma per axis, shape (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[3:])
 
     @property
     def mean_degc(self) -> float | None:
-        """Mean temperature over the window."""
         path = None if self.warming is None else self.warming.path
         return self.temperature_degc if path is None else path.mean_degc
 
@@ -101,21 +106,21 @@ class ImuSolution:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Shared:
-    """The errors that all IMUs of one stretch have in common: one attitude, one gravity, one Earth's rate."""
+    """The errors that all IMUs of one stretch have in common: one attitude, one gravity, one Earth's rate.
+
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of every IMU's own and that of any two.
+    """
 
     up: Array
     gravity_m_s2: float
     covariance: Matrix
-    """6x6 (gyro rad/s, accelerometer m/s^2), part of every IMU's own and that of any two."""
     by_reading: Matrix | None
     """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
     zero_sigma_rad: float
-    """One sigma of the gradienter's zero, the same in every calibration."""
 
     @property
     def by_zero(self) -> Matrix:
-        """One sigma of the accelerometer biases by each axis of the gradienter's zero, (3, 2)."""
         return self.tilted(self.zero_sigma_rad)
 
     def tilted(self, sigma_rad: float | Array) -> Matrix:
@@ -125,8 +130,6 @@ class Shared:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The biases of all IMUs from one still stretch."""
-
     pose: Pose
     site: SiteRecord
     imus: tuple[ImuSolution, ...]
@@ -138,7 +141,6 @@ class Solution:
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
     doubts: tuple[Doubt, ...] = ()
-    """Contradictions to earlier calibrations."""
 
     @property
     def doubted(self) -> dict[tuple[str, Triad], Doubt]:
@@ -150,8 +152,7 @@ class Solution:
         }
 
 
-def moved(biases: Pair, shift: Array) -> Pair:
-    """Add a shift, (6,), to the biases that are known."""
+def _moved(biases: Pair, shift: Array) -> Pair:
     gyro, accel = (
         None if bias is None else bias + part for bias, part in zip(biases, (shift[:3], shift[3:]), strict=True)
     )
@@ -316,7 +317,6 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
-    """Give the Earth's rate in the gyro means: all of it, or the part that turning left."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)

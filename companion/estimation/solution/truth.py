@@ -24,8 +24,8 @@ from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import HeadingFrom, Magnetic, TiltFrom
 from companion.estimation.solution import magnetic
+from companion.estimation.solution.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.estimation.solution.site import LocalEarth
-from companion.estimation.temperature.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, symmetric_by
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
@@ -33,7 +33,6 @@ from companion.physics.units import DEG, MG
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
 UNKNOWN_K: Final = 5.0
-"""Assumed change of an unknown temperature."""
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
@@ -41,17 +40,12 @@ LENGTH_SIGMAS: Final = 4.0
 
 
 class OwnHeading(msgspec.Struct, frozen=True):
-    """The autopilot's yaw, clockwise from true north."""
-
     heading_deg: float
     sigma_deg: float
 
 
 class Otherwise(msgspec.Struct, frozen=True, kw_only=True):
-    """Fallbacks for a missing gradienter or compass."""
-
     sides: dict[str, Sides] = {}
-    """Figures of the accelerometers from all sides, by IMU."""
     heading: OwnHeading | None = None
 
 
@@ -60,32 +54,30 @@ NOTHING: Final = Otherwise()
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Reference for the sensors."""
+    """Reference for the sensors: up and attitude error in vehicle FRD, (3, 3).
+
+    `tilt_from` None: from accelerometers of unknown bias. `reading_sigma_rad`: of the gradienter's means, without its
+    zero.
+    """
 
     up: Array
     up_covariance: Matrix
     attitude_covariance_rad2: Matrix
-    """(3, 3) in vehicle FRD."""
     up_by_reading: Matrix | None
     """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
-    """Sigma of the gradienter's two means, without its zero."""
     tilt_from: TiltFrom | None
-    """None: from accelerometers of unknown bias."""
     heading_rad: float | None = None
     heading_sigma_rad: float | None = None
     heading_from: HeadingFrom | None = None
     magnetic: Magnetic | None = None
-    """Quality of the heading by the compass' field and steadiness; None without a compass."""
 
     @property
     def body_from_ned(self) -> Matrix:
-        """The attitude; heading north where the heading is unknown."""
         gamma, theta = roll_pitch_from_up(self.up)
         return body_from_ned(gamma, theta, self.heading_rad or 0.0)
 
     def earth_rate(self, local: LocalEarth) -> tuple[Array, Matrix]:
-        """Give the Earth's rate in the vehicle's axes, and its covariance."""
         return local.rate_in_body(self.body_from_ned, heading_known=self.heading_rad is not None)
 
 
@@ -208,7 +200,6 @@ def _up_by_sides(
 
 
 def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
-    """Give the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
     figures, turn = known.figures, known.vehicle_from_sensor
     inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])

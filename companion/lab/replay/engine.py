@@ -7,6 +7,7 @@ power-ups had told, and all that only the autopilot can tell: what was written a
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import math
 from collections.abc import Iterable
@@ -17,20 +18,19 @@ import msgspec
 import numpy as np
 
 from companion import __version__
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.configured import models
 from companion.configured.models import aligned, collect
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.records.record import AlignmentUsed, Record, from_json
-from companion.estimation.request import What
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.results import imu_records, record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.lab.logs.recording import UNUSABLE, Head, Playback, Recording, config_of
-from companion.physics.frames import Array
 from companion.recording import messages
 from companion.recording.messages import ImuState, Measured, Solved, Start, decode
 
@@ -167,14 +167,16 @@ class Replay:
                 What[detail.what], config.vehicle.platform, any_bias=config.calibration.any_bias,
                 otherwise=detail.otherwise,
             )  # fmt: skip
-            whole = {found.name: self._whole(found) for found in solution.imus}
-            self._solution = weigh(solution, whole, detail.expectation)
+            imus = tuple(map(self._with_offsets, solution.imus))
+            self._solution = weigh(dataclasses.replace(solution, imus=imus), detail.expectation)
         except CalibrationRefusedError as error:
             self._not_recomputed = f"refused here: {error}"
 
-    def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
-        calibration = self._offsets.get(found.name)
-        return (found.gyro_rad_s, found.accel_m_s2) if calibration is None else whole_of(calibration, found)
+    def _with_offsets(self, imu: ImuSolution) -> ImuSolution:
+        calibration = self._offsets.get(imu.name)
+        if calibration is None:
+            return imu
+        return dataclasses.replace(imu, subtracted=calibration.subtracted(imu.temperature_degc))
 
     def _compare(self, recorded: Record) -> Replayed:
         """Compare a recorded calibration with its replay; the record takes from it what only the autopilot can tell."""
@@ -183,13 +185,11 @@ class Replay:
             return Replayed(recorded, [], None, "it ended before anything was worked out")
         if solution is None:
             return Replayed(recorded, [], None, self._not_recomputed)
-        corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
         began, seconds = datetime.datetime.fromisoformat(recorded.started_at), recorded.duration_s
-        whole = {found.name: self._whole(found) for found in solution.imus if found.name in corrected}
         earlier = {imu.name: imu for imu in recorded.imus}
         imus = tuple(
             msgspec.structs.replace(imu, written=was.written, gyro_id=was.gyro_id, accel_id=was.accel_id)
-            for imu, was in ((imu, earlier[imu.name]) for imu in imu_records(solution, whole) if imu.name in earlier)
+            for imu, was in ((imu, earlier[imu.name]) for imu in imu_records(solution) if imu.name in earlier)
         )
         again = record_of(solution, began, seconds, state=recorded.state, reason=recorded.reason, imus=imus)
         again = msgspec.structs.replace(again, system_id=recorded.system_id, alignment=recorded.alignment)

@@ -18,11 +18,11 @@ from companion.errors import CalibrationRefusedError, StorageError
 from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
-from companion.estimation.request import What
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Remedies, Whereabouts, local_earth
 from companion.estimation.solution.solve import solve

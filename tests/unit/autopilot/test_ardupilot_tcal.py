@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware.ardupilot import ArduPilotParameters
-from companion.autopilot.firmware.imu_calibration import whole_bias
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
+from companion.estimation.solution.curve import Polynomial, of_curve
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.temperature.curve import Polynomial, of_curve
 from tests.unit.autopilot.test_ardupilot import IMU1, read
 
 ON: dict[str, float] = dict.fromkeys(ArduPilotParameters(1).tcal, 0.0) | {
@@ -44,11 +43,11 @@ def test_what_is_taken_off_at_a_temperature(
     np.testing.assert_allclose(found[0], gyro, atol=1e-9)
     np.testing.assert_allclose(found[1], accel, atol=1e-7)
     # Nothing left in the output: the whole is what is taken off. Board x is the vehicle's y; scales come last.
-    (x, y, z), force = whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), degc)
+    x, y, z, *force = calibration.subtracted(degc)
     assert (y, -x, z) == pytest.approx((0.001 + gyro[0], 0.002 + gyro[1], 0.003 + gyro[2]), abs=1e-9)
     assert force[2] == pytest.approx(1.1 * (0.3 + accel[2]), abs=1e-6)
     # Without a thermometer it is that at CALTEMP.
-    assert whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None)[0] == pytest.approx((-0.002, 0.001, 0.003))
+    assert calibration.subtracted(None)[:3] == pytest.approx((-0.002, 0.001, 0.003))
 
 
 def test_switched_off_it_takes_nothing_off_whatever_the_rest_says() -> None:

@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import Refusal
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,

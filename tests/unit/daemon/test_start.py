@@ -14,7 +14,7 @@ import pytest
 
 from companion.config import parse
 from companion.daemon.job import Job
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from tests.bench_start import FULL, MINIMAL
 from tests.support.first_heartbeat import modules_at_first_heartbeat
 from tests.support.rig import Rig

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, align, in_words
-from companion.estimation.alignment.align_model import Ground, ImuStand, Priors, StandMeans
+from companion.estimation.alignment.align_model import Ground, Priors, StandMeans
 from companion.physics.frames import rotation_matrix
 from companion.physics.gradienter import Law
 from companion.physics.units import DEG, DEG_H, MG
@@ -18,6 +18,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import angles_of, axis_rotation, body_from_ned
 from sim.scenario import site_at
+from tests.support.windows import imu_means
 
 Floats = NDArray[np.float64]
 
@@ -59,18 +60,12 @@ class World:
         device = Gradienter(aircraft, law=self.law, mounting_deg=self.mounting_deg)
         x, y = device.tilt_deg(np.array([0.0]))[0] + self.zero_deg + self.noise(self.reading_deg, 2)
         force = self.stretch @ self.imu_from_gradienter @ truth.force_m_s2 + self.accel_bias
+        force += self.noise(self.accel_ug * UG, 3)
+        rate = truth.rate_rad_s + self.gyro_bias + self.noise(self.gyro_deg_h * DEG_H, 3)
         # Where the nose points up a heading says nothing.
         heading_sigma = self.heading_deg if abs(pitch) < 70 * DEG else 90.0
         return StandMeans(
-            imus=(
-                ImuStand(
-                    "fc",
-                    force + self.noise(self.accel_ug * UG, 3),
-                    np.full(3, self.accel_ug * UG),
-                    truth.rate_rad_s + self.gyro_bias + self.noise(self.gyro_deg_h * DEG_H, 3),
-                    np.full(3, self.gyro_deg_h * DEG_H),
-                ),
-            ),
+            imus=(imu_means(rate, self.gyro_deg_h * DEG_H, force, self.accel_ug * UG),),
             tilt_deg=(float(x), float(y)) if in_range else None,
             tilt_sigma_deg=(self.reading_deg, self.reading_deg),
             heading_rad=heading + float(self.noise(self.heading_deg * DEG, 1)[0]),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from companion.estimation.records.history import PowerUp
-from companion.estimation.solution.joint import Whole, weigh
+from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
 from companion.estimation.solution.results import points
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
@@ -47,12 +47,8 @@ def imus(
     ]
 
 
-def whole_of(of: Solution) -> Whole:
-    return {imu.name: (imu.gyro_rad_s, imu.accel_m_s2) for imu in of.imus}
-
-
 def weighed(of: Solution, known: Sequence[ExpectedImu]) -> Solution:
-    return weigh(of, whole_of(of), Expectation(imus=tuple(known), zero_is_known=True))
+    return weigh(of, Expectation(imus=tuple(known), zero_is_known=True))
 
 
 def accel_of(imu: ImuSolution) -> Array:
@@ -128,8 +124,8 @@ def test_a_cautious_sigma_of_the_zero_is_no_reason_to_believe_the_past() -> None
     shared = shared_errors(ZERO_RAD)
     of = solution(imus([np.array([1.5, 0.0, 0.0]) * MG], shared), shared)
     known = (ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.4 * MG, other_zero_rad=0.01 * DEG)}),)
-    guessed = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=False))
-    vouched = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=True))
+    guessed = weigh(of, Expectation(imus=known, zero_is_known=False))
+    vouched = weigh(of, Expectation(imus=known, zero_is_known=True))
     assert accel_of(guessed.imus[0])[0] > 1.49 * MG
     assert accel_of(vouched.imus[0])[0] < 0.2 * MG
 
@@ -253,7 +249,6 @@ def test_what_is_remembered_is_what_was_measured_not_what_became_of_it() -> None
     assert abs(accel_of(found.imus[0])[0]) < 0.9 * MG
     kept = points(
         of,
-        whole_of(of),
         found.doubts,
         started_at="now",
         unix_s=1.0,

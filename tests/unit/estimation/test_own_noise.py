@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.estimation.stillness.gates import ImuGate

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.estimation.alignment.align import Alignment, Complaint, in_words, turned
-from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
+from companion.estimation.alignment.align_model import Ground, StandMeans
 from companion.estimation.alignment.faces import Sides, faces, mounting
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
@@ -19,6 +19,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.hands import Hands
 from sim.imu_model import ImuModel
 from sim.scenario import site_at
+from tests.support.windows import imu_means
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ def on_spot(
         if k:
             t_s = hands.turn(t_s, heading - headings_deg[k - 1])
         read = imu.expected(t_s + 1.0)
-        means = ImuStand("fc", read[3:], np.full(3, SIGMA), read[:3], np.full(3, 5.0 * DEG_H))
+        means = imu_means(read[:3], 5.0 * DEG_H, read[3:], SIGMA)
         sigma_rad = (0.15 if k else 0.01) * DEG
         turned_rad = heading * counted * DEG
         stands.append(StandMeans((means,), None, (1.0, 1.0), turned_rad, sigma_rad, on_spot=True, counted=k > 0))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import kept
+from companion.estimation.solution.curve import Curve, PowerUpNodes, fit, settling
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.temperature.curve import Curve, PowerUpNodes, fit, settling
 from sim.accuracy.temperature import RATES_K_MIN, SPANS_S, AgingAircraft, mid_warm_up
 from sim.imu_model import DEG_H, PARTS
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import BIAS, Sides, faces
+from companion.estimation.machine import What
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
-from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
 from companion.estimation.solution.truth import Otherwise, OwnHeading, aged_m_s2

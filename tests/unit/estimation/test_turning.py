@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.noise.slope import fit_slope
-from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.estimation.turning.turn import Turn

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import Severity, Weight
 from companion.errors import ConfigError, NobodyHeardError
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from companion.ground.heard import Address
 from companion.ground.link import GroundLink
 from companion.ground.station import Display, Station

@@ -12,7 +12,7 @@ import pytest
 
 from companion.commands import Calibrate, Cancel, Undo
 from companion.component.commands import Refused, Request, judge
-from companion.estimation.request import What
+from companion.estimation.machine import What
 from tests.support.component import command_long
 
 SCRIPT = Path(__file__).parents[3] / "docs/ground_stations/mission_planner_companion.py"

@@ -41,7 +41,6 @@ LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
 """Kelvins beyond the temperatures seen within which the model is valid (method 3.3)."""
 FEWEST: Final = 3
-"""Least power-ups of a fit, and of a guard."""
 _CUBIC: Final = 3
 _BETTER: Final = 0.9
 """Largest mean square error of a cubic, as a share of that of a mean, at which the cubic is used."""
@@ -51,17 +50,14 @@ _RANGE: Final = 18.0
 """Half the search range of the logarithm of the scatter's variance, about that of a kelvin."""
 _HALVINGS: Final = 25
 _SURELY: Final = 2.0
-"""Sigmas beyond which an error is not chance."""
 _LITTLE: Final = 1e-6
 """Lower bounds of variances, as shares of that of a kelvin and of that of the noise."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """Prior sigma of each coefficient, in kelvins of the slope of parts."""
 _SLOWED_K_S: Final = 0.25 / 60.0
-"""Least slowing of a warm-up that tells where it ends."""
 _TAU_SIGMA: Final = 0.05
 """Least sigma of tau as a share of it: boards have more than one time constant."""
 _WARM_AFTER: Final = 5.0
-"""Time constants after which a board is warm."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 _END_LESS_MEAN: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
@@ -73,13 +69,14 @@ CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2
 
 
 class PowerUpNodes(NamedTuple):
-    """Still seconds of one power-up, a row for each temperature; vehicle FRD, rad/s or m/s^2."""
+    """Still seconds of one power-up, n rows; vehicle FRD, rad/s or m/s^2.
+
+    `states` (n, 2): temperature in degC and its rate in K/s. `variance` (n,): white noise, mean over the axes.
+    """
 
     states: Floats
-    """(n, 2): temperature in degC and its rate in K/s."""
     bias: Floats
     variance: Floats
-    """(n,): variance of the white noise, mean over the axes."""
     common_variance: float = 0.0
     """Variance of an error that all rows share; it lowers the weight."""
 
@@ -93,44 +90,43 @@ class Warm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Along(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one triad's bias within one window; vehicle FRD, rad/s or m/s^2, and those a second."""
+    """Prediction of one triad's bias within one window; vehicle FRD, rad/s or m/s^2, and those a second.
+
+    `shift`: bias at the end less the mean over the window. `warm` None: the end of the warm-up is unknown, or beyond
+    the temperatures seen.
+    """
 
     shift: Vector
-    """Bias at the end less the mean over the window."""
     shift_variance: Vector
     slope: Vector
     slope_variance: Vector
     warm: Warm | None = None
-    """None: the end of the warm-up is unknown, or beyond the temperatures seen."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """Model of the next power-up's bias over temperature, vehicle FRD, rad/s or m/s^2."""
+    """Model of the next power-up's bias over temperature, vehicle FRD, rad/s or m/s^2; factors and variances (3,).
+
+    `order` 0: a mean; 3: a cubic. `covariance` of the coefficients is for an axis with the usual scatter, `widening`
+    the factor for each axis, `of_changes` that for changes within a power-up. `unexplained`: share of the changes, in
+    squares, that neither the model nor chance explains. `scatter`: variance of one more power-up, wandering included.
+    """
 
     order: int
-    """0: a mean; 3: a cubic."""
     lag_s: float
     coefficients: Matrix
     covariance: Matrix
-    """Covariance of the coefficients, for an axis with the usual scatter."""
     widening: Array
-    """Factor on the covariance for each axis, (3,)."""
     of_changes: Array
-    """Factor on the covariance for changes within a power-up, (3,)."""
     unexplained: float
-    """Share of the changes, in squares, that the model does not explain and that is not chance."""
     scatter: Array
-    """Variance of one more power-up about the model, wandering included, (3,)."""
     mean_square_error: float
     shares: Array
     freedom: float
     span_degc: tuple[float, float]
     per_kelvin: float
-    """One sigma of the change per kelvin beyond them."""
 
     def beyond_k(self, degc: float) -> float:
-        """Give the kelvins by which a temperature lies beyond the valid range."""
         return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
 
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
@@ -302,7 +298,6 @@ class _Fit:
         )
 
     def _scatter(self) -> float:
-        """Find the scatter with which the actual mean square of the prediction errors is the predicted one."""
         unit = math.log(self._per_kelvin**2)
         low, high = unit - _RANGE, unit + _RANGE
         for _ in range(_HALVINGS):
@@ -314,7 +309,6 @@ class _Fit:
         return math.exp(high)
 
     def _equations(self, scatter: float) -> tuple[Floats, Floats, Floats]:
-        """Give the weights of the power-ups' means, and the normal equations of each."""
         weight = 1.0 / (scatter + self._variance)
         by = weight[:, None, None]
         return weight, self._within + by * self._between, self._within_right + by * self._between_right
@@ -333,7 +327,6 @@ class _Fit:
 
 
 def _over(error: Floats, variance: Floats) -> Floats:
-    """Give the actual over the predicted mean square error of each axis, (3,)."""
     return np.asarray((error * error / variance[:, None]).sum(axis=0) / len(error))
 
 
@@ -355,7 +348,6 @@ class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
     high_degc: float = math.inf
 
     def at(self, degc: float) -> Array:
-        """Return the bias at a temperature, (3,)."""
         d = min(max(degc, self.low_degc), self.high_degc) - self.reference_degc
         c0, c1, c2, c3 = np.array(self.coefficients)
         value: Array = c0 + (c1 + (c2 + c3 * d) * d) * d
