@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
-from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.machine import What
 from companion.estimation.means.windows import ImuInput

@@ -24,7 +24,7 @@ from companion.config.sections import (
     Parity,
     Profile,
 )
-from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.deck.deck import KEPT_S, Deck
 from companion.estimation.means.pose import CompassModel, GradienterModel

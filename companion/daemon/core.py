@@ -14,7 +14,7 @@ from companion.component.statustext import Severity, StatusText, Tune, Tunes, We
 from companion.config.sections import AtArm, Config
 from companion.configured import models
 from companion.configured.models import Profiles
-from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.intake import Settings
 from companion.estimation.machine import Machine
 from companion.estimation.means.windows import Window
 from companion.estimation.solution.site import LocalEarth, local_earth

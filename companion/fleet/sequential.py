@@ -17,7 +17,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.estimation.noise.robust import HUBER_C
+from companion.estimation.noise.lines import HUBER_C
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
 

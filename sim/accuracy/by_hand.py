@@ -13,7 +13,7 @@ import numpy as np
 from companion.estimation.alignment.align import turned
 from companion.estimation.alignment.align_model import Ground, StandMeans
 from companion.estimation.alignment.faces import Face, Sides, faces, mounting
-from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.windows import ImuInput, ImuWindow
 from companion.estimation.noise.allan import noise_profile

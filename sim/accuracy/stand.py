@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.outlook import CollectorStatus
+from companion.estimation.collector.intake import CollectorStatus
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.noise.robust import huber_mean
+from companion.estimation.noise.lines import huber_mean
 from companion.estimation.seconds.batch import BatchSource
 from companion.samples import CompassSample, ImuSample, TiltSample
 from tests.support import still_aircraft as still

@@ -19,7 +19,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
 from companion.errors import AutopilotError, CalibrationRefusedError
-from companion.estimation.collector.outlook import CollectorStatus
+from companion.estimation.collector.intake import CollectorStatus
 from companion.estimation.machine import Event, State, What
 from companion.estimation.means.windows import Window
 from companion.estimation.solution.site import Whereabouts, local_earth

@@ -1,4 +1,4 @@
-"""One stream into the collector: its seconds, its gate and its verdict.
+"""Streams into the collector, each with its seconds, gate and verdict; and the types of the collector's state.
 
 A gradienter, or a compass that averages, goes on moving after the aircraft has stopped: both follow the truth with a
 time constant; the fluid of a field gradienter keeps a tenth of its error after every second (BEI INC manual; sensors
@@ -27,33 +27,136 @@ Kind = Literal["imu", "gradienter", "compass"]
 PoseKind = Literal["gradienter", "compass"]
 
 _SILENT_S: Final = 2.5
-_CARRY: Final = 2
-"""Seconds for which a slow gradienter's or compass' last reading stands."""
-_LONGEST_UP_S: Final = 3e8
-"""A longer time since power-up counts from somewhere else, such as UTC."""
+_LONGEST_UP_S: Final = 3e8  # A longer time since power-up counts from somewhere else, such as UTC
 LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
 _LIMITS_TILT: Final = (180.0,) * 2
 _LIMITS_HEADING: Final = (1e3,)
-
-
-OFF_DEG: Final = 5.0
-"""Largest error that a movement leaves in a pose sensor."""
+OFF_DEG: Final = 5.0  # Largest error that a movement leaves in a pose sensor
 _SHARE: Final = 0.1
+
+LOWEST_DEGC: Final = -40.0
+HIGHEST_DEGC: Final = 105.0
+_NONE_AFTER_S: Final = 10
+_ADJACENT_S: Final = 3
+JUMP_K: Final = 5.0  # Change within a second that no board makes
+_JUMPS: Final = 2
+_WITHIN_S: Final = 600
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    """Lengths and targets of a calibration; a target that is not wanted is `math.inf`."""
+
+    min_still_s: float
+    max_s: float
+    target_gyro_sigma_rad_s: float
+    target_accel_sigma_m_s2: float
+    horizon_s: float = 180.0
+
+    @property
+    def min_slots(self) -> int:
+        return max(math.ceil(self.min_still_s), 1)
+
+    @property
+    def max_slots(self) -> int:
+        return max(math.floor(self.max_s), self.min_slots)
+
+
+class CollectorObstacle(msgspec.Struct, frozen=True):
+    """Reason why nothing can be measured now: a movement, which a hand can end, or a fault."""
+
+    words: str
+    moving: bool = False
+    hold_still_s: int | None = None
+    """Seconds to stand still yet, where nothing else is missing."""
 
 
 class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one source."""
+    """State of one source; `words` say why it is not still.
+
+    `rate_hz` is the number of samples in its last whole second; `lost` those that never came, by the device's counter
+    or clock.
+    """
 
     kind: Kind
     name: str
     still: bool
     words: str
-    """Reason for not being still; empty when still."""
     rate_hz: int
-    """Samples in its last whole second."""
     dropped: dict[str, int]
     lost: int
-    """Samples that never came, by the device's counter or clock."""
+
+
+class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """State of the collector; a glance leaves out what an estimate tells.
+
+    `still_s` counts the good seconds, common to all sources, of the stretch under way, and `steady_s` those without a
+    bad one until now; a window is possible after `hold_still_s` more. `enough`: more seconds would not better the
+    result; `progress` (0..1) leads there. `measuring`: words for a measurement under way; `left`: their part on how
+    much longer it takes, where that is minutes.
+    """
+
+    still_s: float
+    steady_s: float
+    good_now: bool
+    hold_still_s: int = 0
+    obstacle: CollectorObstacle | None = None
+    """A movement now, or a source that is silent or stuck; by an estimate, too, what it still waits for."""
+    enough: bool = False
+    progress: float = 0.0
+    sources: tuple[SourceStatus, ...] = ()
+    measuring: str = ""
+    left: str = ""
+
+    @property
+    def waiting_for(self) -> str | None:
+        return None if self.obstacle is None else self.obstacle.words
+
+    @property
+    def moving(self) -> bool:
+        return self.obstacle is not None and self.obstacle.moving
+
+    @property
+    def moves(self) -> str | None:
+        """Words for a movement at this moment; None where nothing moves."""
+        found = self.obstacle
+        return found.words if found is not None and found.moving and found.hold_still_s is None else None
+
+
+class Thermometer:
+    """Checks an IMU's thermometer, second by second.
+
+    One that is in another unit or jumps is not believed: then the IMU counts as one without a thermometer. A constant
+    reading is no fault: a board comes to rest at some temperature, and a heater holds its IMU warm.
+    """
+
+    def __init__(self) -> None:
+        self._begin(math.inf)
+
+    def _begin(self, slot: float) -> None:
+        self.none = False
+        self.wrong = ""
+        """Reason in one line why it is not believed; empty: it is, or there is none."""
+        self._slot = slot
+        self._degc: float | None = None
+        self._jumps: deque[float] = deque(maxlen=_JUMPS)
+
+    def believed(self, slot: int, degc: float | None) -> float | None:
+        if slot < self._slot:
+            self._begin(slot)
+        if degc is None or not math.isfinite(degc):
+            self.none = slot - self._slot >= _NONE_AFTER_S
+            return None
+        jumped = self._degc is not None and abs(degc - self._degc) > JUMP_K and slot - self._slot <= _ADJACENT_S
+        if jumped:
+            self._jumps.append(slot)
+        self._slot, self._degc, self.none, wrong = slot, degc, False, ""
+        if not LOWEST_DEGC <= degc <= HIGHEST_DEGC:
+            allowed = f"{LOWEST_DEGC:g} to {HIGHEST_DEGC:g} degC"
+            wrong = f"shows {degc:.2f}, allowed {allowed}: in another unit?"
+        elif len(self._jumps) == _JUMPS and slot - self._jumps[0] <= _WITHIN_S:
+            wrong = f"jumps: more than {JUMP_K:g} K within a second, again and again"
+        self.wrong = f"its thermometer {wrong}; nothing is learned by it" if wrong else ""
+        return None if wrong or jumped else degc
 
 
 class Settling:
@@ -64,11 +167,9 @@ class Settling:
 
     def __init__(self, lag_s: float, sigma_deg: float) -> None:
         self.left_s = 0
-        """Seconds until its readings count again, as of the last second judged."""
         # Without a lag nothing follows, however exact the sensor is said to be.
         self._tail_s = math.ceil(lag_s * math.log(max(OFF_DEG / (_SHARE * sigma_deg), 1.0))) if lag_s > 0.0 else 0
         self._moved: int | None = None
-        """Last second in which the aircraft moved."""
 
     def judge(self, slot: int, *, moved: bool) -> bool:
         """Judge whether the second counts, seconds ascending; `moved`: the IMUs were not still."""
@@ -81,24 +182,19 @@ class Settling:
 class Source:
     """One stream: its batches, its gate, its last verdict."""
 
-    hint = ""
-    """Reason for silence, where it is known."""
+    carry = 0  # Seconds for which the last reading stands
 
     def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
         self.kind, self.name, self.batches, self.gate = kind, name, batches, gate
         self.verdict = GateVerdict(still=False)
-        self.settling: Settling | None = None
-        self.unsettled: deque[int] = deque(maxlen=0)
-        """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
+        self.hint = ""
 
     @property
     def label(self) -> str:
-        """Name for a pilot."""
         return f"imu {self.name}" if self.kind == "imu" else self.name
 
     @property
     def newest(self) -> Batch | None:
-        """The last whole second."""
         return next(reversed(self.batches.batches.values()), None)
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
@@ -106,11 +202,8 @@ class Source:
 
         `may_move`: only a fault of the source counts against it.
         """
-        # A slow pose sensor's last batch counts for a short while.
-        first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
-        batch = next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
-        if self.settling is not None and not self.settling.judge(slot, moved=moved):
-            self.unsettled.append(slot)
+        batches = self.batches.batches
+        batch = next((batches[at] for at in range(slot, slot - self.carry - 1, -1) if at in batches), None)
         if batch is None:
             # Before the first whole second there is nothing to complain about.
             words = f"{self.label} was silent for a second" if batches else ""
@@ -122,32 +215,14 @@ class Source:
 
     def accept(self, slot: int) -> None:
         """Let the gate learn from a second in which every source was still."""
-        batch = self.batches.batches.get(slot)
-        if batch is not None and (self.kind == "imu" or slot not in self.unsettled):
+        if (batch := self.batches.batches.get(slot)) is not None:
             self.gate.accept(batch)
 
     def forget(self) -> None:
-        """Drop the seconds so far."""
         self.batches.forget()
         self.verdict = GateVerdict(still=False)
-        if isinstance(self.gate, ImuGate):
-            self.gate.forget_level()
-
-    def settled(self, slots: Sequence[int]) -> list[Batch]:
-        """Return the batches of these seconds that no longer follow a movement."""
-        batches, unsettled = self.batches.batches, frozenset(self.unsettled)
-        return [batches[slot] for slot in slots if slot in batches and slot not in unsettled]
-
-    def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
-        """Say how long its mean over these seconds and the next `left_s` has to wait after a movement, if at all."""
-        unsettled = sum(slot in self.unsettled for slot in slots) if self.unsettled else 0
-        needed -= len(slots) - unsettled
-        if self.settling is None or unsettled == 0 or needed <= 0 or self.settling.left_s + needed <= left_s:
-            return None
-        return f"{self.label} settles: {self.settling.left_s + needed} s more"
 
     def silence(self, now_s: float) -> str | None:
-        """Return one line when nothing comes; None when data flows."""
         last = self.batches.last_s
         if last is None:
             return self.hint or f"no data from {self.label} yet"
@@ -156,7 +231,6 @@ class Source:
         return None
 
     def status(self, now_s: float) -> SourceStatus:
-        """Return the state to show."""
         silence, newest = self.silence(now_s), self.newest
         return SourceStatus(
             kind=self.kind,
@@ -170,46 +244,39 @@ class Source:
 
 
 class ImuSource(Source):
-    """The stream of one IMU, with what is known of its device."""
+    gate: ImuGate
 
     def __init__(self, imu: ImuInput, keep: int) -> None:
-        batches = BatchSource(LIMITS_IMU, keep, steps=imu.steps)
-        super().__init__("imu", imu.name, batches, _gate(imu))
+        super().__init__("imu", imu.name, BatchSource(LIMITS_IMU, keep, steps=imu.steps), _gate(imu))
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
         """Means that come beside a stream of integers, in floats."""
         self._raw_count = 0
         self.counter: TurnCounter | None = None
-        """Set while turns on a spot are counted."""
         self._breaks = 0
         self._restarted_s = -math.inf
         self._up: tuple[float, float] | None = None
         """A time, and the time since power-up by then, where the device tells."""
 
     def replace(self, imu: ImuInput) -> None:
-        """Set the new kind of the stream."""
-        self.imu, self.gate = imu, _gate(imu)
-        self.batches.steps = imu.steps
+        self.imu, self.gate, self.batches.steps = imu, _gate(imu), imu.steps
 
     def add_raw(self, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
-        """Add a mean that tells more than the stream."""
         self._raw_count += 1
         self.raw.add(t_s, row, temperature_degc, float(self._raw_count))
 
     def forget(self) -> None:
-        """Drop the seconds so far."""
         super().forget()
         self.raw.forget()
+        self.gate.forget_level()
 
     def has_restarted(self, sample: ImuSample) -> bool:
-        """Return whether the stream was interrupted just before a sample."""
         if sample.breaks == self._breaks:
             return False
         self._breaks, self._restarted_s = sample.breaks, sample.t_s
         return True
 
     def add(self, sample: ImuSample) -> bool:
-        """Add a sample; return whether a second may have ended."""
         if self.counter is not None:
             self.counter.add(sample)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
@@ -232,7 +299,6 @@ class ImuSource(Source):
 
     @property
     def up_s(self) -> float | None:
-        """Time since power-up by the latest sample; None where the device does not tell."""
         return None if self._up is None else self._up[1]
 
     def forces_m_s2(self, start_s: float, end_s: float) -> list[Array]:
@@ -241,7 +307,6 @@ class ImuSource(Source):
         return [batches[slot].mean[3:] for slot in sorted(batches) if start_s <= slot < end_s]
 
     def counted(self, start_s: float, end_s: float, bias_rad_s: Array) -> Counted | None:
-        """Return `TurnCounter.counted`; None where nothing was kept."""
         if self.counter is None:
             return None
         return self.counter.counted(start_s, end_s, bias_rad_s, self.imu.rotation, self.imu.gyro_step_rad_s)
@@ -254,9 +319,34 @@ def _gate(imu: ImuInput) -> ImuGate:
 class PoseSource(Source):
     """The two channels of a gradienter, or the heading of a compass, in degrees."""
 
+    carry = 2  # a slow gradienter or compass
+
     def __init__(self, model: GradienterModel | CompassModel | None, kind: PoseKind, keep: int) -> None:
         circle = kind == "compass"
         batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
         super().__init__(kind, kind, batches, PoseGate(kind))
-        self.settling = None if model is None else Settling(model.lag_s, model.sigma_deg)
-        self.unsettled = deque(maxlen=keep)
+        self._settling = Settling(0.0, 1.0) if model is None else Settling(model.lag_s, model.sigma_deg)
+        self._unsettled: deque[int] = deque(maxlen=keep)
+        """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
+
+    def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
+        if not self._settling.judge(slot, moved=moved):
+            self._unsettled.append(slot)
+        return super().judge(slot, moved=moved, may_move=may_move)
+
+    def accept(self, slot: int) -> None:
+        if slot not in self._unsettled:
+            super().accept(slot)
+
+    def settled(self, slots: Sequence[int]) -> list[Batch]:
+        batches, unsettled = self.batches.batches, frozenset(self._unsettled)
+        return [batches[slot] for slot in slots if slot in batches and slot not in unsettled]
+
+    def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
+        """Say how long its mean over these seconds and the next `left_s` has to wait after a movement, if at all."""
+        unsettled = sum(slot in self._unsettled for slot in slots)
+        needed -= len(slots) - unsettled
+        wait_s = self._settling.left_s + needed
+        if unsettled == 0 or needed <= 0 or wait_s <= left_s:
+            return None
+        return f"{self.label} settles: {wait_s} s more"

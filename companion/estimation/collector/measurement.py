@@ -9,7 +9,6 @@ that is due can be packed up and worked out in another thread.
 
 from __future__ import annotations
 
-import functools
 import math
 from abc import ABC, abstractmethod
 from collections import deque
@@ -17,58 +16,52 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.outlook import (
-    CollectorObstacle,
-    CollectorStatus,
-    Settings,
-    expected_s,
-    is_enough,
-)
+from companion.estimation.collector.intake import CollectorObstacle, CollectorStatus, Settings
 from companion.estimation.means.pose import FieldWindow, heading_window, tilt_window
-from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, Window, imu_estimates
+from companion.estimation.means.windows import WHITE_SHARE, Estimate, ImuInput, ImuWindow, Window, imu_window
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.turning.turn import Turn
+from companion.physics.frames import Floats
 
 MIN_BATCHES: Final = 5
 """Seconds of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
 MAX_REJECTED: Final = 0.20
 MAX_REJECTED_RUN: Final = 3
+_NO_ROOM: Final = 1e-300
 
 
 class Work(NamedTuple):
-    """An estimate that is due."""
+    """An estimate that is due, of ascending slots, none before `since_s` where that was asked for.
+
+    `run` returns the estimate, or the refusal that says why there is none; another thread may call it.
+    """
 
     slots: Sequence[int]
-    """Seconds of the window, ascending."""
     since_s: float | None
-    """Earliest beginning that was asked for; None: that of all seconds."""
     generation: int
     run: Callable[[], Any]
-    """Returns the estimate, or the `CalibrationRefusedError` that says why there is none. It touches nothing that
-    changes, so another thread may call it."""
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """Parts of a window; nothing in it changes later."""
+    """Parts of a window; nothing in it changes later.
+
+    `slots` are good seconds, ascending, at least one; those of the gradienter and the compass that count are `tilt` and
+    `heading`, None without the sensor. `begun_s`: time of power-up by IMU, where it is known. `estimate` returns the
+    estimates of the IMUs, or the whole window, or a `CalibrationRefusedError`.
+    """
 
     slots: Sequence[int]
-    """Good seconds, ascending, at least one."""
     estimate: Callable[[], Any]
-    """Returns the estimates of the IMUs, or the whole window, or a `CalibrationRefusedError`."""
     settling: str | None = None
-    """Reason why a pose sensor's mean has to wait."""
     tilt: list[Batch] | None = None
-    """Seconds of the gradienter that count; None: no gradienter."""
     heading: list[Batch] | None = None
-    """Seconds of the compass that count; None: no compass."""
     from_field: bool = False
     wander_deg: float | None = None
-    """Both as in `HeadingWindow`."""
     field: FieldWindow | None = None
     begun_s: dict[str, float] = {}
-    """Time of power-up by IMU, where it is known."""
     turn: Turn = Turn()
 
     def window(self) -> Window:
@@ -110,22 +103,19 @@ class WindowSource(ABC):
     def __init__(self) -> None:
         self._kept: dict[float | None, tuple[int, Any]] = {}
         self.generation = 0
-        """Number of the stretch that is under way."""
 
     @abstractmethod
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
         """Add an IMU with its seconds and those of means beside it, or begin anew: its stream is another now."""
 
     def set_pose(self, kind: str, batches: BatchSource) -> None:  # noqa: B027 - not every source of windows needs it
-        """Add the seconds of the gradienter or the compass."""
+        """Add the seconds of a pose sensor."""
 
     def forget(self, imu: str | None) -> None:
-        """Drop what was measured, of one IMU or of everything."""
         self.clear()
 
     @abstractmethod
-    def new_stretch(self) -> None:
-        """End a still stretch."""
+    def new_stretch(self) -> None: ...
 
     @abstractmethod
     def add(self, slot: int, *, good: bool) -> bool:
@@ -133,8 +123,7 @@ class WindowSource(ABC):
 
     @property
     @abstractmethod
-    def stillness(self) -> CollectorStatus:
-        """The stillness so far, without an estimate."""
+    def stillness(self) -> CollectorStatus: ...
 
     def good_slots(self, since_s: float | None) -> list[int]:
         """Return the seconds that count of those that wait for a pose sensor to settle."""
@@ -149,15 +138,13 @@ class WindowSource(ABC):
         """
 
     @abstractmethod
-    def work(self, slots: Sequence[int], since_s: float | None) -> Work:
-        """Pack up the estimate of these seconds."""
+    def work(self, slots: Sequence[int], since_s: float | None) -> Work: ...
 
     @abstractmethod
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
         """Return the progress of the newest estimate towards good enough; `waits`: something is in the way."""
 
     def clear(self) -> None:
-        """Drop all estimates, also those that are being worked out."""
         self._kept.clear()
         self.generation += 1
 
@@ -167,7 +154,6 @@ class WindowSource(ABC):
         return kept[1] if kept is not None and kept[0] >= last else None
 
     def pending(self, since_s: float | None) -> Work | None:
-        """Return what has to be worked out now; None when there is nothing."""
         try:
             slots = self.slots(since_s)
         except CalibrationRefusedError:
@@ -183,11 +169,7 @@ class WindowSource(ABC):
         return True
 
     def measurement(self, since_s: float | None) -> Measurement:
-        """Return what a window is made of, without the pose.
-
-        Raises:
-            CalibrationRefusedError: too few seconds.
-        """
+        """Return what a window is made of, without the pose; raises as `slots`."""
         slots = self.slots(since_s)
         return Measurement(slots=slots, estimate=self.estimate_later(slots, since_s))
 
@@ -207,15 +189,12 @@ class WindowSource(ABC):
 
 
 class Stretch:
-    """Counts good and rejected seconds, and knows where the still stretch begins."""
-
     def __init__(self, min_good: int, max_slots: int) -> None:
         self._min_good = min_good
         self.flags: deque[bool] = deque(maxlen=max_slots)
         self.clear()
 
     def clear(self) -> None:
-        """End the stretch."""
         self.start: int | None = None
         self.good = 0
         self.begun = False
@@ -242,17 +221,14 @@ class Stretch:
 
     @property
     def steady(self) -> int:
-        """Good seconds in a row until now."""
         return min(self._steady, len(self.flags))
 
     @property
     def good_now(self) -> bool:
-        """True if the latest second was good."""
         return bool(self.flags) and self.flags[-1]
 
     @property
     def full(self) -> bool:
-        """True if it fills the longest window."""
         return len(self.flags) == self.flags.maxlen
 
 
@@ -268,7 +244,6 @@ class GroundWindows(WindowSource):
         self._next = 0
 
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
-        """Add an IMU or replace it."""
         self._imus[imu.name] = imu, batches, raw
 
     def new_stretch(self) -> None:
@@ -281,7 +256,6 @@ class GroundWindows(WindowSource):
 
     @property
     def stillness(self) -> CollectorStatus:
-        """The stretch under way."""
         stretch = self._stretch
         left_s = 0 if stretch.begun else self._min_good - stretch.good
         return CollectorStatus(
@@ -307,12 +281,24 @@ class GroundWindows(WindowSource):
         return slots
 
     def work(self, slots: Sequence[int], since_s: float | None) -> Work:
-        imus, sources, raw = zip(*self._imus.values(), strict=True) if self._imus else ((), (), ())
-        batches = [[source.batches[slot] for slot in slots] for source in sources]
         # A window since some time shows whether new offsets are in use: raw readings would not.
         with_raw = slots if since_s is None else ()
-        beside = [[source.batches[slot] for slot in with_raw if slot in source.batches] for source in raw]
-        run = functools.partial(_estimates, slots, imus, batches, beside, self._horizon_s)
+        streams = [
+            (
+                imu,
+                [source.batches[slot] for slot in slots],
+                [raw.batches[slot] for slot in with_raw if slot in raw.batches],
+            )
+            for imu, source, raw in self._imus.values()
+        ]
+        end_s, horizon_s, rejected = slots[-1] + 1.0, self._horizon_s, slots[-1] - slots[0] + 1 - len(slots)
+
+        def run() -> list[tuple[Estimate, ImuWindow]] | CalibrationRefusedError:
+            try:
+                return [imu_window(*each, end_s=end_s, horizon_s=horizon_s, rejected=rejected) for each in streams]
+            except CalibrationRefusedError as error:
+                return error
+
         return Work(slots, since_s, self.generation, run)
 
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
@@ -330,16 +316,21 @@ class GroundWindows(WindowSource):
         return msgspec.structs.replace(status, enough=enough, progress=1.0 if enough else stretch.good / needed)
 
 
-def _estimates(
-    slots: Sequence[int],
-    imus: Sequence[ImuInput],
-    batches: Sequence[Sequence[Batch]],
-    raw: Sequence[Sequence[Batch]],
-    horizon_s: float,
-) -> list[tuple[Estimate, ImuWindow]] | CalibrationRefusedError:
-    """Estimate a still window; `raw`: means in floats beside a stream of integers, of the seconds that have any."""
-    end_s, rejected = slots[-1] + 1.0, slots[-1] - slots[0] + 1 - len(slots)
-    try:
-        return imu_estimates(imus, batches, raw, end_s=end_s, horizon_s=horizon_s, rejected=rejected)
-    except CalibrationRefusedError as error:
-        return error
+def is_enough(settings: Settings, found: Sequence[Estimate]) -> bool:
+    """Tell whether every axis meets its target, or its white part is below 30 % of the part that stays (method 3.2)."""
+    return all(bool((each.white_variance <= _room(settings, each)).all()) for each in found)
+
+
+def expected_s(settings: Settings, found: Sequence[Estimate]) -> int:
+    """Return the good seconds after which it is expected to be enough, the noise staying as seen so far."""
+    needed = [np.square(each.white) / np.maximum(_room(settings, each), _NO_ROOM) for each in found]
+    longest = max((float(each.max()) for each in needed), default=0.0)
+    return min(max(math.ceil(min(longest, settings.max_s)), settings.min_slots), settings.max_slots)
+
+
+def _room(settings: Settings, own: Estimate) -> Floats:
+    """Return the variance that white noise may leave in each axis; below zero for integers that are waited for."""
+    target = np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
+    stays = own.use_variance - own.white_variance
+    room = np.maximum(np.square(target) - stays, WHITE_SHARE * stays)
+    return np.where(own.undecided & np.isfinite(target), -1.0, room)

@@ -14,14 +14,21 @@ from typing import Any, Final
 import msgspec
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.intake import ImuSource, PoseKind, PoseSource, Source
+from companion.estimation.collector.intake import (
+    CollectorObstacle,
+    CollectorStatus,
+    ImuSource,
+    PoseKind,
+    PoseSource,
+    Settings,
+    Source,
+    Thermometer,
+)
 from companion.estimation.collector.measurement import MIN_BATCHES, GroundWindows, Measurement, WindowSource, Work
-from companion.estimation.collector.outlook import CollectorObstacle, CollectorStatus, Settings
 from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
-from companion.estimation.seconds.thermometer import Thermometer
 from companion.estimation.stillness.gates import GateVerdict
 from companion.estimation.turning.turn import Turn
 from companion.estimation.turning.watch import TurnWatch
@@ -36,9 +43,9 @@ _MARGIN: Final = 8
 class RollingCollector:
     """Collects batches of all sources, judges stillness, and gives means of the seconds that count.
 
-    Pure: no clock and no I/O. Nothing that a sample holds makes it raise; samples that are dropped are counted by
-    reason. Memory is bounded: `max_s` and a margin of one-second batches a source. A model that is None: no such
-    sensor. `windows`: which seconds count; those of the still stretch, unless told otherwise.
+    Nothing that a sample holds makes it raise; samples that are dropped are counted by reason. Memory is bounded:
+    `max_s` and a margin of one-second batches a source. A model that is None: no such sensor. `windows`: which seconds
+    count; None: those of the still stretch.
 
     Raises:
         ValueError: two IMUs of one name.
@@ -68,14 +75,13 @@ class RollingCollector:
         self._now_s = -math.inf
         self._restarts = 0
         self.on_second: list[Callable[[], object]] = []
-        """Called when every source has closed a second, from within the call that closed it: they only take note."""
+        """Called when every source has closed a second, from within the call that closed it: only take note."""
         for imu in imus:
             self.set_imu(imu)
 
-    # ------------------------------------------------------------------------------------------------- samples in
+    # --- samples in
 
     def add_imu(self, name: str, sample: ImuSample) -> None:
-        """Add one sample of the IMU of that name; of an unknown name it is dropped."""
         source = self.imus.get(name)
         if source is None:
             return
@@ -93,7 +99,6 @@ class RollingCollector:
             self.imus[name].add_raw(t_s, row, temperature_degc)
 
     def add_tilt(self, sample: TiltSample) -> None:
-        """Add one reading of the gradienter; dropped when none is expected."""
         if self._field is not None:
             self._field.take_tilt(sample)
         row = (sample.x_deg, sample.y_deg)
@@ -136,7 +141,7 @@ class RollingCollector:
                 self._field.batches.close_before(now_s - _CLOSE_S)
         self._evaluate()
 
-    # ------------------------------------------------------------------------------------------------- what changes
+    # --- what changes
 
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or replace it when its stream changes kind: all that was learned of it is forgotten."""
@@ -170,7 +175,6 @@ class RollingCollector:
         return source
 
     def retarget(self, settings: Settings) -> None:
-        """Use other targets from the next status on; the lengths (`min_still_s`, `max_s`) stay."""
         self._settings = msgspec.structs.replace(
             self._settings,
             target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s,
@@ -190,56 +194,45 @@ class RollingCollector:
         self._break()
 
     def count_turns(self, *, wanted: bool) -> None:
-        """Start or stop to keep what turns on a spot are counted by."""
         for source in self.imus.values():
             source.counter = TurnCounter() if wanted else None
 
-    # ------------------------------------------------------------------------------------------------- what is known
+    # --- what is known
 
     @property
     def begun_s(self) -> dict[str, float]:
-        """Time of power-up by IMU: by its device's clock, else the first sample of its stream."""
         return {name: source.begun_s for name, source in self.imus.items() if source.begun_s is not None}
 
     def up_s(self, name: str) -> float | None:
-        """Return the time since power-up by the latest sample of an IMU; None where its device does not tell."""
         return self.imus[name].up_s if name in self.imus else None
 
     @property
     def turn(self) -> Turn:
-        """The platform's own rate, as far as it is known."""
         return self._turns.turn
 
     @property
     def wander_deg(self) -> float | None:
-        """Wander of the heading since the aircraft last moved; None until that is known."""
         return self._turns.wander_deg
 
     def imu_seconds(self) -> dict[str, Batch]:
-        """Return the last whole second of each IMU that has one, still or not."""
         return {name: source.newest for name, source in self.imus.items() if source.newest is not None}
 
     def tilt_second(self) -> Batch | None:
-        """Return the last whole second of the gradienter."""
         return None if self._tilt is None else self._tilt.newest
 
     def glance(self, now_s: float) -> CollectorStatus:
-        """Return the stillness at `now_s`; costs a small part of what `status` does."""
+        """Return the stillness without an estimate; costs a small part of what `status` does."""
         return msgspec.structs.replace(self._windows.stillness, obstacle=self._obstacle(now_s))
 
     def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
-        """Return what `window` would have to work out now, for another thread; None when there is nothing.
-
-        It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
-        """
+        """Return what `window` would have to work out now, for another thread; None when there is nothing."""
         return None if self._obstacle(now_s) is not None else self._windows.pending(since_s)
 
     def accept(self, work: Work, found: Any) -> None:
-        """Keep the result of such work, unless it comes too late."""
         self._windows.accept(work, found)
 
     def status(self, now_s: float) -> CollectorStatus:
-        """Return the state at `now_s` (the samples' clock). Its figures may be those of the second before."""
+        """Return the state; its figures may be those of the second before."""
         waits = self._waiting_for(now_s)
         found = self._windows.status(self._settings, waits=waits is not None)
         obstacle = waits or found.obstacle
@@ -286,13 +279,12 @@ class RollingCollector:
             turn=self.turn,
         )
 
-    # ------------------------------------------------------------------------------------------------- inside
+    # --- inside
 
     def _sources(self) -> list[Source]:
         return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
 
     def _others(self) -> list[GateVerdict]:
-        """Return the verdicts on all sources but the compass."""
         return [source.verdict for source in self._sources() if source is not self._heading]
 
     def _break(self) -> None:
@@ -323,7 +315,7 @@ class RollingCollector:
             self._break()
             self._next = min(last, *known)
         if last - self._next > self._keep:
-            # Nobody closed anything for so long that nothing of it is left.
+            # Nobody closed anything for so long that no second is left.
             self._break()
             self._next = last - 1
         if last < self._next:
@@ -349,7 +341,7 @@ class RollingCollector:
                 source.accept(slot)
 
     def _watch_turn(self, slot: int, *, good: bool) -> bool:
-        """Look for a turn in a second that has been judged; False where the still stretch ends with it."""
+        """Look for a turn in a judged second; False where the still stretch ends with it."""
         others = self._others()
         if self._windows.may_move or any(verdict.fault for verdict in others):
             return True
@@ -361,7 +353,6 @@ class RollingCollector:
         return self._turns.add_second(slot, imus, heading, good=good)
 
     def _obstacle(self, now_s: float) -> CollectorObstacle | None:
-        """Return a silent source or the reason why the latest second was not still; None when nothing is in the way."""
         sources = self._sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
             return CollectorObstacle(silence)
@@ -388,6 +379,5 @@ class RollingCollector:
         return CollectorObstacle(f"hold still {left_s} s more", hold_still_s=left_s) if left_s else None
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
-        """Say how long the mean of a pose sensor over these seconds and the next `left_s` has to wait, if at all."""
         sources, least = filter(None, (self._tilt, self._heading)), min(MIN_BATCHES, self._settings.min_slots)
         return next(filter(None, (source.lacks(slots, least, left_s) for source in sources)), None)

@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.intake import CollectorStatus, Settings
 from companion.estimation.collector.measurement import Measurement, WindowSource, Work
-from companion.estimation.collector.outlook import CollectorStatus, Settings
 from companion.estimation.deck.estimate import (
     MAX_S,
     MIN_LOOK_S,

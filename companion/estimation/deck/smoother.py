@@ -35,7 +35,7 @@ from companion.physics.frames import (
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
 """W cos L halfway between the equator and 65 degrees: the rest, once the latitude is known, is linear."""
 RAMP_T: Final = 5.0
-"""Sigmas from which on a ramp is believed, as at rest (`noise.robust`)."""
+"""Sigmas from which on a ramp is believed, as at rest (`noise.lines`)."""
 _ROUNDS: Final = 7
 _NEAR: Final = 0.1
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)

@@ -39,18 +39,15 @@ HUBER_C: Final = 4.0
 """Limit in scales of a second for these streams: rare integers make the seconds' means skew, and 1.345 would cut off
 the rare ones, which show the mean."""
 BORROWED_RMS: Final = 0.1
-"""Relative difference between the noise of the three axes of one gyro or accelerometer."""
+# Sigmas in LSB of a mean that the readings do not show: anywhere, and within a step of zero.
 HALF_STEP: Final = 0.5
-"""Sigma in LSB of a mean that the readings do not show."""
 NEAR_ZERO: Final = 1.0
-"""Sigma in LSB of such a mean within a step of zero, on either side."""
 
 _ROUNDS: Final = 60
 _HALVINGS: Final = 30
 _CONVERGED: Final = 1e-7
 _LEAST_PROBABILITY: Final = 1e-300
 _LEAST_SIGMA: Final = 1e-3
-"""LSB; less noise shows no more of the mean."""
 _OUTLIER: Final = 6.0
 _CORE_SIGMAS: Final = 8.0
 _LEAST_SPREAD: Final = 0.3
@@ -61,16 +58,15 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """Gaussian noise under truncation; arrays are (c,) unless said otherwise, in LSB.
+    """Gaussian noise of one reading under truncation; arrays are (c,) unless said otherwise, in LSB.
 
+    `variance` is that of `mean` by the Fisher information, for independent readings.
     Nothing here is NaN; where `identified` is false the figures are no estimate and must not be used.
     """
 
     mean: Floats
     sigma: Floats
-    """Noise of one reading."""
     variance: Floats
-    """Variance of `mean` by the Fisher information, for independent readings."""
     identified: NDArray[np.bool_]
     influence: Floats
     """(k, c): change of the mean by one reading in that cell, times the number of readings. The mean over a part of

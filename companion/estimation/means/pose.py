@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from companion.estimation.noise.allan import white_noise
-from companion.estimation.noise.robust import huber_mean
+from companion.estimation.noise.lines import huber_mean
 from companion.estimation.seconds.batch import Batch, BatchSource, decimal, few_distinct
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up, vector
 from companion.physics.gradienter import Law, up_in_sensor
@@ -30,14 +30,11 @@ LEVEL_COSINE: Final = math.cos(2.0 * DEG)
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GradienterModel:
-    """Gradienter model for up in the vehicle: law, zero offset, mounting, sigma."""
-
     law: Law
     vehicle_from_sensor: Matrix
     offset_deg: tuple[float, float]
     sigma_deg: float
     lag_s: float = 0.0
-    """Time constant of the device."""
 
     def up(self, x_deg: float, y_deg: float) -> Array:
         """Return up in the vehicle's axes, (3,), from readings without an offset.
@@ -50,23 +47,18 @@ class GradienterModel:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassModel:
-    """Compass model for a true heading: reference, offset, mounting, sigma."""
-
     magnetic: bool
     vehicle_from_sensor: Matrix
     offset_deg: float
     sigma_deg: float
     counts_per_gauss: float | None = None
-    """Scale of a field in counts; None: only its direction is known."""
+    """None: only the direction of a field in counts is known."""
     prefers_field: bool = False
-    """The heading is worked out from the field even where the device gives one of its own."""
     tilted_sigma_deg: float | None = None
     """Sigma where the compass is not level; None: `sigma_deg`."""
     lag_s: float = 0.0
-    """Time constant of the device."""
 
     def sigma_at(self, up: Array) -> float:
-        """Return sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
         upright = float(-(self.vehicle_from_sensor.T @ up)[2])
         if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
             return self.sigma_deg
@@ -91,7 +83,7 @@ def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) ->
 
 
 class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of the gradienter in its own axes; sigmas are statistical."""
+    """Means of the gradienter in its own axes; the sigmas of this and the next windows are statistical."""
 
     x_deg: float
     y_deg: float
@@ -106,7 +98,6 @@ class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
     heading_deg: float
     sigma_deg: float
     from_field: bool = False
-    """Worked out from the device's field and the gradienter's tilt; else the device's own."""
     wander_deg: float | None = None
     """Change while no other sensor showed a turn; None: not watched long enough."""
 
@@ -115,15 +106,12 @@ FieldUnit = Literal["gauss", "counts"]
 
 
 class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean of the magnetic field in the compass' own axes; sigmas are statistical."""
-
     field: tuple[float, float, float]
     sigma: tuple[float, float, float]
     unit: FieldUnit
 
 
 def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
-    """Average the gradienter's good batches, at least one."""
     (x_deg, y_deg), (x_sigma_deg, y_sigma_deg) = _pose_mean(batches, np.array([batch.mean for batch in batches]))
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     return TiltWindow(
@@ -136,7 +124,6 @@ def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
 
 
 def heading_window(batches: Sequence[Batch], *, from_field: bool, wander_deg: float | None) -> HeadingWindow:
-    """Average the compass' good batches, at least one."""
     first = batches[0].mean
     turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
     mean, sigma = _pose_mean(batches, turned)
@@ -162,8 +149,7 @@ def _resolution(batches: Sequence[Batch]) -> Floats:
     return np.where(few, np.where(high > low, high - low, decimal(low, high)), 0.0)
 
 
-OLDEST_TILT_S: Final = 1.0
-"""A tilt older than this is none; the slowest gradienters send five readings in that time."""
+OLDEST_TILT_S: Final = 1.0  # A tilt older than this is none; the slowest gradienters send five readings in that time
 OWN_HEADING_S: Final = 2.0
 """After so long without a heading of its own a compass is taken for one that sends its field only."""
 _LIMITS: Final = (1e6,) * 3
@@ -181,12 +167,10 @@ class FieldHeading:
         self.unit: FieldUnit = "gauss"
         self.batches = BatchSource(_LIMITS, keep)
         self.from_field = False
-        """True: the latest heading that counts was worked out here."""
         self.hint = ""
         """Why there is none from the field although one is needed; empty while there is."""
 
     def take_tilt(self, sample: TiltSample) -> None:
-        """Add a reading of the gradienter."""
         self._tilt = sample
 
     def takes_own(self, sample: CompassSample) -> bool:
@@ -219,7 +203,6 @@ class FieldHeading:
         return CompassSample(sample.t_s, heading / DEG % 360.0)
 
     def window(self, slots: Sequence[int]) -> FieldWindow | None:
-        """Return the mean field of these seconds; None where nothing came in them."""
         found = [self.batches.batches[slot] for slot in slots if slot in self.batches.batches]
         if not found:
             return None

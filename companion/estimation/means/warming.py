@@ -21,21 +21,16 @@ from companion.physics.frames import Floats, Matrix
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, rows_of
 
-QUICKEST_S: Final = 60.0
-"""Shortest time constant of a warm-up; boards take 1 to 20 min."""
-NEXT_S: Final = 60.0
-"""Time for which an unseen slope is believed to continue."""
+QUICKEST_S: Final = 60.0  # Shortest time constant of a warm-up; boards take 1 to 20 min
+NEXT_S: Final = 60.0  # Time for which an unseen slope is believed to continue
 _LATER_S: Final = (120.0, 600.0, 3600.0)
 _WORTH_WAITING: Final = 2.0 / 3.0
-"""Share of the present sigma below which a later one is worth waiting for."""
 _TEMPERATURE_WARNING_K: Final = 3.0
 UNKNOWN: Final = 1.0
 """Variance of a slope that the window does not tell, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
 _TINY: Final = float(np.finfo(float).tiny)
 _BENT_SIGMAS: Final = 3.0
-"""Curvature over its sigma from which the temperature is taken for a parabola."""
 _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
-"""Resolutions of thermometers."""
 
 
 State = tuple[float, float]
@@ -43,42 +38,39 @@ State = tuple[float, float]
 
 
 class Path(msgspec.Struct, frozen=True, kw_only=True):
-    """Temperature through a window: a line or a parabola."""
+    """Temperature at the beginning, in the middle and at the end of a window: a line or a parabola."""
 
     states: tuple[State, State, State]
-    """At the beginning, in the middle and at the end."""
     span_s: float
     variance: float
     """Variance of the difference between end and mean, K^2."""
 
     @property
     def mean_degc(self) -> float:
-        """Mean over the window."""
         (start, _), (middle, _), (end, _) = self.states
         return (start + 4.0 * middle + end) / 6.0
 
 
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
-    """Straight lines through the readings of gyro and accelerometer over one window; (6,), rad/s^2 and m/s^3."""
+    """Straight lines through the readings of gyro and accelerometer over one window; (6,), rad/s^2 and m/s^3.
+
+    `ramp` has the slopes that are significant, else zero: the reported mean is the end of that line. `variance` is that
+    of the slope, with the part's flicker and walk, `UNKNOWN` where the window is too short for a line; `level_variance`
+    that of the mean over the window as a prediction of the next minutes, without any ramp. `warm_up`: bias change of
+    gyro and accelerometer by `WARM_UP_K`, rad/s and m/s^2. `rate`: of the thermometer, K/s, and its variance, None
+    without one; `path` is None without a significant change.
+    """
 
     slope: Floats
     ramp: Floats
-    """Slopes that are significant, else zero: the reported mean is the end of that line."""
     variance: Floats
-    """Variance of the slope, with the part's flicker and walk; `UNKNOWN` where the window is too short for a line."""
     level_variance: Floats
-    """Variance of the mean over the window as a prediction of the next minutes, without any ramp."""
     warm_up: tuple[float, float]
-    """Bias change of gyro and accelerometer in a warm-up of `WARM_UP_K`, rad/s and m/s^2."""
     half_s: float
-    """Half of the window's length."""
     rate: tuple[float, float] | None
-    """Rate of the thermometer, K/s, and its variance; None: no thermometer."""
     path: Path | None
-    """Temperature through the window; None: no significant change."""
 
     def rotated(self, rotation: Matrix) -> Warming:
-        """Turn the lines into other axes."""
         both = np.kron(np.eye(2), rotation)
         return msgspec.structs.replace(
             self,

@@ -24,11 +24,12 @@ from companion.estimation.noise.allan import (
     FLOOR_OF_FLICKER,
     WARM_UP,
     allan_variance,
+    columns,
     floor_variance,
     slope_variance,
     white_noise,
 )
-from companion.estimation.noise.robust import HUBER_C, RAMP_BATCHES, huber_line, is_ramp, robust_mean
+from companion.estimation.noise.lines import HUBER_C, RAMP_BATCHES, huber_line, is_ramp, robust_mean
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Floats, vector
@@ -38,30 +39,28 @@ from companion.samples import TRIADS, Triad, Vector, rows_of
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
-RAW_BATCHES: Final = 10
-"""Seconds with means in floats that say enough of their own scatter."""
-RAW_STEP: Final = 1e-5
-"""Their rounding: five decimals, rad/s and m/s^2."""
+RAW_BATCHES: Final = 10  # Seconds of floats beside integers that say enough of their own scatter
+RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
-"""Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
 _ALLAN_SIGNIFICANT: Final = 3.0
 """ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 
 
 class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU as the collector needs to know it."""
+    """One IMU for the collector; `rotation` is that from the sensor to vehicle FRD, 3x3.
+
+    The steps are those of integers that are truncated toward zero, 0 for floats; both triads are one or the other.
+    `clock_from_start`: the time in its samples (`t_device_s`) counts from the switch-on of the device.
+    """
 
     name: str
     rotation: NDArray[np.float64]
-    """3x3, sensor to vehicle FRD."""
     profile: NoiseProfile
     gyro_step_rad_s: float = 0.0
-    """Step of integers that are truncated toward zero; 0 for floats. Both triads are one or the other."""
     accel_step_m_s2: float = 0.0
     clock_from_start: bool = False
-    """True: the time in its samples (`t_device_s`) counts from the switch-on of the device."""
 
     @property
     def steps(self) -> Floats | None:
@@ -70,7 +69,14 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of one IMU over one still stretch; axes are the vehicle's FRD."""
+    """Means of one IMU over one still stretch; axes are the vehicle's FRD.
+
+    `sigma_use` is sqrt(V(T, H)) of the sensor alone; `solve` adds what the pose adds. A curve of the temperature may
+    explain the warnings in `drifting`. Triads in `hidden` have too little noise to spread their integers: their means
+    are good to half a step, and those in `useless` are no measurement at all. On a deck there are `covariance` (6x6 of
+    all axes) and `by_earth` (3x3, the share of the Earth's rate, ahead, right and down, in the gyro means). `mounting`
+    has the rows of the rotation from the sensor's axes.
+    """
 
     name: str
     samples: int
@@ -80,34 +86,27 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     gyro_sigma_stat_rad_s: Vector
     accel_sigma_stat_m_s2: Vector
     gyro_sigma_use_rad_s: Vector
-    """sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`."""
     accel_sigma_use_m_s2: Vector
     temperature_degc: float | None
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
-    """Warnings of a drift, unless a curve of the temperature explains it."""
     hidden: dict[Triad, str] = {}
-    """Words on triads whose noise spreads the integers too little for a mean: good to half a step."""
     useless: frozenset[Triad] = frozenset()
-    """Triads of `hidden` whose means are no measurement at all."""
     named: bool = True
-    """The part is known."""
     covariance: NDArray[np.float64] | None = None
-    """6x6 of all axes, on a deck."""
     by_earth: NDArray[np.float64] | None = None
-    """3x3, on a deck: share of the Earth's rate (ahead, right, down) in the gyro means."""
     mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    """Rows of the rotation from the sensor's axes."""
     warming: Warming | None = None
-    """Slopes by a warm-up; None: none is allowed for."""
 
     def refused(self, part: Triad) -> str | None:
-        """Return why the means of a triad are no measurement; None when they are one."""
         return self.hidden[part] if part in self.useless else None
 
 
 class Window(msgspec.Struct, frozen=True, kw_only=True):
-    """One still stretch: everything that a calibration is computed from."""
+    """One window; `powered_s` is the least age of each IMU since its switch-on, at the end.
+
+    `turn_rad_s` is the mean turn of a deck, its axis levelled by the gradienter's readings without an offset.
+    """
 
     start_s: float
     end_s: float
@@ -115,34 +114,29 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     tilt: TiltWindow | None
     heading: HeadingWindow | None
     field: FieldWindow | None = None
-    """Mean field of a compass that sends it, over those of the good seconds in which it came."""
     turn_rad_s: Vector | None = None
-    """Mean turn of a deck, its axis levelled by the gradienter's readings without an offset."""
     powered_s: dict[str, float] = {}
-    """Least age of each IMU since its switch-on, at the end."""
     turn: Turn = Turn()
-    """Rate of the platform itself where it stands still."""
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2."""
+    """One IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2.
+
+    The mean of integers is unknown yet where `undecided` (more seconds may bring the rare reading that tells); where
+    `useless` it says no more than that it is less than a step. `half_step`: floats with fewer than 3 distinct readings.
+    `white` is the N in force: measured, or the profile's where that is larger; more seconds reduce `white_variance`, a
+    part of `use_variance`.
+    """
 
     mean: Floats
     stat_variance: Floats
     use_variance: Floats
     white_variance: Floats
-    """Part of `use_variance` that more seconds reduce."""
     white: Floats
-    """N in force: measured, or the profile's where that is larger."""
-    flicker: Floats
-    walk: Floats
     warming: Warming
     half_step: NDArray[np.bool_]
-    """Floats with fewer than 3 distinct readings."""
     undecided: NDArray[np.bool_]
-    """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
     useless: NDArray[np.bool_]
-    """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
 
 
 def estimate(
@@ -153,7 +147,7 @@ def estimate(
     A ramp is evaluated at the end of the window, `end_s`, and never later. `horizon_s` is H of V(T, H), `rounding` the
     step of floats that were rounded.
     """
-    models = imu.profile.gyro, imu.profile.accel
+    profile_white, flicker, walk = columns(imu.profile)
     slots = np.array([batch.slot for batch in batches], dtype=np.int64)
     seconds = float(len(slots))
     huber_c, least, useless = HUBER_C, np.zeros(6), np.zeros(6, dtype=np.bool_)
@@ -164,8 +158,6 @@ def estimate(
     else:
         values = np.array([batch.mean for batch in batches])
         quantum, half_step = _quantisation(batches, rounding)
-    flicker = np.repeat([model.flicker for model in models], 3)
-    walk = np.repeat([model.walk for model in models], 3)
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
     wander = slope_variance(flicker, walk, end_s - slots[0]) if imu.profile.is_named else np.zeros(6)
     mean, leverage = robust_mean(values, huber_c, least), np.full(6, 1.0 / seconds)
@@ -178,7 +170,7 @@ def estimate(
         level = values - ramp * (times - times.mean())[:, None]
         mean, leverage = np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage)
     measured = np.maximum(white_noise(slots, level), least)
-    white = np.maximum(measured, np.repeat([model.white for model in models], 3))
+    white = np.maximum(measured, profile_white)
     flicker = _flicker(slots, level, measured, flicker)
     quantum = np.sqrt(np.square(quantum) + np.mean([batch.shared_variance for batch in batches], axis=0))
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
@@ -195,8 +187,6 @@ def estimate(
         use_variance=white_part + rest + going_on,
         white_variance=white_part,
         white=white,
-        flicker=flicker,
-        walk=walk,
         warming=Warming(
             slope=slope,
             ramp=ramp,
@@ -242,37 +232,33 @@ def _quantisation(batches: Sequence[Batch], step: float) -> tuple[Floats, NDArra
     return np.where(few, step / 2.0, step / math.pi * np.exp(-2.0 * math.pi**2 * variance / step**2)), few
 
 
-def imu_estimates(
-    imus: Sequence[ImuInput],
-    batches: Sequence[Sequence[Batch]],
-    raw: Sequence[Sequence[Batch]] = (),
+def imu_window(
+    imu: ImuInput,
+    seconds: Sequence[Batch],
+    raw: Sequence[Batch] = (),
     *,
     end_s: float,
     horizon_s: float,
     rejected: int,
-) -> list[tuple[Estimate, ImuWindow]]:
-    """Estimate all IMUs from their good batches, which are of the same seconds: in its own axes, and the vehicle's.
+) -> tuple[Estimate, ImuWindow]:
+    """Estimate one IMU from its good seconds: in its own axes, and in the vehicle's.
 
-    `raw`: of those seconds, means in floats beside a stream of integers; by them where they know the gyros better.
+    `raw`: of those seconds, means in floats beside a stream of integers; they count where they know the gyros better.
 
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
     """
-    for imu, seconds in zip(imus, batches, strict=True):
-        _refuse_broken(imu, seconds)
-    found = []
-    for imu, seconds, means in zip(imus, batches, raw or [()] * len(imus), strict=True):
-        used, by, own = imu, seconds, estimate(imu, seconds, end_s=end_s, horizon_s=horizon_s)
-        if len(means) >= RAW_BATCHES:
-            floats = msgspec.structs.replace(imu, gyro_step_rad_s=0.0, accel_step_m_s2=0.0)
-            better = estimate(floats, means, end_s=end_s, horizon_s=horizon_s, rounding=RAW_STEP)
-            if better.use_variance[:3].sum() < own.use_variance[:3].sum():
-                used, by, own = floats, means, better
-        found.append((own, _imu_window(used, by, own, rejected)))
-    return found
+    _refuse_broken(imu, seconds)
+    own = estimate(imu, seconds, end_s=end_s, horizon_s=horizon_s)
+    if len(raw) >= RAW_BATCHES:
+        floats = msgspec.structs.replace(imu, gyro_step_rad_s=0.0, accel_step_m_s2=0.0)
+        better = estimate(floats, raw, end_s=end_s, horizon_s=horizon_s, rounding=RAW_STEP)
+        if better.use_variance[:3].sum() < own.use_variance[:3].sum():
+            return better, _in_vehicle(floats, raw, better, rejected)
+    return own, _in_vehicle(imu, seconds, own, rejected)
 
 
-def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:
+def _in_vehicle(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     rotation = np.asarray(imu.rotation, dtype=np.float64)
     gyro, accel, hidden = slice(0, 3), slice(3, 6), _hidden(imu, found)
@@ -298,7 +284,6 @@ def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, reject
 
 
 def _turned(rotation: Floats, variance: Floats) -> Vector:
-    """Return the sigmas of independent axes after a rotation."""
     return vector(np.sqrt(np.square(rotation) @ variance))
 
 

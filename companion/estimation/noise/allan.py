@@ -26,12 +26,10 @@ from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG_H, MG
 
 FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor
-"""Allan deviation of pure flicker noise over B: 0.664."""
 
 _FLOOR_REACHED_S: Final = 1000.0
 """Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method 2.2)."""
-WARM_UP_K: Final = 20.0
-"""A board with its processor and radio, from cold to warm; two sigma."""
+WARM_UP_K: Final = 20.0  # Warm-up of a board with its processor and radio; two sigma
 WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
 """Bias change of a part without a data sheet: a BMI088's gyro (method 2.1), a BMI160's accelerometer (table there)."""
 
@@ -86,6 +84,11 @@ def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
     if profile is not None and profile not in PROFILES:
         raise ConfigError(f"no noise profile {profile!r} (known: {', '.join(PROFILES)})")
     return PROFILES[profile or "unknown"]
+
+
+def columns(profile: NoiseProfile) -> Floats:
+    """Return N, B and K of the three axes of the gyro and of the accelerometer: (3, 6)."""
+    return np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
 
 
 def phi(ratio: Floats | float) -> Floats:
@@ -173,42 +176,39 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
 
 KNOWN_SIGMAS: Final = 2.0
 """N^2, B^2 or K^2 over its standard error from which the recordings show it: within 25 % of N, B or K."""
-UPPER_SIGMAS: Final = 1.645
-"""One-sided 95 %: the upper limit of a figure that the recordings do not show."""
+UPPER_SIGMAS: Final = 1.645  # One-sided 95 %: the upper limit of a figure that the recordings do not show
 LEAST_SLOTS: Final = 8
-"""Least seconds of a stretch: shorter ones have no two averages that show more than white noise."""
 LONGEST_S: Final = 256
-_LONGEST_SHARE: Final = 3
-"""The longest average is a third of the stretch: beyond, one difference is all there is."""
+_LONGEST_SHARE: Final = 3  # The longest average is a third of the stretch: beyond, one difference is all there is
 _ROUNDS: Final = 1000
 _UPPER_ROUNDS: Final = 40
 _UNBOUNDED: Final = 1e6
 
 
 class AllanCurve(NamedTuple):
-    """Allan variances of all stretches of a recording at rest; a row for each averaging time of each stretch."""
+    """Allan variances of all stretches of a recording at rest; k rows: each averaging time of each stretch.
+
+    `spans` are the averaging times, s, `counts` the seconds in an average, fewer where the stretch has holes, and
+    `freedom` the independent squares, (k,) each; `variance` is (k, c).
+    """
 
     spans: Floats
-    """(k,) averaging times, s."""
     counts: Floats
-    """(k,) seconds in an average; fewer where the stretch has holes."""
     freedom: Floats
-    """(k,) independent squares."""
     variance: Floats
-    """(k, c)."""
 
 
 class AxisFit(msgspec.Struct, frozen=True):
-    """Noise of one axis; figures in its unit (times sqrt(s), 1, over sqrt(s))."""
+    """N, B and K of one axis in its unit (times sqrt(s), 1, over sqrt(s)); `known`: the recordings show the figure.
+
+    `sigmas` are the standard errors of the squares N^2, B^2, K^2; `upper` the one-sided 95 % limits, infinite where the
+    recordings are too short for one.
+    """
 
     figures: tuple[float, float, float]
-    """N, B, K; none is negative."""
     sigmas: tuple[float, float, float]
-    """Standard errors of the squares N^2, B^2, K^2."""
     upper: tuple[float, float, float]
-    """One-sided 95 % limits of N, B, K; infinite where the recordings are too short for one."""
     known: tuple[bool, bool, bool]
-    """True: the recordings show the figure."""
 
 
 def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> AllanCurve:

@@ -18,67 +18,59 @@ from numpy.typing import NDArray
 
 from companion.physics.frames import Floats
 
-MAX_SAMPLES: Final = 4096
-"""Samples kept of one slot, ten times the fastest stream; more are dropped and counted."""
+MAX_SAMPLES: Final = 4096  # Samples kept of one slot, ten times the fastest stream; more are dropped and counted
 MAX_LEVELS: Final = 1024
 """Largest range of integers within one second that are counted one by one; at rest it is a tenth of that."""
 
-_EVEN: Final = 1.4999
-"""Counter steps within this ratio of each other are one sample each."""
+_EVEN: Final = 1.4999  # Counter steps within this ratio of each other are one sample each
 _OFF_BEAT: Final = 0.25
 """A step farther from a whole number of usual ones is no loss: lost samples leave whole steps out."""
 _MOST_OFF_BEAT: Final = 0.2
 """With a larger share of such steps the stamps do not count samples: the sender picks some of them."""
 _LEAST_OF_A_PART: Final = 4
 _FINEST: Final = 5
-"""Halvings of a second: 1/32 s; what is faster is vibration."""
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
 _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
-"""Samples in a row from the past that show a clock gone back; fewer are late."""
 _BACKWARD_S: Final = 2.0
-_PAUSE_S: Final = 3.0
-"""A sensor that was silent for longer may have been switched off."""
+_PAUSE_S: Final = 3.0  # A sensor that was silent for longer may have been switched off
 _MAX_DECIMALS: Final = 4
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """Histogram of the integers of one second."""
+    """Histogram of one second: how often, (k, c), each integer was read, from `lowest` (c,) on, in steps."""
 
     lowest: NDArray[np.int64]
-    """(c,) integer of the first row, in steps of the stream."""
     table: NDArray[np.int32]
-    """(k, c), k at most `MAX_LEVELS`."""
 
 
 class Batch(msgspec.Struct, frozen=True):
-    """One second of one source; arrays are (c,) over its channels, in the source's units."""
+    """One second of one source; arrays are (c,) over its channels, in the source's units.
+
+    `white`: half the mean square of successive differences (von Neumann), the white part of the variance. `missing`:
+    samples lost, by the device's counter or clock; None where it has none that counts samples. `counts`: None for
+    floats, and for a second that spans more than `MAX_LEVELS`. `allan`: (k, c) Allan variances at averaging times of
+    1/2, 1/4 ... 1/32 of the second, each of four samples or more. `shared_variance`: (6,) variance of an error that all
+    samples of an IMU, also of other seconds, have in common.
+    """
 
     slot: int
     n: int
     mean: Floats
     variance: Floats
-    """Variance of one sample, n - 1 in the denominator; zero for a single sample."""
     white: Floats
-    """Half the mean square of successive differences (von Neumann): the white part of the variance."""
     low: Floats
     high: Floats
     distinct: NDArray[np.int64]
     clipped: bool
-    """Some channel's commonest value is its extreme one: readings pile up at the end of the range."""
     largest_gap_s: float
-    """Between samples, and to both ends of the slot."""
     missing: int | None
-    """Samples lost, by the device's sequence counter or clock; None where it has none that counts samples."""
     temperature_degc: float | None
     counts: Counts | None = None
-    """None for a stream of floats, and for a second that spans more than `MAX_LEVELS`."""
     allan: Floats = np.zeros((0, 0))
-    """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
     shared_variance: Floats = np.zeros(6)
-    """(6,) variance of an error that all samples of an IMU, also of other seconds, have in common."""
 
 
 def summary(
@@ -119,7 +111,6 @@ def summary(
 
 
 def _allan_within(off: Floats) -> Floats:
-    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
     firsts, sizes = _parts_of(len(off))
     depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))
@@ -152,7 +143,6 @@ def _counts(rows: Floats, steps: Floats) -> Counts | None:
 
 
 def unrolled(rows: Floats) -> Floats:
-    """Unroll angles in degrees, (n, 1), from the first finite one."""
     finite = rows[np.isfinite(rows[:, 0]), 0]
     if len(finite) == 0:
         return rows
@@ -243,26 +233,22 @@ class BatchSource:
         self.begun: int | None = None
         """First second without a longer pause since."""
         self.lost = 0
-        """Samples lost since the beginning, by the device's counter or clock."""
         self.restarts = 0
-        """Number of times that the clock went back and everything was dropped."""
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
-        """Filter of a second's temperature."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
         """Called with every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()
 
     def _restart(self) -> None:
         self._slot: int | None = None
-        self._slot_start = self._slot_end = -math.inf
+        self._slot_end = -math.inf
         self._newest = -_MAX_TIME_S
         self._backward = 0
         self._heard_s = -math.inf
         self._skip_rest()
 
     def _skip_rest(self) -> None:
-        """Drop the second under way, the rest of it included."""
         self._partial = True
         self._last_stamp = math.nan
         self._clear()
@@ -328,19 +314,19 @@ class BatchSource:
         first = self._slot is None
         self._close()
         self._slot = slot
-        self._slot_start, self._slot_end = float(slot), slot + 1.0
+        self._slot_end = slot + 1.0
         # A stream that has just begun did so in the middle of a second.
         self._partial = first
         self.closed_through = slot - 1
         return not first
 
     def close_before(self, t_s: float) -> bool:
-        """Close the second under way if it ended before `t_s`; True when it did."""
         if self._slot is None or not self._slot_end <= t_s < _MAX_TIME_S:
             return False
-        self._open(math.floor(t_s))
+        slot = math.floor(t_s)
+        self._open(slot)
         # A sample from before is late now.
-        self._newest = max(self._newest, self._slot_start)
+        self._newest = max(self._newest, float(slot))
         return True
 
     def _close(self) -> None:

@@ -16,13 +16,11 @@ import numpy as np
 from companion.physics.frames import Array, Floats, Matrix, rotations, running_products
 from companion.samples import ImuSample
 
-MAX_SAMPLES: Final = 60_000
-"""Ten minutes at 100 Hz, 2.4 MB, since the stand before; a longer turn is not counted."""
+MAX_SAMPLES: Final = 60_000  # Ten minutes at 100 Hz, 2.4 MB, since the stand before; a longer turn is not counted
 LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
 """Longest hole beyond the stream's interval: hands that turn by 60 deg/s turn by 3 degrees meanwhile."""
-AT_REST_S: Final = 0.5
-"""Longest hole at rest: nobody turns an aircraft from rest to rest in less."""
+AT_REST_S: Final = 0.5  # Longest hole at rest: nobody turns an aircraft from rest to rest in less
 LATE_S: Final = 0.05
 """Delay of a sample; a larger disagreement of the clocks is a wrong pace, as of a simulator on a busy computer."""
 MOVES_RAD_S: Final = math.radians(0.5)
@@ -38,13 +36,10 @@ class Counted(NamedTuple):
 
 
 class TurnCounter:
-    """Keeps the latest rates of one IMU, sample by sample."""
-
     def __init__(self) -> None:
         self._samples = array("d")
 
     def add(self, sample: ImuSample) -> None:
-        """Add one sample, rates in the sensor's axes."""
         if len(self._samples) >= 5 * MAX_SAMPLES:
             del self._samples[:]
         device_s = math.nan if sample.t_device_s is None else sample.t_device_s
@@ -53,14 +48,9 @@ class TurnCounter:
     def counted(
         self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix, cut_rad_s: float = 0.0
     ) -> Counted | None:
-        """Integrate the turn between two times at rest; None where samples are missing. Drops what is older.
+        """Integrate the turn between two times at rest; None where samples are missing. Drops older samples.
 
-        Args:
-            start_s: end of the window before.
-            end_s: beginning of the window after.
-            bias_rad_s: (3,) in the vehicle's axes.
-            vehicle_from_sensor: 3x3.
-            cut_rad_s: step of integers that are cut off toward zero.
+        `bias_rad_s` (3,) is in the vehicle's axes; `cut_rad_s` is the step of integers that are cut off toward zero.
         """
         rows = np.array(self._samples).reshape(-1, 5)
         old = int(np.searchsorted(rows[:, 0], start_s))

@@ -43,7 +43,7 @@ BOUNDS_RAD_S: Final = 0.1 * DEG
 _CONTRADICTS: Final = 4.0
 _WORTH_SAYING: Final = 2.0
 _END_OF_RAMP: Final = 0.25
-"""Variance of a mean over that of the end of a line through the same values (`robust.Line.end_leverage`)."""
+"""Variance of a mean over that of the end of a line through the same values (`RobustLine.end_leverage`)."""
 
 
 def weigh(solution: Solution, expectation: Expectation) -> Solution:

@@ -43,56 +43,48 @@ GYRO_STEP_RAD_S: Final = 0.05 * DEG
 ACCEL_STEP_M_S2: Final = 5.0 * MG
 """A second's mean against the start of the stretch: a tilt of 0.3 deg. Warming by 10 K moves consumer parts 2 mg."""
 
-GYRO_BIAS_RAD_S: Final = 10.0 * DEG
-"""Beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)."""
+GYRO_BIAS_RAD_S: Final = 10.0 * DEG  # Beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)
 
 GRAVITY_M_S2: Final = 9.81
 GRAVITY_GATE_M_S2: Final = 1.5
 """Uncalibrated parts miss by up to 0.1 g; a mean that is off by more is another unit, a dead axis or a centrifuge."""
 
 TILT_MOTION_DEG: Final = 0.10
-TILT_STEP_DEG: Final = 0.10
-"""Ten times a field gradienter's noise, and 1.7 mg on a horizontal accelerometer."""
+TILT_STEP_DEG: Final = 0.10  # Ten times a field gradienter's noise, and 1.7 mg on a horizontal accelerometer
 
 HEADING_MOTION_DEG: Final = 2.0
-HEADING_STEP_DEG: Final = 3.0
-"""The class of field compasses; 3 deg cost 0.6 deg/h on a horizontal gyro."""
+HEADING_STEP_DEG: Final = 3.0  # The class of field compasses; 3 deg cost 0.6 deg/h on a horizontal gyro
 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
 _LEAST_RANGE: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
 """No part's range ends below: integers that pile up there are those of a sway that turns back or comes to rest."""
-STUCK_SAMPLES: Final = 10
-"""Fewer may well be equal by chance on a quiet sensor with coarse steps."""
-STUCK_S: Final = 60
-"""Seconds after a change in steps during which a coarse stream may show one value."""
+STUCK_SAMPLES: Final = 10  # Fewer may well be equal by chance on a quiet sensor with coarse steps
+STUCK_S: Final = 60  # Seconds after a change in steps during which a coarse stream may show one value
 
 _TRIADS: Final = (
     ("gyro", slice(0, 3), GYRO_MOTION_RAD_S, GYRO_VIBRATION_RAD_S, DEG, "deg/s"),
     ("accel", slice(3, 6), ACCEL_MOTION_M_S2, ACCEL_VIBRATION_M_S2, MG, "mg"),
 )
-_FEW_LEVELS: Final = 4
-"""Most levels in one second of a stream whose noise is of the size of its steps."""
-_TIMES_EACH: Final = 4
-"""Least readings a level: few samples are never the same, and no steps."""
+_FEW_LEVELS: Final = 4  # Most levels in one second of a stream whose noise is of the size of its steps
+_TIMES_EACH: Final = 4  # Least readings a level: few samples are never the same, and no steps
 _COARSE_S: Final = 3
-"""Seconds of few levels that show a coarse stream."""
 _RECENT: Final = 10
 _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
 _STATIONARY: Final = 2.0
-"""Largest ratio of noise at rest to its usual variance."""
 
 
 class GateVerdict(msgspec.Struct, frozen=True):
-    """Verdict of one gate on one second; `words` name the device and are empty when still."""
+    """Verdict of one gate on one second; `words` name the device and are empty when still.
+
+    `fault`: the device, not the aircraft, blocks the calibration. `what`: the words without figures, for counting.
+    """
 
     still: bool
     words: str = ""
     fault: bool = False
-    """True if the device, not the aircraft, blocks the calibration."""
     what: str = ""
-    """Words without figures, for counting; those of a fault in full."""
 
 
 STILL: Final = GateVerdict(still=True)
@@ -142,9 +134,7 @@ class ImuGate:
         self._few_levels_s = np.zeros(6, dtype=np.int64)
         """Seconds of few levels since the last one of many, for each channel."""
         self._coarse_slot = [-math.inf, -math.inf]
-        """Latest second in which the gyro, or the accelerometer, changed in coarse steps."""
-        self._whites: deque[Floats] = deque(maxlen=_RECENT)
-        """White parts of seconds without motion."""
+        self._whites: deque[Floats] = deque(maxlen=_RECENT)  # of seconds without motion
         self._noise = np.zeros(6)
         """Variance of one sample's white noise; zero until a second was without motion."""
         self.new_stretch()
@@ -160,13 +150,11 @@ class ImuGate:
         self.new_stretch()
 
     def accept(self, batch: Batch) -> None:
-        """Make the second a reference; it is still for all sources."""
         self._recent.append(batch.mean[:3])
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
 
     def judge(self, batch: Batch) -> GateVerdict:
-        """Judge whether this IMU was still; learn its noise on the way."""
         if (broken := self._broken(batch)) is not None:
             return broken
         self._watch_steps(batch)
@@ -267,16 +255,13 @@ class PoseGate:
         self.new_stretch()
 
     def new_stretch(self) -> None:
-        """End the still stretch: the reference pose starts again."""
         self._start: list[Floats] = []
 
     def accept(self, batch: Batch) -> None:
-        """Make the second a reference; it is still for all sources."""
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean)
 
     def judge(self, batch: Batch) -> GateVerdict:
-        """Judge whether this sensor was still."""
         every = slice(None)
         found, allowed = _slow_part(batch, every, self._motion_deg, (0.0, self._motion_deg**2))
         if found > allowed:

@@ -32,8 +32,7 @@ from companion.physics.units import DEG, MG
 LEARN_S: Final = 30
 """Seconds without a motion beyond any noise from which it is learned: some 70 degrees of freedom in three axes."""
 KEPT_S: Final = 60
-EVERY_S: Final = 5
-"""Period of learning until both triads are known, then `LEARN_S`."""
+EVERY_S: Final = 5  # Period of learning until both triads are known, then `LEARN_S`
 MOST: Final = (0.07 * DEG, 1.0 * MG)
 """Largest believed density of gyro and accelerometer, times sqrt(s): 250 deg/h and three times the noisiest common
 accelerometer; the noisiest common gyro has 150 deg/h."""
@@ -46,29 +45,26 @@ ROUND: Final = 40.0
 """Largest over smallest variance of a second's steps in any direction: some axes are three times as noisy as others."""
 _SIGMAS: Final = 2.5
 _OUTLIER_SIGMAS: Final = 4.5
-_BEYOND: Final = 1.6
-"""A second with more than so many times the largest density is motion."""
+_BEYOND: Final = 1.6  # A second with more than so many times the largest density is motion
 _GAP: Final = 4
-"""Largest distance of seconds that still belong together."""
 _SPANS: Final = (1, 2, 4, 8)
 _NAMED: Final = 1.5
-"""Margin over the density of a part that the configuration names."""
 _AT_REST: Final = 3.0
-_HINT_S: Final = 5
-"""Seconds without a motion beyond any noise after which it may be noise."""
+_HINT_S: Final = 5  # Seconds without a motion beyond any noise after which it may be noise
 _SHARPEST: Final = 1.5
 """Relative variance of a second's variance, in v / N^2: 1 for white noise and one pole, 1.5 for two, 2 for a wall."""
 
 
 class Known(msgspec.Struct, frozen=True):
-    """Noise of the three axes of one triad at rest, in squares of its unit."""
+    """Noise of the three axes of one triad at rest, in squares of its unit.
+
+    `variance` is that of one sample, `white` its part in successive differences (`Batch.white`), `density` the N^2 at
+    low frequencies: the variance of a second's mean.
+    """
 
     variance: Floats
-    """Variance of one sample."""
     white: Floats
-    """Part of it in successive differences (`Batch.white`)."""
     density: Floats
-    """N^2 at low frequencies: the variance of a second's mean."""
 
     @property
     def chance(self) -> float:
@@ -113,7 +109,6 @@ class OwnNoise:
         return f" (motion or noise: known in {left_s} s)" if self._since >= _HINT_S and left_s > 0 else ""
 
     def add(self, batch: Batch) -> None:
-        """Add the next second."""
         if not len(batch.allan) or self._is_motion(batch):
             self.clear()
             return
@@ -124,7 +119,6 @@ class OwnNoise:
             self._learn()
 
     def _is_motion(self, batch: Batch) -> bool:
-        """True if a second alone has more than any sensor's noise."""
         most2 = _BEYOND**2 * self._most2
         if self._seconds:
             before = self._seconds[-1]
@@ -187,7 +181,6 @@ def _ratio(first: float, second: float) -> float:
 
 
 def _parts(depth: int) -> Floats:
-    """2, 4, 8 ... parts of a second."""
     return np.asarray(np.exp2(np.arange(1.0, depth + 1.0)))
 
 

@@ -17,8 +17,7 @@ from companion.rotations import ROTATIONS_DEG
 from companion.samples import Triad
 
 MOST_GYRO_RAD_S: Final = 30.0 * DEG
-MOST_ACCEL_M_S2: Final = 0.3 * G
-"""Several times the worst power-up bias in data sheets."""
+MOST_ACCEL_M_S2: Final = 0.3 * G  # Several times the worst power-up bias in data sheets
 _TILTED_RAD: Final = math.radians(20.0)
 """Angle between gravity by the IMU and by the tilt; the largest bias turns it by 17 degrees."""
 _FITS_M_S2: Final = 0.2 * G
@@ -30,7 +29,6 @@ _GRAVITY_M_S2: Final = (8.3, 11.3)
 
 
 def unit_of_force(size: float) -> str:
-    """Name the unit in which a specific force of such size is gravity; empty without one."""
     low, high = _GRAVITY_M_S2
     return next((unit for unit, factor in _UNITS.items() if low <= size * factor <= high), "")
 
@@ -90,6 +88,5 @@ def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehi
 
 
 def _pointing(force: Array) -> str:
-    """Name the axis along specific force, which points up at rest."""
     axis = int(np.abs(force).argmax())
     return f"{_AXES[axis]} points {'up' if force[axis] > 0.0 else 'down'}"

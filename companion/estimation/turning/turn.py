@@ -13,7 +13,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from companion.estimation.noise.slope import FEWEST, fit_slope, hidden_by_steps, plain_slope
+from companion.estimation.noise.lines import FEWEST, fit_slope, hidden_by_steps, plain_slope
 from companion.estimation.seconds.batch import Batch, decimal, few_distinct
 from companion.physics.frames import Array, Matrix
 from companion.physics.units import DEG
@@ -26,31 +26,28 @@ LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
 SIGNIFICANT: Final = 4.0
 """Sigmas; rates are judged every second: 3 would be exceeded by chance in one still minute of a hundred."""
 CHANCE_SIGMAS: Final = 2.0
-EVEN: Final = 0.25
-"""Share of the rate that each half of the headings must show; after a jump one half does not."""
+EVEN: Final = 0.25  # Share of the rate that each half of the headings must show; after a jump one half does not
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True):
-    """Angular rate of the platform during a window."""
+    """Angular rate of the platform during a window: clockwise about the vertical, and tilting (level, vehicle FRD).
+
+    Where nothing measures it, `by` is None, and the platform counts as fixed to the Earth. `noise_rad_s`: sigma of the
+    gyros without warm-up. `step_rad_s`: error of the window's mean where a turn may have begun within it. `is_vouched`:
+    a compass has seen the level of the gyros at rest; else that level may hold a turn itself.
+    """
 
     rate_rad_s: float = 0.0
-    """About the vertical, clockwise seen from above; never subtracted."""
     sigma_rad_s: float = 0.0
     noise_rad_s: float = 0.0
-    """Sigma of the gyros without warm-up."""
     by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None = None
-    """None: nothing measures it, and the platform counts as fixed to the Earth."""
     tilting_rad_s: Vector = (0.0, 0.0, 0.0)
-    """Level part, vehicle FRD."""
     tilting_sigma_rad_s: float = 0.0
     step_rad_s: float = 0.0
-    """Error of the window's mean where a turn may have begun within it."""
     is_vouched: bool = True
-    """A compass has seen the level of the gyros at rest; else that level may hold a turn."""
 
     @property
     def is_significant(self) -> bool:
-        """True if the platform turns about the vertical."""
         least = LEAST_BY_GYROS_RAD_S if self.by == "gyros" else LEAST_RAD_S
         return abs(self.rate_rad_s) > max(SIGNIFICANT * self.sigma_rad_s, least)
 
@@ -63,7 +60,6 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_chance(self) -> bool:
-        """True if a platform at rest may well show such a rate."""
         return abs(self.rate_rad_s) <= CHANCE_SIGMAS * self.sigma_rad_s
 
     @property
@@ -73,7 +69,6 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def at_most_rad_s(self) -> float:
-        """Rate about the vertical that is hardly exceeded."""
         return abs(self.rate_rad_s) + 2.0 * self.sigma_rad_s
 
     @property
@@ -94,7 +89,6 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
         return np.outer(up, up) * self.variance + np.outer(tilting, tilting) + level * self.tilting_sigma_rad_s**2
 
     def contradicts(self, other: Turn) -> bool:
-        """Return whether another estimate of the platform's rate differs significantly."""
         return abs(self.rate_rad_s - other.rate_rad_s) > SIGNIFICANT * math.hypot(self.sigma_rad_s, other.sigma_rad_s)
 
 

@@ -20,91 +20,76 @@ import msgspec
 import numpy as np
 
 from companion.config.sections import AllanModel, NoiseProfile
-from companion.estimation.noise.allan import floor_variance
-from companion.estimation.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
+from companion.estimation.noise.allan import columns, floor_variance
+from companion.estimation.noise.lines import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.estimation.seconds.batch import Batch
-from companion.estimation.turning.turn import SIGNIFICANT, Turn, by_both, by_compass, by_gyros
+from companion.estimation.turning.turn import CHANCE_SIGMAS, SIGNIFICANT, Turn, by_both, by_compass, by_gyros
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.units import DEG, DEG_H
 
-LEVEL_S: Final = 5
-"""Least seconds at rest that make a level."""
+LEVEL_S: Final = 5  # Least seconds at rest that make a level
 RESTED_S: Final = 20
 """Least seconds before a step within a window: just after switching on, a gyro warms up as fast as a step."""
 NOISE_KNOWN_S: Final = 20
 """Least seconds that show the white noise of their means; before that, the noise of the last window holds."""
-PER_K_RAD_S: Final = 54.0 * DEG_H
-"""Bias of a common gyro per kelvin (BMI088, method 2.1)."""
-PER_G_RAD_S: Final = 0.1 * DEG
-"""Sensitivity of an uncompensated MEMS gyro to gravity: another tilt gives another level."""
+PER_K_RAD_S: Final = 54.0 * DEG_H  # Bias of a common gyro per kelvin (BMI088, method 2.1)
+PER_G_RAD_S: Final = 0.1 * DEG  # Sensitivity of an uncompensated MEMS gyro to gravity: another tilt gives another level
 EARTH_RAD_S: Final = 15.04 * DEG_H
 WARMING_S: Final = 120.0
 """A warm-up that is visible now may have been twice as steep for so long; an invisible one is over after it."""
-WARMING_RAD_S2: Final = 0.5 * DEG_H
-"""Drift of an older level without thermometer, at most by `WARMED_RAD_S`."""
+WARMING_RAD_S2: Final = 0.5 * DEG_H  # Drift of an older level without thermometer, at most by `WARMED_RAD_S`
 WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
 RAMP_SIGMAS: Final = 1.5
-HINT_SIGMAS: Final = 2.0
-"""A smaller step is chance."""
 STEP_SIGMAS: Final = 5.0
-STEP_CHI_SQUARE: Final = 12.0
-"""Gain of a step over a cubic, a warm-up, from which it is sure."""
+STEP_CHI_SQUARE: Final = 12.0  # Gain of a step over a cubic, a warm-up, from which it is sure
 ACROSS_SHARE: Final = 0.25
 """Share of a turn about the vertical that an error of the vertical, some degrees, shows in the level plane."""
-STEADY_SIGMAS: Final = 2.5
-"""Seconds that are farther off do not join the level: a slow turn would become the level."""
-CLEARED_S: Final = 10
-"""Seconds after which gyros at their level have not begun to turn with the latest movement."""
-SMOOTHED_OVER: Final = 5
-"""Headings in one value of the wander, so that noise does not look like wander."""
-BLIND_S: Final = 5
-"""Longest pause, for example while offsets are written, after which headings still belong together."""
+STEADY_SIGMAS: Final = 2.5  # Seconds that are farther off do not join the level: a slow turn would become the level
+CLEARED_S: Final = 10  # Seconds after which gyros at their level have not begun to turn with the latest movement
+SMOOTHED_OVER: Final = 5  # Headings in one value of the wander, so that noise does not look like wander
+BLIND_S: Final = 5  # Longest pause, for example while offsets are written, after which headings still belong together
 
+# Columns of a second; rates and forces in vehicle FRD.
 _SLOT: Final = 0
 _RATES: Final = slice(1, 4)
+_FORCES: Final = slice(4, 7)
 _READINGS: Final = slice(1, 7)
-"""Rates and forces, vehicle FRD."""
-_DEGC: Final = 7
-"""NaN without a thermometer."""
-_TURNED: Final = 8
-"""Variance of the platform's rate by the compass, for seconds of the level; NaN without a compass."""
+_DEGC: Final = 7  # NaN without a thermometer
+_TURNED: Final = 8  # Variance of the platform's rate by the compass, for seconds of the level; NaN without a compass
 
 
 class ImuLevel:
     """Seconds of one IMU: those of the current window, and those at rest before it, which are its level.
 
     `rotation`: sensor to vehicle FRD; `steps`: resolution of its stream, rad/s and m/s^2, 0 for floats.
+
+    Found by `look`: `turn`, the rate about the vertical above the level, None without a level; `has_changed`, part of
+    that rate lies in the level plane, as no turn of the ground does: the sensor itself has changed; `tilting_rad_s`,
+    rotation of the direction of gravity, (3,) horizontal, vehicle FRD; `began`, the first second after a step of the
+    rate that neither the part's noise nor a warm-up explains; `step_rad_s`, the error that the likeliest step leaves in
+    the mean of the window, 0 where it is chance; `white`, the white noise N about the vertical.
     """
 
     def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
         self._gyro, self._steps, self._span = profile.gyro, steps, span
-        self._turned = np.kron(np.eye(2), rotation)
-        self._least = np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
-        """N, B and K of its six channels."""
+        self._rotation = np.kron(np.eye(2), rotation)
+        self._least = columns(profile)
         self._white = np.zeros(6)
-        """White noise of the last window that was long enough to show it; only that of the gyros is kept."""
+        """N of the gyros in the last window that was long enough to show it."""
         self.window: deque[Floats] = deque()
         self.rest: deque[Floats] = deque(maxlen=2 * span)
-        """The level."""
         self.turn: Turn | None = None
-        """Rate about the vertical above the level at rest; None without a level."""
         self.has_changed = False
-        """Part of that rate lies in the level plane, as no turn of the ground does: the sensor itself has changed."""
         self.tilting_rad_s: Array = np.zeros(3)
-        """Rotation of the direction of gravity: (3,) horizontal, vehicle FRD."""
         self.tilting_variance = 0.0
-        """Variance of each component."""
         self.began: int | None = None
-        """First second after a step of the rate that neither the part's noise nor a warm-up explains."""
         self.step_rad_s = 0.0
-        """Error that the likeliest step leaves in the mean of the window; 0 where it is chance."""
         self.white = 0.0
-        """White noise N about the vertical."""
 
     def add(self, slot: int, batch: Batch, turned: float | None) -> None:
         """Add a still second; one that leaves the window joins the level, with `turned` as in `end_window`."""
         degc = math.nan if batch.temperature_degc is None else batch.temperature_degc
-        self.window.append(np.array([slot, *self._turned @ batch.mean, degc, math.nan]))
+        self.window.append(np.array([slot, *self._rotation @ batch.mean, degc, math.nan]))
         self._variance = batch.variance
         self.end_window(turned, self._span)
 
@@ -132,7 +117,6 @@ class ImuLevel:
         self.end_window(turned)
 
     def _usual(self) -> float:
-        """Variance of the platform's rate during the level."""
         return sum(float(second[_TURNED]) for second in self.rest) / len(self.rest) if self.rest else math.nan
 
     def look(self) -> bool:
@@ -142,8 +126,8 @@ class ImuLevel:
         window = np.array(self.window)
         slots, rows = window[:, _SLOT].astype(np.int64), window[:, _READINGS]
         # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, which is enough here.
-        force = rows[:, 3:].mean(axis=0)
-        size = _length(force)
+        force = window[:, _FORCES].mean(axis=0)
+        size = float(np.linalg.norm(force))
         down = np.asarray(-force / size)
         shows_noise = len(slots) >= NOISE_KNOWN_S
         slope = fit_slope(
@@ -160,20 +144,19 @@ class ImuLevel:
         self.began, self.step_rad_s = None, 0.0
         if self._steps[0] == 0.0 and len(window) >= RESTED_S + LEVEL_S:
             self.began, self.step_rad_s = _step(window[:, _SLOT], window[:, _RATES] @ down, self.white, self._gyro)
-        self.turn, self.has_changed = self._above_level(window, slope, down)
+        self.turn, self.has_changed = None, False
+        if len(self.rest) >= LEVEL_S:
+            self.turn, self.has_changed = self._above_level(window, slope, down)
         up, moves = -down, slope.per_s[3:] / size
         # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
         self.tilting_rad_s = np.cross(moves - up * (up @ moves), up)
         self.tilting_variance = float(slope.variance[3:].max()) / size**2
         return True
 
-    def _above_level(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn | None, bool]:
+    def _above_level(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn, bool]:
         """Return the rate above the level about the vertical, and whether another part is above it too."""
         count, weight = len(window), len(self.rest)
-        if weight < LEVEL_S:
-            return None, False
-        level = np.array(self.rest).mean(axis=0)
-        now = window.mean(axis=0)
+        level, now = np.array(self.rest).mean(axis=0), window.mean(axis=0)
         off = now[_RATES] - level[_RATES]
         unseen = float(np.nan_to_num(level[_TURNED]))
         age_s = float(now[_SLOT] - level[_SLOT])
@@ -189,7 +172,7 @@ class ImuLevel:
             warmed = min(WARMING_RAD_S2 * max(age_s - WARMING_S, 0.0), WARMED_RAD_S)
         # Integers of the stream hide up to half a step each time.
         hidden = 0.5 * self._steps[0]
-        leaned = _length(down + level[4:7] / _length(level[4:7]))
+        leaned = float(np.linalg.norm(down + level[_FORCES] / np.linalg.norm(level[_FORCES])))
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
         variance = noise + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
@@ -206,10 +189,6 @@ class ImuLevel:
         return turn, bool((across > limit).any())
 
 
-def _length(vector: Floats) -> float:
-    return math.sqrt(vector @ vector)
-
-
 def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tuple[int | None, float]:
     """Return `began` and `step_rad_s` for (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`."""
     count = len(values)
@@ -221,7 +200,7 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tup
     best = int(np.argmax(np.square(jump) / chance))
     first, last = float(before[best]), float(after[best])
     sigma = math.sqrt(chance[best] + floor_variance(model.flicker, model.walk, first, last))
-    if abs(jump[best]) <= HINT_SIGMAS * sigma:
+    if abs(jump[best]) <= CHANCE_SIGMAS * sigma:
         return None, 0.0
     time = (slots - slots[0]) / (slots[-1] - slots[0])
     basis, _ = np.linalg.qr(np.vander(time, 4))
@@ -231,10 +210,7 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tup
 
 
 class TurnWatch:
-    """Estimates the platform's rate from every second of all sources.
-
-    `span`: seconds of the longest window.
-    """
+    """Estimates the platform's rate from every second of all sources; `span`: seconds of the longest window."""
 
     def __init__(self, span: int) -> None:
         self._span = span
@@ -243,20 +219,16 @@ class TurnWatch:
         """Seconds of the compass since the last movement, and whether each is one of the still stretch."""
         self._last_slot = 0
         self._start: int | None = None
-        """First second of the still stretch."""
         self._is_suspect = False
         """Gyros that have moved or stepped since may be off their level by a turn; else they drift."""
         self.turn = Turn()
-        """Rate as of the last second."""
         self.words = ""
         """Reason why no calibration is possible, for a pilot; empty without one."""
 
     def set_imu(self, name: str, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float]) -> None:
-        """Add an IMU, or begin anew with another stream of it; arguments as for `ImuLevel`."""
         self._levels[name] = ImuLevel(rotation, profile, steps, self._span)
 
     def forget(self, imu: str | None) -> None:
-        """Drop readings of one IMU, or of all: they are not comparable with later ones."""
         for name, level in self._levels.items():
             if imu is None or name == imu:
                 level.window.clear()
@@ -272,7 +244,6 @@ class TurnWatch:
         self.turn = Turn()
 
     def moved(self) -> None:
-        """The gyros or the gradienter felt a movement."""
         self._headings.clear()
         self._is_suspect = True
         self.words = ""
@@ -288,11 +259,8 @@ class TurnWatch:
     def add_second(self, slot: int, imus: Mapping[str, Batch], heading: Batch | None, *, good: bool) -> bool:
         """Add a second in which nothing but, perhaps, the compass has moved; False where the stretch ends with it.
 
-        Args:
-            slot: ascending.
-            imus: by name.
-            heading: None without one, or while it still follows a movement.
-            good: whether the second belongs to a still stretch.
+        `slot` ascends; `heading` is None without one, or while it still follows a movement; `good`: the second belongs
+        to a still stretch.
         """
         if slot - self._last_slot > BLIND_S:
             self._headings.clear()
@@ -325,17 +293,7 @@ class TurnWatch:
                 level.split(quietest.began)
             self._is_suspect = True
             return False
-        gyros = by_gyros([one.turn for one in found if one.turn is not None and not one.has_changed])
-        seen = by_compass([batch for _, batch in self._headings])
-        if seen is None or not seen.is_significant:
-            # A jump of the compass may lie before the still stretch.
-            seen = by_compass([batch for good, batch in self._headings if good])
-        turn = by_both(gyros, seen)
-        # A gyro has changed itself if other gyros or a heading that stands contradict it.
-        others = gyros or turn if turn.is_significant else turn
-        for one in found:
-            if one.turn is not None and (one.has_changed or one.turn.contradicts(others)):
-                one.rest.clear()
+        turn = self._combined(found)
         if quietest is not None:
             surest = min(found, key=lambda one: one.tilting_variance)
             turn = msgspec.structs.replace(
@@ -349,13 +307,30 @@ class TurnWatch:
         is_long = self._start is not None and slot - self._start >= CLEARED_S
         if is_long and abs(turn.rate_rad_s) <= STEADY_SIGMAS * noise:
             self._is_suspect = False
-        self.words = ""
-        if turn.is_significant and (turn.by != "gyros" or self._is_suspect):
-            self.words = f"the aircraft {turn.in_words}"
-            if turn.by == "compass and gyros":
-                self.words += ": gyros and compass turn together"
-            elif turn.by == "gyros" and len(self._levels) == 1:
-                self.words += (
-                    f", or gyro {next(iter(self._levels))} has changed: if it stands still, restart the companion"
-                )
+        self.words = self._blocking_reason()
         return True
+
+    def _combined(self, found: list[ImuLevel]) -> Turn:
+        """Combine both witnesses; an IMU that they contradict has changed itself, and its level begins anew."""
+        gyros = by_gyros([one.turn for one in found if one.turn is not None and not one.has_changed])
+        seen = by_compass([batch for _, batch in self._headings])
+        if seen is None or not seen.is_significant:
+            # A jump of the compass may lie before the still stretch.
+            seen = by_compass([batch for good, batch in self._headings if good])
+        turn = by_both(gyros, seen)
+        others = gyros or turn if turn.is_significant else turn
+        for one in found:
+            if one.turn is not None and (one.has_changed or one.turn.contradicts(others)):
+                one.rest.clear()
+        return turn
+
+    def _blocking_reason(self) -> str:
+        turn = self.turn
+        if not turn.is_significant or (turn.by == "gyros" and not self._is_suspect):
+            return ""
+        words = f"the aircraft {turn.in_words}"
+        if turn.by == "compass and gyros":
+            words += ": gyros and compass turn together"
+        elif turn.by == "gyros" and len(self._levels) == 1:
+            words += f", or gyro {next(iter(self._levels))} has changed: if it stands still, restart the companion"
+        return words

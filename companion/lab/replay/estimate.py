@@ -15,8 +15,8 @@ import numpy as np
 
 from companion.config.sections import Mounting, NoiseProfile
 from companion.errors import CalibrationRefusedError, StorageError
+from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.measurement import Measurement
-from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from companion.config.sections import NoiseProfile
-from companion.estimation.collector.outlook import is_enough
+from companion.estimation.collector.measurement import is_enough
 from companion.estimation.means.integers import MIN_BEYOND_TWO, fit, shape_variance, truncation_edges
-from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, imu_estimates
+from companion.estimation.means.windows import Estimate, ImuInput, ImuWindow, imu_window
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu, settings
@@ -65,7 +65,7 @@ Found = tuple[Estimate, ImuWindow]
 
 
 def estimate(batches: list[Batch], profile: NoiseProfile = QUIET) -> Found:
-    return imu_estimates([stream(profile)], [batches], end_s=batches[-1].slot + 1.0, horizon_s=180.0, rejected=0)[0]
+    return imu_window(stream(profile), batches, end_s=batches[-1].slot + 1.0, horizon_s=180.0, rejected=0)
 
 
 def errors(found: Found, mean_lsb: Floats) -> Floats:

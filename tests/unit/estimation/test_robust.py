@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.noise.robust import HUBER_C, huber_line, huber_mean, robust_mean, slope_limit
+from companion.estimation.noise.lines import HUBER_C, huber_line, huber_mean, robust_mean, slope_limit
 
 
 def test_huber_mean_solves_its_own_equation() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector import measurement
-from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.physics.units import DEG, DEG_H
 from companion.recording.messages import encode
@@ -374,7 +374,7 @@ def test_an_estimate_worked_out_elsewhere_is_the_window_that_would_have_been(mon
     found = work.run()
     there.collector.accept(work, found)
     assert there.collector.pending(there.now_s) is None
-    monkeypatch.setattr(measurement, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
+    monkeypatch.setattr(measurement, "imu_window", lambda *_, **__: pytest.fail("worked out on the spot"))
     assert encode(there.collector.window(there.now_s)) == encode(expected)
     assert there.collector.status(there.now_s).waiting_for is None
 
@@ -385,7 +385,7 @@ def test_while_the_next_estimate_is_worked_out_the_status_gives_the_one_before(
     feed = feeder(SILENT)
     feed.run(20.0)
     before = feed.collector.status(feed.now_s).progress
-    monkeypatch.setattr(measurement, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
+    monkeypatch.setattr(measurement, "imu_window", lambda *_, **__: pytest.fail("worked out on the spot"))
     feed.run(1.0)
     assert feed.collector.pending(feed.now_s) is not None
     assert before <= feed.collector.status(feed.now_s).progress < 1.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware import imu_messages
-from companion.estimation.seconds.thermometer import Thermometer
+from companion.estimation.collector.intake import Thermometer
 
 Degc = Callable[[int], float | None]
 

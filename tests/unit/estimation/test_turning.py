@@ -13,7 +13,7 @@ from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.machine import What
 from companion.estimation.means.pose import CompassModel
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.noise.slope import fit_slope
+from companion.estimation.noise.lines import fit_slope
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.estimation.turning.turn import Turn

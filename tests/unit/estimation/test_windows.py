@@ -13,7 +13,7 @@ from companion.config import parse
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.configured.models import gyro_sigmas_deg_h
 from companion.estimation.means.pose import heading_window, tilt_window
-from companion.estimation.means.windows import ImuInput, estimate, imu_estimates
+from companion.estimation.means.windows import ImuInput, estimate, imu_window
 from companion.estimation.noise.allan import noise_profile, predicted_sigma
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
@@ -47,7 +47,7 @@ def batches_of(means: Floats, *, spread: float = 1.0, n: int = 100) -> list[Batc
 
 
 def window_of(source: ImuInput, batches: list[Batch], horizon_s: float = 180.0):  # type: ignore[no-untyped-def]
-    return imu_estimates([source], [batches], end_s=batches[-1].slot + 1.0, horizon_s=horizon_s, rejected=0)[0][1]
+    return imu_window(source, batches, end_s=batches[-1].slot + 1.0, horizon_s=horizon_s, rejected=0)[1]
 
 
 @pytest.mark.parametrize("seconds", [10, 30, 60])
