@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.arm_authorisation import ArmAuthoriser
+from companion.component.component import ArmAuthoriser
 from companion.daemon.job import Job
 from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector

@@ -21,7 +21,6 @@ import logging
 import math
 import re
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable
 from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -29,7 +28,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion import __version__
 from companion.commands import Calibrate, Cancel, Undo
 from companion.component.service import AcceptedJob, CalibrationService, Refusal
-from companion.component.statustext import Say, Severity, Weight
+from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Senders
 from companion.estimation.machine import What
 from companion.links.mavlink.link import MavlinkLink
@@ -41,12 +40,16 @@ MAV_RESULT_CANCELLED = 6
 ACK_PERIOD_S = 0.4
 """QGroundControl gives up 1.2 s after the last IN_PROGRESS, so that two may be lost in a row."""
 NOTHING_RAN: Final = 1
-"""`result_param2` of a cancel's ACK when there was nothing to cancel."""
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
 MAX_REMEMBERED: Final = 32
 _RETRY_S = 0.1
 
+_REFUSALS: Final = {
+    "busy": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+    "unsupported": mavlink.MAV_RESULT_UNSUPPORTED,
+}
+"""Result by the kind of a refusal; the others are DENIED."""
 _RESULTS = {
     "done": mavlink.MAV_RESULT_ACCEPTED,
     "failed": mavlink.MAV_RESULT_FAILED,
@@ -58,7 +61,6 @@ _WORDS = {
     What.ACCELEROMETERS: "accelerometers",
 }
 _NAMES: dict[type, str] = {Calibrate: "Calibration", Undo: "Undo", Cancel: "Cancel"}
-"""Requests that need permission."""
 
 CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message
 
@@ -71,24 +73,13 @@ class Key(NamedTuple):
     command: int
 
 
-class Refused(NamedTuple):
-    """A refusal: the MAV_RESULT and the reason."""
-
-    result: int
-    reason: str
-
-
 Request = Calibrate | Undo | Cancel | Literal["version"]
-"""A checked request; "version": for AUTOPILOT_VERSION."""
 
 
 class Permission:
-    """Checks senders against `mavlink.allow`, counts refusals, and logs the first one of each sender."""
-
     def __init__(self, senders: Senders) -> None:
         self.senders = senders
         self.refused: Counter[tuple[int, int]] = Counter()
-        """Refusals of the first 32 senders."""
 
     def refuses(self, sender: tuple[int, int], what: str) -> str:
         """Return why a sender (system, component) may not request this; empty when it may."""
@@ -122,15 +113,10 @@ class CommandServer:
     """
 
     def __init__(
-        self,
-        link: MavlinkLink,
-        service: CalibrationService,
-        say: Say,
-        wake: Callable[[], None],
-        permission: Permission,
+        self, link: MavlinkLink, service: CalibrationService, texts: StatusText, permission: Permission
     ) -> None:
-        self._link, self._service, self._say, self._wake = link, service, say, wake
-        self._permission = permission
+        self._link, self._service, self._permission = link, service, permission
+        self._say, self._woken = texts.say, texts.woken
         self._running: _Running | None = None
         self._next_ack_s = 0.0
         self._finals: OrderedDict[Key, _Final] = OrderedDict()
@@ -178,7 +164,7 @@ class CommandServer:
         request = self._permit(key, judge(message))
         copy = self._is_copy(bytes(message.get_msgbuf()), now_s)
         running = self._running
-        if running is not None and running.key == key and not isinstance(request, Refused):
+        if running is not None and running.key == key and not isinstance(request, Refusal):
             if request != running.request:
                 # Not by an ACK, which would be taken for the end of the running job.
                 before = running.request
@@ -197,16 +183,14 @@ class CommandServer:
             return
         self._obey(key, request, now_s)
 
-    def _permit(self, key: Key, request: Request | Refused) -> Request | Refused:
-        """Return the request, or its refusal when the sender has no permission."""
+    def _permit(self, key: Key, request: Request | Refusal) -> Request | Refusal:
         name = _NAMES.get(type(request))
         if name is None:
             return request
         reason = self._permission.refuses((key.system_id, key.component_id), name.lower())
-        return Refused(mavlink.MAV_RESULT_DENIED, f"{name} refused: {reason}") if reason else request
+        return _denied(f"{name} refused: {reason}") if reason else request
 
     def _is_copy(self, packet: bytes, now_s: float) -> bool:
-        """Return whether the network delivered this packet, sequence number included, before."""
         while self._packets and now_s - self._packets[0][0] > SAME_PACKET_S:
             self._packets.popleft()
         if any(before == packet for _, before in self._packets):
@@ -214,7 +198,7 @@ class CommandServer:
         self._packets.append((now_s, packet))
         return False
 
-    def _obey(self, key: Key, request: Request | Refused, now_s: float) -> None:
+    def _obey(self, key: Key, request: Request | Refusal, now_s: float) -> None:
         try:
             match request:
                 case Calibrate() | Undo():
@@ -224,14 +208,15 @@ class CommandServer:
                 case "version":
                     self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
                     self._link.send(autopilot_version())
-                case Refused(result, reason):
+                case Refusal():
                     # Ground stations try out by themselves what a component supports: that is worth no warning.
-                    unsupported = result == mavlink.MAV_RESULT_UNSUPPORTED
-                    self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
+                    severity = Severity.INFO if request.kind == "unsupported" else Severity.WARNING
+                    self._refuse(key, request, now_s, severity)
         except Exception:
             name = _NAMES.get(type(request), "Request")
             logger.exception("%s failed", name)
-            self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
+            self._say(Severity.WARNING, f"{name} failed: internal error, see the log", Weight.REFUSAL)
+            self._finally(key, mavlink.MAV_RESULT_FAILED, now_s)
 
     def _start(self, key: Key, request: Calibrate | Undo, now_s: float) -> None:
         name = _NAMES[type(request)]
@@ -239,8 +224,7 @@ class CommandServer:
             self.step(now_s)
         if self._running is not None:
             other = "an undo" if isinstance(self._running.request, Undo) else "a calibration"
-            reason = f"{name} refused: {other} is running"
-            self._refuse(key, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, now_s)
+            self._refuse(key, Refusal("busy", f"{name} refused: {other} is running"), now_s)
             return
         requester = f"mavlink {key.system_id}/{key.component_id}"
         if isinstance(request, Undo):
@@ -248,15 +232,14 @@ class CommandServer:
         else:
             job = self._service.start_calibration(request.biases, requester, reboot=request.reboot)
         if isinstance(job, Refusal):
-            later, never = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_DENIED
-            self._refuse(key, later if job.kind == "busy" else never, f"{name} refused: {job.reason}", now_s)
+            self._refuse(key, Refusal(job.kind, f"{name} refused: {job.reason}"), now_s)
             return
         self._finals.pop(key, None)
         self._running = _Running(key, request, job)
         self._acknowledge_progress(self._running)
         self._next_ack_s = now_s + ACK_PERIOD_S
-        job.finished.add_done_callback(lambda _: self._wake())
-        self._wake()
+        job.finished.add_done_callback(lambda _: self._woken.set())
+        self._woken.set()
 
     def _cancel(self, key: Key, now_s: float) -> None:
         was_running = self._service.cancel(f"mavlink {key.system_id}/{key.component_id}")
@@ -265,13 +248,12 @@ class CommandServer:
         self._finally(key, mavlink.MAV_RESULT_ACCEPTED, now_s, 0 if was_running else NOTHING_RAN)
 
     def _finish(self, running: _Running, now_s: float) -> None:
-        """Acknowledge the end; the service itself says how a job ended."""
         self._running = None
         self._finally(running.key, _RESULTS[running.job.finished.result().outcome], now_s)
 
-    def _refuse(self, key: Key, result: int, reason: str, now_s: float, severity: Severity = Severity.WARNING) -> None:
-        self._say(severity, reason, Weight.REFUSAL)
-        self._finally(key, result, now_s)
+    def _refuse(self, key: Key, refusal: Refusal, now_s: float, severity: Severity = Severity.WARNING) -> None:
+        self._say(severity, refusal.reason, Weight.REFUSAL)
+        self._finally(key, _REFUSALS.get(refusal.kind, mavlink.MAV_RESULT_DENIED), now_s)
 
     def _finally(self, key: Key, result: int, now_s: float, detail: int = 0) -> None:
         sent = self._acknowledge(key, result, detail=detail)
@@ -280,7 +262,7 @@ class CommandServer:
         if len(self._finals) > MAX_REMEMBERED:
             self._finals.popitem(last=False)
         if not sent:
-            self._wake()
+            self._woken.set()
 
     def _send_unsent(self, now_s: float) -> float:
         """Send final ACKs again that the transport did not take, while their requesters may still wait."""
@@ -313,7 +295,6 @@ CAPABILITIES = (
 
 
 def autopilot_version() -> mavlink.MAVLink_autopilot_version_message:
-    """AUTOPILOT_VERSION (148) of this component: its capabilities and the companion's own version."""
     nothing = (0,) * 8
     return mavlink.MAVLink_autopilot_version_message(
         CAPABILITIES, encode_version(__version__), 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
@@ -329,7 +310,7 @@ def encode_version(version: str) -> int:
     return major << 24 | minor << 16 | patch << 8 | release_type
 
 
-def judge(message: CommandMessage) -> Request | Refused:
+def judge(message: CommandMessage) -> Request | Refusal:
     """Return the request of a command. NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
     if isinstance(message, mavlink.MAVLink_command_int_message):
         last = float(message.x), float(message.y), message.z
@@ -350,14 +331,14 @@ def judge(message: CommandMessage) -> Request | Refused:
         case mavlink.MAV_CMD_REQUEST_MESSAGE if first == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             return "version"
         case mavlink.MAV_CMD_REQUEST_MESSAGE if 0 <= first < 1 << 24 and first.is_integer():
-            return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {first:.0f} cannot be requested here")
+            return Refusal("unsupported", f"Message {first:.0f} cannot be requested here")
         case mavlink.MAV_CMD_REQUEST_MESSAGE:
             return _denied(f"Message request refused: param1 {first:g}")
         case other:
-            return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Command {other} is not supported by the companion")
+            return Refusal("unsupported", f"Command {other} is not supported by the companion")
 
 
-def _calibrate(which: float, reboot: float) -> Calibrate | Refused:
+def _calibrate(which: float, reboot: float) -> Calibrate | Refusal:
     # NaN stands for "not given" with some ground stations.
     if reboot not in (0.0, 1.0) and not math.isnan(reboot):
         return _denied(f"Calibration refused: param2 {reboot:g}, allowed 0, 1")
@@ -367,7 +348,7 @@ def _calibrate(which: float, reboot: float) -> Calibrate | Refused:
     return _denied(f"Calibration refused: param1 {which:g}, allowed 0, 1, 2")
 
 
-def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused:
+def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refusal:
     """Parse MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers.
 
     Mission Planner's button always sets param3, ground pressure, too: it is ignored beside gyros or accelerometers.
@@ -381,5 +362,5 @@ def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused
     return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate.of(what)
 
 
-def _denied(reason: str) -> Refused:
-    return Refused(mavlink.MAV_RESULT_DENIED, reason)
+def _denied(reason: str) -> Refusal:
+    return Refusal("other", reason)

@@ -1,4 +1,4 @@
-"""MAVLink component 191: one loop sends heartbeats, ACKs, texts, tunes and parameters."""
+"""MAVLink component 191: one loop sends heartbeats, ACKs, texts, tunes and parameters; arming requests are answered."""
 
 from __future__ import annotations
 
@@ -9,26 +9,118 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
-from companion.component.statustext import StatusText, Tunes
+from companion.component.statustext import Say, Severity, StatusText, Tunes, Weight, shortened, to_ascii
 from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
+from companion.lua import to_script
+
+VALID_S: Final = 10
+"""Validity of an ACCEPTED; 0 would expire at once."""
+TOLD_BY_US: Final = 1
+"""MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot stays silent; our STATUSTEXT has the reason."""
+REPEAT_S: Final = 0.05
+"""Delay of a second, equal answer: links lose packets, and PX4 drops an answer with the time of its question, as
+happens in SITL's lockstep."""
+ATTEMPT_S: Final = 1.5
+"""Time after which a request that is no retransmission begins a new attempt."""
+_RESULTS: Final = {
+    "accept": mavlink.MAV_RESULT_ACCEPTED,
+    "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+    "refuse": mavlink.MAV_RESULT_DENIED,
+}
+
+
+class ArmAuthoriser:
+    """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST of our autopilot (PX4) at once, and of nobody else.
+
+    The protocol was observed on the firmware (autopilots 9.2) and differs from the message definitions: the validity
+    goes into result_param2, the reason into progress, and an answer that is not addressed to the vehicle's own system
+    id is ignored. An attempt brings two requests, and retransmissions of both; each is answered, but people are told
+    once.
+    """
+
+    def __init__(self, link: MavlinkLink, gate: ArmGate, say: Say) -> None:
+        self._link, self._gate, self._say = link, gate, say
+        self._attempt_s = -math.inf
+        link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
+
+    def _on_message(self, message: mavlink.MAVLink_command_long_message, now_s: float) -> None:
+        if message.command != mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
+            return
+        autopilot = self._link.autopilot
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        if autopilot is None or sender != (autopilot[0], mavlink.MAV_COMP_ID_AUTOPILOT1):
+            return
+        target = (message.target_system, message.target_component)
+        if target not in ((self._link.system_id, 0), (self._link.system_id, self._link.component_id)):
+            return  # PX4 asks on every link; whom it asks is checked with its parameters
+        if self._gate.at_arm == "off":
+            return
+        answer, gate = self._gate.answer(), self._gate.at_arm == "gate"
+        result = _RESULTS[answer.verdict] if gate else mavlink.MAV_RESULT_ACCEPTED
+        accepted = result == mavlink.MAV_RESULT_ACCEPTED
+        progress = TOLD_BY_US if result == mavlink.MAV_RESULT_DENIED else 0
+        ack = mavlink.MAVLink_command_ack_message(
+            message.command, result, progress, VALID_S if accepted else 0, *sender
+        )
+        self._link.send(ack)
+        asyncio.get_running_loop().call_later(REPEAT_S, self._link.send, ack)
+        if self._begins_attempt(message.confirmation, now_s) and answer.verdict != "accept":
+            words = f"{'Not armed' if gate else 'Arming uncalibrated'}: {answer.words}"
+            self._say(Severity.WARNING, words, Weight.REFUSAL)
+
+    def _begins_attempt(self, confirmation: int, now_s: float) -> bool:
+        if now_s - self._attempt_s <= ATTEMPT_S or (confirmation > 0 and now_s - self._attempt_s <= 3 * ATTEMPT_S):
+            return False
+        self._attempt_s = now_s
+        return True
+
+
+SCRIPT_PERIOD_S: Final = 0.5
+MARK: Final = b"CMPA\x01"
+REASON_BYTES: Final = 41 - len("Companion: ")
+"""Length of the reason that ArduPilot shows (autopilots 5.3), less the prefix of the script."""
+VERDICTS: Final = {"wait": 0, "accept": 1, "refuse": 2}
+NOT_GATING: Final = 3
+
+
+class ArmingScript:
+    """Sends the verdict to ArduPilot's arming script (companion/lua/companion_arming.lua) twice a second.
+
+    The component's loop sends it: the script closes the gate after 3 s without it, so that a loop that hangs closes it
+    too. TUNNEL carries it: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the
+    autopilot alone, and it has room for the reason as text. Payload: "CMPA", version 1, verdict (0 wait, 1 accept,
+    2 refuse, 3 nothing is gated any more), then the reason, ASCII.
+    """
+
+    def __init__(self, link: MavlinkLink, gate: ArmGate) -> None:
+        self._link, self._gate = link, gate
+        self._next_s = -math.inf
+
+    def step(self, now_s: float) -> float:
+        """Send what is due; return when to send next (infinity: not needed until the next heartbeat)."""
+        autopilot = self._link.autopilot
+        if autopilot is None or not self._link.connected or not self._gate.asks_script:
+            return math.inf
+        if now_s >= self._next_s:
+            self._next_s, answer = now_s + SCRIPT_PERIOD_S, self._gate.answer()
+            verdict = VERDICTS[answer.verdict] if self._gate.at_arm == "gate" else NOT_GATING
+            reason = shortened(to_ascii(answer.words), REASON_BYTES).encode("ascii")
+            self._link.send(to_script(autopilot[0], MARK + bytes([verdict]) + reason))
+        return self._next_s
+
 
 HEARTBEAT_PERIOD_S = 1.0
 _RETRY_S = 0.05
 PROGRESS: Final = "CMP_PROG"
-"""Progress of the calibration under way in percent; 100 where none is."""
 READY: Final = "CMP_READY"
-"""1: it may arm; 0: not now."""
 IDLE_BEATS: Final = 5
 
 
 class MavlinkComponent:
-    """The companion on the MAVLink network; a loop that stalls stops its heartbeat too."""
-
     def __init__(
         self,
         link: MavlinkLink,
@@ -42,19 +134,17 @@ class MavlinkComponent:
         self._link, self._service, self._gate, self._texts, self._tunes = link, service, gate, texts, tunes
         self._woken = texts.woken
         self._known_as = link.system_id
-        """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
         self._beats = 0
         self.turns = 0
         self.permission = Permission(senders)
-        self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
-        self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
+        self.parameters = OwnParameters(link, parameters, texts, self.permission)
+        self._commands = CommandServer(link, service, texts, self.permission)
         self._script = ArmingScript(link, gate)
         self._authoriser = ArmAuthoriser(link, gate, texts.say)
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     async def run(self) -> None:
-        """Send until cancelled."""
         loop = asyncio.get_running_loop()
         try:
             while True:

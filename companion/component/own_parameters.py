@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.change import float32
 from companion.component.commands import Permission
-from companion.component.statustext import Say, Severity, Weight
+from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import AtArm
 from companion.errors import CompanionError
 from companion.links.mavlink.link import MavlinkLink
@@ -29,9 +29,7 @@ logger = logging.getLogger(__name__)
 
 VALUES_PER_S = 40.0
 AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
-"""CMP_AT_ARM."""
 RESULTS: Final = ("none", "done", "failed", "cancelled")
-"""CMP_STATE: end of the last calibration since the start."""
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
@@ -48,22 +46,14 @@ class Parameter:
     """Called before a value takes effect; raises a CompanionError to refuse it. None: read only."""
 
     def allows(self, value: float) -> bool:
-        """Return whether a float32 is a number within the limits (NaN compares false)."""
         return float32(self.minimum) <= value <= float32(self.maximum)
 
 
 class OwnParameters:
-    """The parameters of component 191."""
-
     def __init__(
-        self,
-        link: MavlinkLink,
-        parameters: Sequence[Parameter],
-        say: Say,
-        wake: Callable[[], None],
-        permission: Permission,
+        self, link: MavlinkLink, parameters: Sequence[Parameter], texts: StatusText, permission: Permission
     ) -> None:
-        self._link, self._say, self._wake, self._permission = link, say, wake, permission
+        self._link, self._texts, self._permission = link, texts, permission
         self._by_name = {parameter.name: parameter for parameter in parameters}
         self._values = {parameter.name: float32(parameter.value) for parameter in parameters}
         self._names = list(self._by_name)
@@ -74,7 +64,6 @@ class OwnParameters:
         link.subscribe(mavlink.MAVLink_param_set_message, self._on_set)
 
     def get(self, name: str) -> float:
-        """Return the value of a parameter."""
         return self._values[name]
 
     def set(self, name: str, value: float) -> None:
@@ -88,7 +77,6 @@ class OwnParameters:
             self._request(name)
 
     def step(self, now_s: float) -> float:
-        """Send the values that are due; return when the next one is (infinity: none waits)."""
         if not self._pending or not self._link.connected:
             # Changes are sent once there is a transport again.
             return math.inf
@@ -101,7 +89,7 @@ class OwnParameters:
 
     def _request(self, name: str) -> None:
         self._pending.setdefault(name)
-        self._wake()
+        self._texts.woken.set()
 
     def _send(self, name: str) -> bool:
         count, index = len(self._names), self._names.index(name)
@@ -142,14 +130,13 @@ class OwnParameters:
             return  # an echo, or somebody who pretends to be us
         refusal = self._permission.refuses(sender, f"setting {parameter.name}") or self._apply(parameter, message)
         if refusal:
-            self._say(Severity.WARNING, f"{parameter.name} not set: {refusal}", Weight.REFUSAL)
+            self._texts.say(Severity.WARNING, f"{parameter.name} not set: {refusal}", Weight.REFUSAL)
         if self._send(parameter.name):
             self._pending.pop(parameter.name, None)
         else:
             self._request(parameter.name)
 
     def _apply(self, parameter: Parameter, message: mavlink.MAVLink_param_set_message) -> str:
-        """Set the value; return the reason of a refusal, or an empty text."""
         value = float32(message.param_value)
         if parameter.on_set is None:
             return "it is read only"

@@ -21,20 +21,16 @@ WRITTEN_PERCENT: Final = 80.0
 class Refusal(msgspec.Struct, frozen=True):
     """Refusal of a request; `reason` is one line for people, without a leading "refused"."""
 
-    kind: Literal["armed", "unknown", "busy", "nothing_to_undo", "other"]
+    kind: Literal["armed", "unknown", "busy", "nothing_to_undo", "unsupported", "other"]
     reason: str
 
 
 class JobResult(msgspec.Struct, frozen=True):
-    """End of a job; `reason` is one line for people (the figures when done)."""
-
     outcome: Literal["done", "failed", "cancelled"]
     reason: str = ""
 
 
 class AcceptedJob(Protocol):
-    """A calibration or an undo under way."""
-
     progress_percent: int
     """0 to 100; never falls."""
     finished: asyncio.Future[JobResult]
@@ -47,14 +43,12 @@ class CalibrationService(Protocol):
     requested by others than MAVLink. The component says refusals.
     """
 
-    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal:
-        """Start a calibration, with a restart of the autopilot after it if requested; or refuse."""
+    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal: ...
 
-    def start_undo(self, requester: str) -> AcceptedJob | Refusal:
-        """Start restoring the previous values, or refuse."""
+    def start_undo(self, requester: str) -> AcceptedJob | Refusal: ...
 
     def cancel(self, requester: str) -> bool:
-        """Cancel the running job, whoever requested it; return whether there was one."""
+        """Cancel the running job, whoever requested it; False where there was none."""
 
     @property
     def progress_percent(self) -> int:
@@ -77,26 +71,23 @@ class ArmAnswer(msgspec.Struct, frozen=True):
     hold_still_s: int | None = None
     """Time to hold still, where nothing else is needed."""
     meanwhile: str = ""
-    """Activity while it is held still."""
+    against: str = ""
+    """Reason why it would arm uncalibrated; empty where the reason is another."""
 
     @classmethod
-    def hold_still(cls, seconds: float, meanwhile: str = "") -> ArmAnswer:
-        """Answer that it may arm when it has stood still for so long."""
+    def hold_still(cls, seconds: float, meanwhile: str = "", against: str = "") -> ArmAnswer:
         whole_s = max(1, round(seconds))
         words = f"hold still {whole_s} s"
-        return cls("wait", f"{words}: {meanwhile}" if meanwhile else words, whole_s, meanwhile)
+        return cls("wait", f"{words}: {meanwhile}" if meanwhile else words, whole_s, meanwhile, against)
 
 
 class ArmGate(Protocol):
     """The arm gate; it answers at once."""
 
     @property
-    def at_arm(self) -> Literal["gate", "warn", "off"]:
-        """Action at arming."""
-
+    def at_arm(self) -> Literal["gate", "warn", "off"]: ...
     @property
     def asks_script(self) -> bool:
         """Return whether a script on the autopilot (ArduPilot) waits for the answer."""
 
-    def answer(self) -> ArmAnswer:
-        """Return the prepared answer."""
+    def answer(self) -> ArmAnswer: ...

@@ -38,9 +38,7 @@ LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
 GOES_ON = "... "
-"""Beginning of a line that continues the one before."""
 SPOKEN = 4
-"""Number of spoken texts kept for page and monitor."""
 STALE_S = 20.0
 """Age at which a text that could not be sent (no link) is dropped, unless it is a result."""
 RECENT_TEXTS = 32
@@ -54,23 +52,19 @@ _ASCII = str.maketrans(
 
 
 class Severity(enum.IntEnum):
-    """MAV_SEVERITY, and what we use it for.
+    """MAV_SEVERITY. CRITICAL: act this second. ERROR: a request has failed. WARNING: the pilot has to know this fault.
 
+    NOTICE: a request or a success, spoken to an operator who looks at no screen, hence short. INFO: to be read.
     QGroundControl speaks NOTICE and worse aloud (`Vehicle.cc`: `severity <= MAV_SEVERITY_NOTICE`), as our page does,
     and opens a window for ERROR and worse. Mission Planner speaks and shows on its HUD WARNING and worse, unless its
     user has chosen NOTICE (`MAVLinkInterface.cs`: setting "severity", 4 by default).
     """
 
     CRITICAL = 2
-    """Act this second."""
     ERROR = 3
-    """A request has failed."""
     WARNING = 4
-    """Something is wrong, and the pilot has to know it."""
     NOTICE = 5
-    """Request or success, spoken to an operator who looks at no screen: short."""
     INFO = 6
-    """To be read."""
 
 
 class Weight(enum.IntEnum):
@@ -82,11 +76,10 @@ class Weight(enum.IntEnum):
 
 
 Say = Callable[[Severity, str, Weight], object]
-"""Sends a text to the ground stations."""
 
 
 def to_ascii(text: str) -> str:
-    """Convert to one line of ASCII: ground stations disagree on everything else."""
+    # Ground stations disagree on everything else.
     text = unicodedata.normalize("NFKD", " ".join(text.translate(_ASCII).split()))
     text = "".join(character for character in text if not unicodedata.combining(character))
     return "".join(character if " " <= character <= "~" else "?" for character in text)
@@ -112,7 +105,6 @@ def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
 
 
 def shortened(text: str, most: int) -> str:
-    """Cut a text to so many characters: at its last pause, else after its last whole word."""
     return text if len(text) <= most else text[: _end_of_line(text, figures=True, most=most)].rstrip(" :;,")
 
 
@@ -133,18 +125,14 @@ def _end_of_line(text: str, *, figures: bool, most: int = LINE_BYTES) -> int:
 
 
 class StatusText:
-    """Queue of texts; `step` sends what may be sent now."""
-
     def __init__(self, link: MavlinkLink) -> None:
         self.woken = asyncio.Event()
-        """Set when there is something new to send, for the caller of `step`."""
         self._link = link
         self._waiting: list[tuple[Weight, float, Severity, str]] = []
         self._recent: deque[tuple[Severity, str, float]] = deque(maxlen=RECENT_TEXTS)
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
         self.spoken: deque[dict[str, object]] = deque(maxlen=SPOKEN)
-        """The latest spoken texts, the oldest first, numbered from 1."""
         self._numbers = itertools.count(1)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
@@ -200,18 +188,17 @@ class StatusText:
 TUNES_APART_S: Final = 1.5
 """Time between the beginnings of two tunes: the longest takes 1.1 s."""
 TUNE_STALE_S: Final = 3.0
-"""Age at which a tune that could not be played is dropped."""
 
 
 class Tune(enum.Enum):
-    """Tunes by meaning; their notes are at most 29 characters, the first field of PLAY_TUNE."""
+    """Tunes by meaning; their notes are at most 29 characters, the first field of PLAY_TUNE.
+
+    HOLD_STILL is one long note, NEXT goes up (this pose is done), WRONG to and fro (not the requested pose).
+    """
 
     HOLD_STILL = "MFT200O4A2"
-    """One long note."""
     NEXT = "MFT200O4E8A8"
-    """Two short notes, upwards: this stand is done."""
     WRONG = "MFT200O4E8C8E8C8E8C8"
-    """To and fro: not the requested pose."""
     DONE = "MFT200O4C8E8G8>C4"
     FAILED = "MFT200O5C8<G8E8C2"
 
@@ -222,16 +209,13 @@ class Tunes:
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, wanted: Callable[[], bool], woken: asyncio.Event) -> None:
         self._link, self._vehicle, self._wanted, self._woken = link, vehicle, wanted, woken
         self._waiting: tuple[Tune, float] | None = None
-        """The latest tune, and the time of its request."""
         self._free_s = -math.inf
 
     def play(self, tune: Tune) -> None:
-        """Play a tune as soon as the one before is over; only the latest waits."""
         self._waiting = tune, asyncio.get_running_loop().time()
         self._woken.set()
 
     def step(self, now_s: float) -> float:
-        """Send what is due; return when there is more to do (infinity: nothing waits)."""
         if self._waiting is None:
             return math.inf
         if now_s < self._free_s:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
 
 from companion.autopilot.vehicle.parameter_client import ParameterClient
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.component.statustext import Severity, StatusText, Tune, Tunes, Weight
 from companion.config.sections import AtArm, Config
 from companion.configured import models
 from companion.configured.models import Profiles
+from companion.errors import AutopilotError
 from companion.estimation.collector.intake import Settings
 from companion.estimation.machine import Machine
 from companion.estimation.means.windows import Window
@@ -22,9 +24,13 @@ from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.events import Listeners
 
+logger = logging.getLogger(__name__)
+
 CATCH_UPS: Final = 3
 """Most estimates in a row: while one is computed the next may become due."""
 TICK_S: Final = 0.2
+REREAD_EVERY_S: Final = 0.5
+"""Least time between two reads, as anybody on the network can announce a change."""
 Handler = Callable[[Any, str], AsyncIterator[Object]]
 """Answers a `Command` that came through an interface (second), with any number of replies."""
 Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
@@ -52,6 +58,39 @@ class RuntimeSettings:
         """Change targets: `target_...` as in `Settings`."""
         self.settings = msgspec.structs.replace(self.settings, **targets)
         self._retargeted(self.settings)
+
+
+class RepeatedRead:
+    """Reads from the autopilot after each of its starts and each `again`, and `retry_s` after an AutopilotError."""
+
+    def __init__(self, vehicle: Vehicle, read: Callable[[], Awaitable[None]], retry_s: float) -> None:
+        self._vehicle, self._read, self._retry_s = vehicle, read, retry_s
+        self._due = asyncio.Event()
+        self._due.set()
+        vehicle.on_event.add(self._on_event)
+
+    def again(self) -> None:
+        """Read once more, as something has changed."""
+        self._due.set()
+
+    async def run(self) -> None:
+        """Read until cancelled."""
+        while True:
+            await self._due.wait()
+            await self._vehicle.found.wait()
+            self._due.clear()
+            try:
+                await self._read()
+            except AutopilotError as error:
+                logger.debug("reading the autopilot again: %s", error)
+                self._due.set()
+                await asyncio.sleep(self._retry_s)
+            else:
+                await asyncio.sleep(REREAD_EVERY_S)
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("found", "rebooted"):
+            self._due.set()
 
 
 class Core:

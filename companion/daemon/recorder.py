@@ -34,16 +34,8 @@ from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
-from companion.recording import messages
-from companion.recording.files import (
-    Beginning,
-    RecordingFile,
-    Ring,
-    create_on_request,
-    disk_shortage,
-    is_available,
-    unused_path,
-)
+from companion.recording import files, messages
+from companion.recording.files import Beginning, RecordingFile, Ring
 from companion.recording.messages import ImuState, KeyFilter, Measured, Message, RawOutput, Solved, Tape
 
 logger = logging.getLogger(__name__)
@@ -81,8 +73,6 @@ class _OnRequest:
 
 
 class Recorder(Subsystem):
-    """Records the inputs of calibrations."""
-
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating) -> None:
         config = core.config
         self.fault: str | None = None
@@ -92,7 +82,7 @@ class Recorder(Subsystem):
         self._folder = config.storage.path / "recordings"
         megabytes = config.storage.recordings_mb
         self._ring: Ring | None = None
-        if megabytes != 0 and is_available():
+        if megabytes != 0 and files.is_available():
             self._ring = Ring(self._folder, (DEFAULT_MB if megabytes is None else megabytes) << 20)
         elif megabytes:
             self.fault = HOW_TO_INSTALL
@@ -176,7 +166,6 @@ class Recorder(Subsystem):
     # --- to the disk
 
     async def run(self) -> None:
-        """Write until cancelled, then finish the files."""
         if self.fault is not None:
             logger.warning("recordings: %s", self.fault)
         try:
@@ -260,7 +249,7 @@ class Recorder(Subsystem):
     async def _flush_file(self, recording: _OnRequest, batch: list[Message], beginning: Beginning) -> None:
         try:
             await self._in_thread(recording.file.write, batch, beginning)
-            shortage = await self._in_thread(disk_shortage, recording.file.path.parent)
+            shortage = await self._in_thread(files.disk_shortage, recording.file.path.parent)
         except StorageError as error:
             await self._end(recording, str(error), state="failed")
             return
@@ -303,14 +292,14 @@ class Recorder(Subsystem):
         yield {"kind": "result", **recording.ended.result()}
 
     async def _start(self, name: str | None, seconds: float | None) -> _OnRequest:
-        if not is_available():
+        if not files.is_available():
             raise StorageError(HOW_TO_INSTALL)
         async with self._flushing:
             if self._on_request is not None:
                 path = self._on_request.file.path
                 raise StorageError(f"already recording to {path}; end it with: companion record --stop")
-            path = Path(name) if name is not None else await self._offload(unused_path, self._folder)
-            file, now_s = await self._offload(create_on_request, path), _now_s()
+            path = Path(name) if name is not None else await self._offload(files.unused_path, self._folder)
+            file, now_s = await self._offload(files.create_on_request, path), _now_s()
             ended: asyncio.Future[Object] = asyncio.get_running_loop().create_future()
             until_s, most_bytes = None if seconds is None else now_s + seconds, MOST_BYTES[seconds is None]
             recording = _OnRequest(file, self.tape.lost_in_all, now_s, until_s, most_bytes, ended)

@@ -41,18 +41,15 @@ PER_DAY: Final = 24
 """Most automatic writes a day: some 300 parameters; a page of flash bears 10 000 rewrites."""
 FAILURES: Final = 3
 RETRY_S: Final = 60.0
-"""Wait after a failure; doubled with each further one."""
 TIMEOUT_S: Final = 180.0
 
 
 class Automatic:
-    """Starts calibrations by itself; `run` decides when."""
-
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], in_force: ActiveCalibration) -> None:
         self._core, self._manager, self._imus, self._in_force = core, in_force.manager, imus, in_force
         self._file = BoundedList(core.config.storage.path / "automatic.json", dict[str, float], PER_DAY + 8)
         self._writes: list[dict[str, float]] = []
-        self._to_keep: list[dict[str, float]] = []
+        self._unsaved = False
         self._next_s = -math.inf
         self._failures = 0
         self.turns = 0
@@ -61,7 +58,6 @@ class Automatic:
 
     @property
     def wanted(self) -> bool:
-        """Return whether the settings ask for it."""
         wanted = self._core.wanted
         return wanted.at_arm != "off" and wanted.push and self._core.only_listening is None
 
@@ -84,7 +80,6 @@ class Automatic:
         return sum(write["at_unix_s"] > since_s for write in self._writes)
 
     async def run(self) -> None:
-        """Calibrate whenever it is worth it, until cancelled."""
         self._writes = await self._core.offload(self._file.read)
         while True:
             self.turns += 1
@@ -132,7 +127,6 @@ class Automatic:
             self._core.say(Severity.WARNING, f"Auto calibration off until asked: {why}", Weight.REFUSAL)
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """Count an automatic calibration, and set the time of the next."""
         now_s = asyncio.get_running_loop().time()
         if job.kind == "undo":
             if result.outcome == "done" and job.undid_calibration:
@@ -143,9 +137,8 @@ class Automatic:
             self.stopped, self._failures, self._next_s = None, 0, now_s + SPACING_S
         else:
             if job.record is not None and job.record.written:
-                write = {"at_unix_s": time.time()}
-                self._writes = [*self._writes, write][-PER_DAY - 8 :]
-                self._to_keep.append(write)
+                self._writes = [*self._writes, {"at_unix_s": time.time()}][-PER_DAY - 8 :]
+                self._unsaved = True
             if result.outcome == "done":
                 self._failures, self._next_s = 0, now_s + SPACING_S
             elif result.outcome == "cancelled":
@@ -157,15 +150,14 @@ class Automatic:
                     self._stop(f"failed {FAILURES} times")
 
     async def _keep(self) -> None:
-        while self._to_keep:
-            write = self._to_keep.pop()
+        if self._unsaved:
+            self._unsaved = False
             try:
-                await self._core.offload(self._file.append, write)
+                await self._core.offload(self._file.write, self._writes)
             except StorageError as error:
                 logger.warning("automatic write not counted: %s", error)
 
     def status(self) -> dict[str, object]:
-        """Return its part of `companion status`."""
         return {
             "wanted": self.wanted,
             "stopped": self.stopped,

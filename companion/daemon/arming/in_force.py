@@ -42,7 +42,7 @@ from companion.estimation.records.validity import (
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.solve import Solution
 from companion.physics.frames import vector
-from companion.samples import TRIADS, Triad
+from companion.samples import TRIADS, Triad, rows_of
 
 logger = logging.getLogger(__name__)
 
@@ -51,13 +51,10 @@ _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, W
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
 """Findings that count although a result is held back: choices of people, and writes without a seen effect."""
 SETTLED_EVERY_S: Final = 5
-"""Interval of checks of the output without a finding; otherwise every second."""
 
 
 @dataclasses.dataclass(slots=True)
 class _TriadState:
-    """Gyros or accelerometers of one IMU."""
-
     held: Held | Why = Why.NEVER
     shelved: Held | None = None
     """State before a restart that kept the offsets; restored once a window agrees."""
@@ -69,8 +66,6 @@ class _TriadState:
 
 
 class ActiveCalibration:
-    """The active calibration; `poll` often, `measure` whenever there may be a new window."""
-
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
         self.manager, self._memory = calibrating.manager, calibrating.memory
@@ -88,7 +83,6 @@ class ActiveCalibration:
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
         self.temperatures_degc: dict[str, float] = {}
-        """Temperatures of the IMUs at the last check of their output."""
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
         self.offsets = OffsetWatch(core.vehicle, imus, self._lose)
@@ -100,7 +94,6 @@ class ActiveCalibration:
     # --- what is known
 
     def findings(self, now_s: float) -> list[Objection]:
-        """List the findings against the active calibration; empty while it is good."""
         found: list[Objection] = []
         for (name, triad), state in self._triads.items():
             held = state.held
@@ -124,7 +117,6 @@ class ActiveCalibration:
 
     @property
     def held_back(self) -> str | None:
-        """Triads held back, with the reasons, in one short line; None without."""
         kept = {key: state.in_doubt[0] for key, state in self._triads.items() if state.in_doubt is not None}
         return f"held back: {in_short(kept)} ({', '.join(dict.fromkeys(kept.values()))})" if kept else None
 
@@ -140,7 +132,6 @@ class ActiveCalibration:
 
     @property
     def measured(self) -> bool:
-        """Return whether there is a still window now."""
         return any(state.present is not None for state in self._triads.values())
 
     @property
@@ -166,21 +157,18 @@ class ActiveCalibration:
         return max((max(each.sigma_use) for each in held if isinstance(each, Held)), default=None)
 
     def record_of(self, name: str) -> ImuRecord | None:
-        """Return the last calibration of one IMU; None without, or if it was replaced."""
         states = [state for key, state in self._triads.items() if key[0] == name and state.judged]
         if self.calibration is None or any(isinstance(one.held, Why) or one.in_doubt for one in states):
             return None
         return next((imu for imu in self.calibration.imus if imu.name == name), None)
 
     def reading(self) -> str | None:
-        """Name an IMU of the autopilot whose offsets are not known now, with the reason, in one line."""
         found = ((name, imu.obstacle) for name, imu in self._imus.items())
         return next((f"imu {name}: {obstacle}" for name, obstacle in found if obstacle is not None), None)
 
     # --- what happens
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """Handle the end of a job; the autopilot's present offsets are ours."""
         self._forget_window()
         self.offsets.on_ended(job, result)
         if result.outcome != "done":
@@ -195,10 +183,9 @@ class ActiveCalibration:
                 self._take(imu, asyncio.get_running_loop().time(), job.held_back)
 
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
-        """Make a calibration of one IMU the active one, except for triads held back."""
         corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s
         # Without telemetry of an IMU "stored" is the best outcome.
-        for triad, residual in zip(TRIADS, (imu.residual_gyro_rad_s, imu.residual_accel_m_s2), strict=True):
+        for triad in TRIADS:
             seen = outcomes_of(triad, imu.written) <= {"verified"} or not corrected
             found = held_of(imu, triad, now_s, averaged_s, corrected=corrected, seen=seen)
             state = self._triads.get((imu.name, triad))
@@ -207,11 +194,11 @@ class ActiveCalibration:
             if (doubt := held_back.get((imu.name, triad))) is None:
                 state.held, state.in_doubt = found, None
                 continue
+            residual = imu.of(triad).residual
             expected = residual if corrected and residual is not None else found.expected
             state.in_doubt = doubt.in_short, msgspec.structs.replace(found, expected=expected)
 
     def _realigned(self) -> None:
-        """Void accelerometers that were calibrated with another zero of the gradienter."""
         for (_, triad), state in self._triads.items():
             if triad == "accel":
                 state.held = Why.ALIGNED if isinstance(state.held, Held) else state.held
@@ -219,7 +206,6 @@ class ActiveCalibration:
         self._forget_window()
 
     def poll(self, *, writing: bool) -> None:
-        """Check whether somebody else has changed the autopilot's offsets, unless we are `writing`."""
         if writing:
             self.offsets.let_go()
             self._forget_window()
@@ -242,7 +228,6 @@ class ActiveCalibration:
             state.present = None
 
     async def measure(self, now_s: float) -> bool:
-        """Check the present output when due; return whether it was."""
         second = math.floor(now_s)  # the collector's seconds end with the clock's
         settled = self.measured and self._worth_since_s is None and not self.findings(now_s)
         if second == self._looked_s or (settled and second - self._looked_s < SETTLED_EVERY_S):
@@ -271,13 +256,9 @@ class ActiveCalibration:
         for imu in solution.imus:
             if imu.temperature_degc is not None:
                 self.temperatures_degc[imu.name] = imu.temperature_degc
-            settled = np.sqrt(np.diag(imu.covariance))
-            found = (
-                (imu.gyro_rad_s, imu.gyro_sigma_use_rad_s, settled[:3]),
-                (imu.accel_m_s2, imu.accel_sigma_use_m_s2, settled[3:]),
-            )
-            for triad, (residual, sigma, compared) in zip(TRIADS, found, strict=True):
-                key = (imu.name, triad)
+            use, settled = np.sqrt(np.diag(imu.use_covariance)), np.sqrt(np.diag(imu.covariance))
+            for triad, residual in zip(TRIADS, imu.biases, strict=True):
+                key, rows = (imu.name, triad), rows_of(triad)
                 if (state := self._triads.get(key)) is None:
                     continue
                 if key in solution.unknown:
@@ -286,7 +267,7 @@ class ActiveCalibration:
                 if residual is None:
                     continue
                 state.judged = True
-                present = Present(residual=vector(residual), sigma_use=vector(sigma), sigma=vector(compared))
+                present = Present(residual=vector(residual), sigma_use=vector(use[rows]), sigma=vector(settled[rows]))
                 state.present = present
                 self._confirm(key, state, present, imu.temperature_degc, end_s, averaged_s)
                 if not self._stays_in_doubt(state, present, end_s):

@@ -1,7 +1,7 @@
 """The answer to an arming request with its reason, prepared four times a second.
 
 PX4 waits for it with its commander thread stopped (autopilots 5.2): nothing may be computed, read or awaited then.
-`Readiness._judge` lists the reasons for a closed gate in the order in which they are reported, also without a gate.
+`Readiness._reasons` lists the reasons against arming in the order in which they are reported, also without a gate.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections.abc import Iterator
 from typing import Final, Literal
 
 from companion.autopilot.vehicle.ekf import ADJUSTING
@@ -32,9 +33,7 @@ BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
 """Stillness required after somebody has let go of the aircraft."""
 COUNTDOWN_KEPT_S: Final = 2.0
-"""Age at which a countdown starts anew."""
 OLDEST_ANSWER_S: Final = 1.5
-"""Age at which an answer that was not renewed is void."""
 _STEPS: Final[dict[State, str]] = {
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
@@ -60,8 +59,6 @@ ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
 
 class Readiness:
-    """The arm gate's answer with its words; `run` keeps it fresh."""
-
     def __init__(self, core: Core, owed: RebootOwed, in_force: ActiveCalibration, automatic: Automatic) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
@@ -70,13 +67,11 @@ class Readiness:
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._countdown = -math.inf, math.inf
-        """Time of the last countdown to a calibration, and the seconds that it named."""
         self._has_gated = False
         self.turns = 0
 
     @property
     def at_arm(self) -> AtArm:
-        """Action at arming; may change at run time."""
         return self._wanted.at_arm
 
     @property
@@ -88,7 +83,6 @@ class Readiness:
     # --- the answer
 
     def answer(self) -> ArmAnswer:
-        """Return the prepared answer, unless it is too old or a write has begun."""
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
         if self._manager.state.is_writing and self._answer.verdict == "accept":
@@ -96,7 +90,6 @@ class Readiness:
         return self._answer
 
     async def run(self) -> None:
-        """Keep the answer fresh until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             try:
@@ -122,7 +115,6 @@ class Readiness:
         return measuring.result()
 
     def update(self) -> None:
-        """Prepare the answer."""
         now_s = asyncio.get_running_loop().time()
         self.in_force.poll(writing=self._writing)
         if self.at_arm == "gate":
@@ -139,39 +131,40 @@ class Readiness:
 
     def judge(self, now_s: float) -> ArmAnswer:
         """Return the answer of a gate at this moment, whether there is one or not."""
-        answer = self._judge(now_s)
+        answer = next(self._reasons(now_s), None) or ArmAnswer("accept", self.state(now_s)[1])
         if not self._on_deck or answer.hold_still_s is None:
             return answer
         # Nobody can hold a deck still.
         status, meanwhile = self._collector.status(now_s), "" if answer.meanwhile == BY_ITSELF else answer.meanwhile
         return ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
 
-    def _judge(self, now_s: float) -> ArmAnswer:
+    def _reasons(self, now_s: float) -> Iterator[ArmAnswer]:
+        """Yield the reasons against arming in the order in which they are reported; without any it may arm."""
         if (unmet := self._manager.blocking_reason(_NEEDED)) is not None:
             wait = _WAITS.get(unmet[0])
-            return ArmAnswer("refuse", unmet[1]) if wait is None else ArmAnswer("wait", wait)
+            yield ArmAnswer("refuse", unmet[1]) if wait is None else ArmAnswer("wait", wait)
         if self.at_arm == "gate" and not self._wanted.push:
-            return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
+            yield ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         if self._manager.state.is_writing:
-            return self._during_write(now_s)
+            yield self._during_write(now_s)
         glance = self._collector.glance(now_s)
         if glance.obstacle is not None and not glance.moving:
-            return ArmAnswer("refuse", glance.obstacle.words)
+            yield ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
-            return ArmAnswer("wait", reading)
+            yield ArmAnswer("wait", reading, against=reading)
         if findings := self.in_force.findings(now_s):
+            first, remedy = findings[0], self._automatic.why_not()
             if not self.in_force.measured and all(finding.why in _CHECKED_NEXT for finding in findings):
                 left_s = self._wanted.settings.min_still_s + 1.0 - glance.still_s
-                return ArmAnswer.hold_still(left_s, _CHECKED_NEXT[findings[0].why])
-            remedy = self._automatic.why_not()
-            if remedy is None:
-                return ArmAnswer.hold_still(self._until_calibrated_s(now_s), BY_ITSELF)
-            return ArmAnswer("refuse", f"{findings[0].words}: {remedy}")
+                yield ArmAnswer.hold_still(left_s, _CHECKED_NEXT[first.why], first.words)
+            elif remedy is None:
+                yield ArmAnswer.hold_still(self._until_calibrated_s(now_s), BY_ITSELF, first.words)
+            else:
+                yield ArmAnswer("refuse", f"{first.words}: {remedy}", against=first.words)
         if self.owed.words is not None:
-            return ArmAnswer("refuse", self.owed.words)
+            yield ArmAnswer("refuse", self.owed.words, against=self.owed.words)
         if glance.moving or glance.steady_s < STEADY_S:
-            return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
-        return ArmAnswer("accept", self.state(now_s)[1])
+            yield ArmAnswer.hold_still(STEADY_S - glance.steady_s)
 
     # --- how long yet
 
@@ -199,13 +192,12 @@ class Readiness:
         state, job = self._manager.state, self._manager.running
         words, left_s = _STEPS[state], 0.0 if job is None else math.ceil(job.left_s)
         if state is State.VERIFYING:
-            return ArmAnswer.hold_still(self._check_s - self._collector.glance(now_s).still_s, words)
-        return ArmAnswer("wait", f"{words}: {left_s} s at most" if left_s else f"{words}: wait")
+            return ArmAnswer.hold_still(self._check_s - self._collector.glance(now_s).still_s, words, words)
+        return ArmAnswer("wait", f"{words}: {left_s} s at most" if left_s else f"{words}: wait", against=words)
 
     # --- in words, for arming, status and history
 
     def state(self, now_s: float) -> tuple[ArmedState, str]:
-        """Return the state in which it would arm now, as a word and as one short line."""
         state, words = self._state(now_s)
         held_back = self.in_force.held_back
         if held_back is None or self._manager.state.is_writing:
@@ -213,10 +205,9 @@ class Readiness:
         return state, "; ".join(filter(None, (words, held_back, "calibrate to write it")))
 
     def _state(self, now_s: float) -> tuple[ArmedState, str]:
-        in_force, findings = self.in_force, self.in_force.findings(now_s)
-        against = _STEPS.get(self._manager.state) or in_force.reading() or (findings[0].words if findings else None)
-        if against or self.owed.words is not None:
-            return "uncalibrated", against or self.owed.words or ""
+        in_force = self.in_force
+        if against := next((one.against for one in self._reasons(now_s) if one.against), None):
+            return "uncalibrated", against
         gyro, accel = in_force.sigma("gyro"), in_force.sigma("accel")
         sigmas = [f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []
         sigmas += [f"{accel / MG:.2f} mg"] if accel is not None else []
@@ -227,7 +218,6 @@ class Readiness:
         return "uncalibrated", "not calibrated yet" if in_force.held_back is None else ""
 
     def _quality(self, triad: Triad, unit: float) -> dict[str, object]:
-        """Return the largest active sigma and its target, in deg/h or mg."""
         sigma, settings = self.in_force.sigma(triad), self._wanted.settings
         wanted = settings.target_gyro_sigma_rad_s if triad == "gyro" else settings.target_accel_sigma_m_s2
         return {
@@ -237,7 +227,6 @@ class Readiness:
         }
 
     def status(self) -> dict[str, object]:
-        """Return the gate's part of the status."""
         now_s = asyncio.get_running_loop().time()
         state, words = self.state(now_s)
         answer = self.answer()

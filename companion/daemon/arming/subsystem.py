@@ -17,10 +17,10 @@ from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core, Handler, Subsystem, Task
+from companion.daemon.core import Core, Handler, RepeatedRead, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
-from companion.errors import AutopilotError, StorageError
+from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
@@ -38,8 +38,6 @@ SCRIPT_STARTS_S: Final = 10.0
 
 
 class Armings:
-    """Reports and records the active calibration at each arming; `run` writes to disk."""
-
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._readiness, self._say, self._offload = readiness, core.say, core.offload
         self.file = armings_in(core.config.storage.path)
@@ -49,7 +47,6 @@ class Armings:
         """False: the daemon may have started in flight."""
 
     async def run(self) -> None:
-        """Save every arming until cancelled, and then those still queued."""
         try:
             while True:
                 arming = await self._queue.get()
@@ -63,7 +60,6 @@ class Armings:
                     self.file.append(self._queue.get_nowait())
 
     def add(self) -> None:
-        """Report and record an arming that was just seen."""
         readiness, in_force = self._readiness, self._readiness.in_force
         now_s = asyncio.get_running_loop().time()
         state, words = readiness.state(now_s)
@@ -87,53 +83,35 @@ class Armings:
 
 
 class GateSetup:
-    """Checks whether the autopilot asks before it arms."""
-
     def __init__(self, core: Core) -> None:
         self._core, self._vehicle = core, core.vehicle
-        self._stale = asyncio.Event()
+        self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self._said: str | None = None
         self.problem: str | None = None
         """Missing settings, for people; None while complete or not known."""
         self.known = False
         core.parameters.on_value.add(self._on_parameter)
 
-    async def run(self) -> None:
-        """Check after every start of the autopilot and change of its settings, until cancelled."""
-        while True:
-            await self._stale.wait()
-            while self._core.wanted.at_arm != "gate":  # may be set at the flight line
-                await asyncio.sleep(POLL_S)
-            await self._vehicle.found.wait()
-            self._stale.clear()
-            try:
-                self.problem = await self._vehicle.kind.find_gate_problem(
-                    self._core.parameters, self._vehicle.system_id, SCRIPT_STARTS_S
-                )
-            except AutopilotError as error:
-                logger.info("whether the gate is set up is not known: %s", error)
-                self._stale.set()
-                await asyncio.sleep(RETRY_S)
-                continue
-            self.known = True
-            if self.problem not in (None, self._said) and self._core.wanted.at_arm == "gate":
-                logger.warning("arming is not gated: %s", self.problem)
-                self._core.say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
-            self._said = self.problem
-
-    def check_again(self) -> None:
-        """Check again, as the autopilot has started or a setting has changed."""
+    async def _read(self) -> None:
         self.known = False
-        self._stale.set()
+        while self._core.wanted.at_arm != "gate":  # may be set at the flight line
+            await asyncio.sleep(POLL_S)
+        await self._vehicle.found.wait()
+        self.problem = await self._vehicle.kind.find_gate_problem(
+            self._core.parameters, self._vehicle.system_id, SCRIPT_STARTS_S
+        )
+        self.known = True
+        if self.problem not in (None, self._said) and self._core.wanted.at_arm == "gate":
+            logger.warning("arming is not gated: %s", self.problem)
+            self._core.say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
+        self._said = self.problem
 
     def _on_parameter(self, name: str, _value: float) -> None:
         if self.known and name in self._vehicle.kind.gate_parameters:
-            self.check_again()
+            self.reading.again()
 
 
 class Arming(Subsystem):
-    """Wires the active calibration, the gate, automatic calibrations and the history of armings."""
-
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
         self.manager = calibrating.manager
@@ -149,13 +127,10 @@ class Arming(Subsystem):
         core.vehicle.on_event.add(self._on_event)
 
     def _on_event(self, event: VehicleEvent) -> None:
-        match event:
-            case "found" | "rebooted":
-                self.gate_setup.check_again()
-            case "disarmed":
-                self.armings.seen_disarmed = True
-            case "armed" if self.armings.seen_disarmed:  # a daemon that starts in flight sees no arming
-                self.armings.add()
+        if event == "disarmed":
+            self.armings.seen_disarmed = True
+        elif event == "armed" and self.armings.seen_disarmed:  # a daemon that starts in flight sees no arming
+            self.armings.add()
 
     def commands(self) -> Mapping[str, Handler]:
         return {"history": self._answer_history}
@@ -173,11 +148,11 @@ class Arming(Subsystem):
         }
 
     def tasks(self) -> Sequence[Task]:
-        setup: list[Task] = [("gate-setup", self.gate_setup.run)]
-        if self._core.only_listening is not None:
-            return setup
-        writing: list[Task] = [("readiness", self.readiness.run), ("automatic", self.automatic.run)]
-        return [*writing, ("armings", self.armings.run), *setup]
+        tasks: list[Task] = [("gate-setup", self.gate_setup.reading.run)]
+        if self._core.only_listening is None:
+            tasks += [("readiness", self.readiness.run), ("automatic", self.automatic.run)]
+            tasks.append(("armings", self.armings.run))
+        return tasks
 
     def _calibration(self) -> Object | None:
         """Return the active calibration, else the last good one, without its age: the wall clock may be wrong."""

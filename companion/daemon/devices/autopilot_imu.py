@@ -22,7 +22,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.component.service import JobResult
 from companion.config.sections import Imu
 from companion.configured import models
-from companion.daemon.core import Core
+from companion.daemon.core import Core, RepeatedRead
 from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError
 from companion.estimation.records.validity import Why
@@ -32,14 +32,11 @@ from companion.samples import ImuSample
 logger = logging.getLogger(__name__)
 
 RETRY_S: Final = 3.0
-REREAD_EVERY_S: Final = 0.5
 CONFIRMED_WITHIN_S: Final = 3.0
 """A later reading does not show which offsets were in force in between."""
 
 
 class AutopilotImu:
-    """Gives the collector the samples of one autopilot IMU while the offsets behind them are known."""
-
     def __init__(self, core: Core, imu: Imu, slots: SlotMemory, ekf_bias: EkfBias, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
@@ -50,7 +47,6 @@ class AutopilotImu:
         self.upset = ""
         self.on_sample: Listeners[ImuSample] = Listeners()
         self.on_counting: Listeners[ImuSample] = Listeners()
-        """Listeners to samples that count, before the collector."""
         self.on_raw: Listeners[float, Six, float | None] = Listeners()
         """Listeners to means of raw readings: time, output less the offsets in force, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
@@ -63,9 +59,7 @@ class AutopilotImu:
         self._ours = 0
         self._announced: tuple[str, float, float] | None = None
         """Name, value and time of a parameter that somebody says was changed."""
-        self._pause_s = 0.0
-        self._stale = asyncio.Event()
-        self._stale.set()
+        self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self.stream = ImuStream(
             core.link,
             core.vehicle,
@@ -78,12 +72,6 @@ class AutopilotImu:
         )
         core.parameters.on_value.add(self._on_parameter)
         core.vehicle.on_event.add(self._on_event)
-
-    async def run(self) -> None:
-        """Ask for the telemetry and follow the offsets until cancelled."""
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self.stream.run(), name=f"{self.name} telemetry")
-            group.create_task(self._follow(), name=f"{self.name} offsets")
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:
@@ -100,7 +88,6 @@ class AutopilotImu:
 
     @property
     def obstacle(self) -> str | None:
-        """Reason why no sample counts at this moment, in one line, or None."""
         return self.stream.problem or (self.problem if self.calibration is None else None)
 
     @property
@@ -154,12 +141,10 @@ class AutopilotImu:
 
     @property
     def wants_raw(self) -> bool:
-        """True: its telemetry is integers, and means of raw readings are finer."""
         kind = self.stream.kind
         return self.calibration is not None and kind is not None and kind.integers
 
     def take_raw(self, gyro_id: int, accel_id: int, raw: ImuSample) -> None:
-        """Hand on a mean of raw readings of these devices, less the offsets in force."""
         known = self.calibration
         if known is None:
             return
@@ -167,7 +152,7 @@ class AutopilotImu:
             # The console knows which device it is; the slots' order was a guess.
             self._slots.learn("gyro", gyro_id, self.instance)
             self._slots.learn("accel", accel_id, self.instance)
-            self._stale.set()
+            self.reading.again()
             return
         output = known.output(raw.gyro_rad_s, raw.accel_m_s2, raw.temperature_degc)
         row: Six = tuple(output.tolist())
@@ -192,7 +177,7 @@ class AutopilotImu:
         self.problem = f"reading its offsets again ({why})"
         self._collector.reset(why, self.name)
         self.on_change.tell()
-        self._stale.set()
+        self.reading.again()
 
     def _upset(self, why: str) -> None:
         self.upsets, self.upset = self.upsets + 1, why
@@ -210,37 +195,24 @@ class AutopilotImu:
             watched = {rival.parameter for rival in self._vehicle.kind.rivals}
             if name not in watched or active.get(name, 0) == value:
                 return  # else what is in force is the same, but not what will become of it
-        self._pause_s = REREAD_EVERY_S
-        self._stale.set()
+        self.reading.again()
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
             self._upset("the autopilot rebooted")
-        elif event == "found":
-            # Somebody may have changed them while we heard nothing; if so, `refresh` voids what was collected.
-            self._stale.set()
 
-    async def _follow(self) -> None:
-        while True:
-            await self._stale.wait()
-            self._stale.clear()
-            await self._vehicle.found.wait()
-            if self._ours:
-                continue
-            try:
-                await self.refresh()
-            except AutopilotError as error:
-                self.problem = str(error)
-                self.failures += 1
-                logger.warning("%s: %s", self.name, error)
-                self._stale.set()
-                await asyncio.sleep(RETRY_S)
-            else:
-                pause_s, self._pause_s = self._pause_s, 0.0
-                await asyncio.sleep(pause_s)
+    async def _read(self) -> None:
+        if self._ours:
+            return
+        try:
+            await self.refresh()
+        except AutopilotError as error:
+            self.problem = str(error)
+            self.failures += 1
+            logger.warning("%s: %s", self.name, error)
+            raise
 
     def status(self) -> dict[str, object]:
-        """For `companion status` and `check`."""
         problem, kind = self.stream.problem or self.problem, self.stream.kind
         return {
             "name": self.name,
@@ -253,7 +225,6 @@ class AutopilotImu:
 
 @contextlib.contextmanager
 def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
-    """Enter `changing` of several IMUs."""
     with contextlib.ExitStack() as stack:
         for imu in imus:
             stack.enter_context(imu.changing())
@@ -271,23 +242,17 @@ class OffsetWatch:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost
         self._known: dict[str, _Known] = {}
         self._before: dict[str, _Known] = {}
-        """Offsets before a job, until those after it are read."""
         self._failed = self._asked_restart = False
         self._written: dict[str, dict[str, float]] = {}
-        """Values just written, by IMU, until they are read."""
         self.foreign: str | None = None
-        """Change by somebody else since the last request, in short."""
 
     def known(self) -> dict[str, _Known]:
-        """Return the present offsets for a later comparison."""
         return dict(self._known)
 
     def let_go(self) -> None:
-        """Expect changes of our own until the next `poll`."""
         self._before, self._known = dict(self._known) or self._before, {}
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """Handle the end of a calibration, an alignment or an undo."""
         self.let_go()
         self._written, self._failed = {}, result.outcome != "done"
         if job.kind == "undo":
@@ -300,34 +265,28 @@ class OffsetWatch:
                 self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
 
     def poll(self) -> None:
-        """Compare the autopilot's offsets with those before."""
         for name, imu in self._imus.items():
             calibration = imu.calibration
             if calibration is None:
                 continue
             now = tuple(calibration.offsets.values()), self._vehicle.boots
-            known, self._known[name] = self._known.get(name), now
-            if known is None:
-                self._check_after_job(name, self._before.pop(name, now), now, calibration)
-            elif known[1] != now[1]:
-                self._lost(name, Why.REPLACED if known[0] != now[0] else Why.REBOOTED)
-            elif known != now:
-                self._changed_by_others(name)
-
-    def _check_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
-        """Compare with the end of a job: the EKF may have settled for minutes since."""
-        written, rebooted = self._written.pop(name, {}), before[1] != now[1]
-        restarted = rebooted and not self._asked_restart
-        changed = (self._failed and before[0] != now[0]) or (written and calibration.contradicts(written))
-        if changed and rebooted and (self._failed or restarted):
-            # Our own changes have been restored by now.
-            self._lost(name, Why.FAILED if self._failed else Why.REPLACED)
-        elif changed:
-            self._changed_by_others(name)
-        elif restarted:
-            self._lost(name, Why.REBOOTED)
-
-    def _changed_by_others(self, name: str) -> None:
-        self.foreign = f"{name} was changed"
-        logger.warning("imu %s: somebody else changed its offsets; they are left alone", name)
-        self._lost(name, Why.CHANGED)
+            after_job = name not in self._known
+            before = self._before.pop(name, now) if after_job else self._known[name]
+            self._known[name] = now
+            failed, written = after_job and self._failed, self._written.pop(name, {})
+            rebooted = before[1] != now[1]
+            restarted = rebooted and not (after_job and self._asked_restart)
+            if failed or not after_job:
+                changed = before[0] != now[0]
+            else:
+                # The EKF may have settled for minutes: only what was written must still be there.
+                changed = bool(written) and calibration.contradicts(written)
+            if changed and rebooted and (failed or restarted):
+                # Our own changes have been restored by now.
+                self._lost(name, Why.FAILED if failed else Why.REPLACED)
+            elif changed:
+                self.foreign = f"{name} was changed"
+                logger.warning("imu %s: somebody else changed its offsets; they are left alone", name)
+                self._lost(name, Why.CHANGED)
+            elif restarted:
+                self._lost(name, Why.REBOOTED)

@@ -61,7 +61,6 @@ class SensorWatch:
         self._has_failed = False
 
     async def run(self) -> None:
-        """Check until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             try:
@@ -74,7 +73,6 @@ class SensorWatch:
             await asyncio.sleep(PERIOD_S)
 
     def update(self, now_s: float) -> None:
-        """Check all sensors once."""
         self._note_motion()
         for sensor in self._sensors:
             found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
@@ -133,11 +131,9 @@ class SensorWatch:
         return Trouble("stuck", f"{words}; switch its power off and on", implausible=True)
 
     def implausible(self) -> str | None:
-        """Return a sensor whose readings look good and are not, and why, or None."""
         return next((words for plausible, words in self._troubles() if not plausible), None)
 
     def worst(self) -> str | None:
-        """Return the worst trouble of all sensors, with the sensor's name; None while all do well."""
         return next((words for _, words in self._troubles()), None)
 
     def _troubles(self) -> list[tuple[bool, str]]:

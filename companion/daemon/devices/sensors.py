@@ -44,8 +44,6 @@ AGAIN_S: Final = 60.0
 
 
 class SensorHealth:
-    """Present trouble of one sensor, and how often each trouble has begun."""
-
     def __init__(self, link: ByteLink, protocol: str, decoder: Decoder) -> None:
         self.link, self._decoder = link, decoder
         self.stream = StreamHealth(protocol, decoder)
@@ -59,12 +57,10 @@ class SensorHealth:
         self._warned_s: dict[str, float] = {}
 
     def opened(self, now_s: float) -> None:
-        """Forget the stream of before: the port was opened (again)."""
         self._opened_s = now_s
         self.stream.opened()
 
     def trouble(self, now_s: float) -> Trouble | None:
-        """Return the worst fault; None while good samples come."""
         if not self.link.connected:
             return Trouble(ABSENT, self.link.last_error or f"{self.link.settings.url}: not open yet")
         found = _flood(self.link.budget, now_s) or self.stream.trouble(now_s) or self._stuck
@@ -122,8 +118,6 @@ def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
 
 
 class SensorRole:
-    """One use of a device, as `companion status` shows it."""
-
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
         self.name, self.kind = role.name, role.kind
         self._sensor = sensor
@@ -133,7 +127,6 @@ class SensorRole:
         self._rate_hz = 0.0
 
     def count(self, t_s: float) -> None:
-        """Count a sample from bytes that were read at `t_s`."""
         self._samples += 1
         self._last_s = t_s
         since_s, before = self._counted
@@ -142,7 +135,6 @@ class SensorRole:
             self._counted = (t_s, self._samples)
 
     def _problem(self, now_s: float) -> str | None:
-        """Return the fault of this use, though frames come, in one line; None while samples come."""
         sensor, port = self._sensor, self._sensor.link.settings
         if self._last_s is not None and now_s - self._last_s < SILENT_AFTER_S:
             return None
@@ -151,7 +143,6 @@ class SensorRole:
         return f"{port}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
 
     def status(self) -> dict[str, object]:
-        """For `companion status` and `check`."""
         sensor, now_s = self._sensor, asyncio.get_running_loop().time()
         trouble, words = sensor.health.trouble(now_s), sensor.text
         problem = self._problem(now_s) if trouble is None else trouble.words
@@ -183,8 +174,6 @@ class SensorRole:
 
 
 class SerialSensor:
-    """One serial device, read and decoded once for all its roles; `take` gets the part of each sample for each role."""
-
     def __init__(
         self, device: SerialDevice, take: Callable[[Role, Sample], None], offload: Offload = asyncio.to_thread
     ) -> None:
@@ -204,7 +193,6 @@ class SerialSensor:
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
         """Listeners to name, bytes and time before decoding; None for bytes that are missing."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
-        """Listeners to all samples of a read and its time, before the collector."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
@@ -217,7 +205,6 @@ class SerialSensor:
         self._told: set[str] = set()
 
     async def run(self) -> None:
-        """Read, and hold the dialogue, until cancelled."""
         if self.dialogue is None:
             await self.link.run()
             return
@@ -243,7 +230,6 @@ class SerialSensor:
         self.decoder.interrupted()
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Decode bytes that were read at `t_s`, and hand on the samples."""
         if self.on_bytes:
             self.on_bytes.tell(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
@@ -298,7 +284,6 @@ class SerialSensor:
 
     @property
     def text(self) -> str:
-        """Return the last words sent to the device, or why nothing is sent; empty without an occasion."""
         if self._held_by:
             return f"nothing is said to it: {self._held_by} has the port open too"
         return self.dialogue.words if self.dialogue is not None else ""

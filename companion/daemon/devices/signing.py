@@ -29,7 +29,6 @@ RESERVE_BEFORE_TICKS: Final = 5 * TICKS_PER_S
 UNANSWERED: Final = 3
 """Unanswered requests in a row, one a second, after which the autopilot is taken to want signatures."""
 ASK_AGAIN_S: Final = 30.0
-"""Pause before an autopilot that has answered is asked again."""
 AFTER_S: Final = 3.0
 """Time without a verified message before a fault is reported: longer than a key takes to be changed."""
 AHEAD_OF_CLOCK_S: Final = 86400.0
@@ -66,9 +65,7 @@ class LinkSigning:
         self._reserved = 0
         self._write_failed = False
         self._named: set[Reason] = set()
-        """Reasons for which a sender other than the autopilot was named."""
         self.warning: str | None = None
-        """Present fault of the autopilot's signatures, with its remedy."""
         self._refused: Counter[Reason] = Counter()
         """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
         self._verified = False
@@ -83,7 +80,6 @@ class LinkSigning:
             self.signing.on_verified, self.signing.on_refused = self._on_verified, self._on_refused
 
     def load(self) -> None:
-        """Read time and key, before anything is sent."""
         if self.signing is None:
             return
         ticks, in_this_boot = 0, False
@@ -96,7 +92,6 @@ class LinkSigning:
         self._read_key(self.signing)
 
     async def run(self) -> None:
-        """Keep time and key, and report faults, until cancelled."""
         signing = self.signing
         try:
             while True:
@@ -215,7 +210,6 @@ class LinkSigning:
         return f"{self._refused[found]} messages dropped: {_fault_of(self.signing, found)}"
 
     def status(self) -> dict[str, Any] | None:
-        """For `companion status`; None while signing is off and no fault is found."""
         if self.signing is None and self.warning is None:
             return None
         signing = self.signing or Signing(required=False)

@@ -7,7 +7,6 @@ between links with MAV_n_FORWARD = 1 at its start; no message tells which MAV_n 
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -19,15 +18,14 @@ from companion.autopilot.firmware.firmwares import port_needs
 from companion.autopilot.telemetry.imu_stream import ask_script
 from companion.autopilot.telemetry.px4_console import EkfBias, ImuStatus, Px4Console
 from companion.autopilot.vehicle.parameter_client import ParameterClient
-from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.configured import models
 from companion.configured.models import Role, baud_of, collect, serial_devices
-from companion.daemon.core import Core, Subsystem, Task
+from companion.daemon.core import Core, RepeatedRead, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensor_watch import NO_OFFSETS, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
-from companion.errors import AutopilotError
 from companion.estimation.means.pose import up_in_vehicle
 from companion.estimation.solution.site import IN_CONFIGURATION
 from companion.estimation.stillness.plausible import misplaced
@@ -37,26 +35,19 @@ from companion.links.system.events import Listeners
 from companion.physics.units import G
 from companion.samples import ImuSample, Sample
 
-logger = logging.getLogger(__name__)
-
 SILENT_S: Final = 5.0
 RETRY_S: Final = 10.0
 
 
 class Reach:
-    """Knows whether a ground station reaches the companion, and what the autopilot's parameters say of forwarding."""
-
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
         self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
         self._heard_s = -math.inf
         self._closed: list[str] = []
-        self._stale = asyncio.Event()
-        self._stale.set()
+        self.reading = RepeatedRead(vehicle, self._read, RETRY_S)
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
-        vehicle.on_event.add(self._on_event)
 
     def text(self) -> tuple[bool, str]:
-        """Return whether all is well, and the facts with the remedy, for `companion check`."""
         if not self._vehicle.alive:
             return True, "not known: no autopilot"
         answers = (word for word, count in self._vehicle.commands.results.items() if count)
@@ -71,26 +62,12 @@ class Reach:
             return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"
         return self._vehicle.kind.forwarding_words(self._closed)
 
-    async def run(self) -> None:
-        """Read the parameters, again after every restart, until cancelled."""
-        while True:
-            await self._stale.wait()
-            self._stale.clear()
-            await self._vehicle.found.wait()
-            try:
-                self._closed = await self._vehicle.kind.read_closed_links(self._parameters)
-            except AutopilotError as error:
-                logger.debug("forwarding is not known yet: %s", error)
-                await asyncio.sleep(RETRY_S)
-                self._stale.set()
+    async def _read(self) -> None:
+        self._closed = await self._vehicle.kind.read_closed_links(self._parameters)
 
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
         if message.type == mavlink.MAV_TYPE_GCS:
             self._heard_s = t_s
-
-    def _on_event(self, event: VehicleEvent) -> None:
-        if event in ("found", "rebooted"):
-            self._stale.set()
 
 
 class Devices(Subsystem):
@@ -119,7 +96,6 @@ class Devices(Subsystem):
 
     @property
     def not_heard(self) -> str:
-        """Words: no autopilot has been heard, and why."""
         return ": ".join(filter(None, (f"not heard yet on {self._core.config.mavlink.url}", self.signing.rejecting)))
 
     def load(self) -> None:
@@ -162,14 +138,14 @@ class Devices(Subsystem):
         return misplaced(name, rotation @ batch.mean[3:], G * up, rotation, IN_CONFIGURATION.mounting)
 
     def tasks(self, *, ports: bool = True) -> Sequence[Task]:
-        """List the tasks; without `ports` a test hands bytes to `sensors`."""
         return [
             ("collector", self._core.keep_ticking),
             ("signing", self.signing.run),
-            ("reach", self.reach.run),
+            ("reach", self.reach.reading.run),
             *([("ekf-bias", self.ekf_bias.run), ("imu-status", self._status.run)] if self._asks else []),
             ("script-floats", lambda: ask_script(self._core.link, [imu.stream for imu in self.imus.values()])),
-            *((imu.name, imu.run) for imu in self.imus.values()),
+            *((f"{imu.name} telemetry", imu.stream.run) for imu in self.imus.values()),
+            *((f"{imu.name} offsets", imu.reading.run) for imu in self.imus.values()),
             *(((sensor.name, sensor.run) for sensor in self.sensors) if ports else ()),
             *([("sensor-watch", self.watch.run)] if ports else []),
         ]

@@ -15,7 +15,6 @@ from companion.autopilot.firmware.base import Firmware, Net
 from companion.autopilot.telemetry.attitude_messages import (
     TimesyncResponder,
     attitude_messages,
-    microseconds,
     vision_position_estimate,
 )
 from companion.autopilot.vehicle.ekf import OwnCompass
@@ -24,12 +23,11 @@ from companion.component.statustext import Severity, Weight
 from companion.configured import models
 from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core
+from companion.daemon.core import Core, RepeatedRead
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier, carrying_imu, without_truncation
 from companion.daemon.heading.health import Difference, Health
 from companion.daemon.heading.resume import Resume
-from companion.errors import AutopilotError
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.physics.units import DEG
@@ -52,7 +50,6 @@ _ROUNDING_S: Final = 1e-6
 SCRIPT_STARTS_S: Final = 15.0
 """Time from the first heartbeat until it is known whether there is a script."""
 WELL_S: Final = 10.0
-"""Time for which our heading must have been pushed before its source set is requested again."""
 AGAIN_S: Final = 1.0
 _OURS, _COMPASS, _GYROS = 1, 2, 3
 _WORDS: Final = {
@@ -73,7 +70,7 @@ class Fallback:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self.net: Net | None = None
         self._selected = False
-        self._stale = asyncio.Event()
+        self.reading = RepeatedRead(core.vehicle, self._read, 0.0)
         self._pushed_since_s = math.inf
         self._asked: int | None = None
         self._tried_s = -math.inf
@@ -81,32 +78,20 @@ class Fallback:
 
     @property
     def is_all(self) -> bool:
-        """Return whether the autopilot has no heading but ours, so that its yaw proves nothing."""
         return self._selected and self.net == "none"
 
-    async def run(self) -> None:
-        """Read the settings after every start of the autopilot, until cancelled."""
-        while True:
-            await self._vehicle.found.wait()
-            self._stale.clear()
-            kind = self._vehicle.kind
-            await asyncio.sleep(SCRIPT_STARTS_S)
-            if kind.heading_settings:
-                try:
-                    found = await self._parameters.read_many(kind.heading_names(), optional=True)
-                except AutopilotError as error:
-                    logger.info("what the autopilot flies by when our heading ends is not known: %s", error)
-                    continue
-                self.net, self._selected = kind.heading_net(found), kind.takes_only_our_heading(found)
-            await self._stale.wait()
+    async def _read(self) -> None:
+        kind = self._vehicle.kind
+        await asyncio.sleep(SCRIPT_STARTS_S)
+        if kind.heading_settings:
+            found = await self._parameters.read_many(kind.heading_names(), optional=True)
+            self.net, self._selected = kind.heading_net(found), kind.takes_only_our_heading(found)
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("found", "rebooted"):
             self.net = self._asked = None
-            self._stale.set()
 
     def step(self, now_s: float, *, pushing: bool) -> None:
-        """Request the right source set where no script does."""
         self._pushed_since_s = min(self._pushed_since_s, now_s) if pushing else math.inf
         if self.net != "command" or not self._selected:
             return
@@ -123,7 +108,6 @@ class Fallback:
         answer.add_done_callback(lambda done: self._answered(wanted, done.result()))
 
     def close(self, now_s: float) -> None:
-        """Request the set for the time after the daemon."""
         self._tried_s = -math.inf
         self.step(now_s, pushing=False)
 
@@ -134,8 +118,6 @@ class Fallback:
 
 
 class Sender:
-    """Sends the attitude to the autopilot when it is due; to ground stations too, if `full`."""
-
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
         self._link, self._full = link, full
@@ -148,13 +130,11 @@ class Sender:
             t_s >= self._next_s - _ROUNDING_S
             and t_s - self._last_s >= SHORTEST_S - _ROUNDING_S
             and now_s - self._left_s >= SHORTEST_S - _ROUNDING_S
-            and microseconds(t_s) > microseconds(max(self._last_s, 0.0))
         )
 
     def send(
         self, firmware: Firmware, attitude: Attitude, levelled: Attitude, reset_counter: int, now_s: float
     ) -> None:
-        """Send `levelled` to the autopilot, and `attitude` to ground stations."""
         t_s = attitude.t_s
         # The rate is kept on average, but messages missed in a gap are not made up for.
         self._next_s = self._next_s + self._period_s if self._next_s > t_s - self._period_s else t_s + self._period_s
@@ -168,15 +148,14 @@ class Sender:
 
 
 class AttitudeService:
-    """Carries, pushes and supervises the attitude; `run` it."""
-
     def __init__(self, core: Core, devices: Devices, in_force: ActiveCalibration, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
         self.turns = 0
         self._config, self._vehicle, self._say = config, vehicle, core.say
         self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
         self.difference = Difference(vehicle, self.carrier)
-        self.resume = Resume(core, self.carrier, self.difference, calibrating, devices.imus)
+        self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
+        self.resume = Resume(core, self.carrier, self.difference, calibrating, self._autopilot_imu)
         self.fallback, own = Fallback(core), OwnCompass(vehicle, wanted=True)
         self.health = Health(
             self.carrier, self.difference, vehicle, lambda now_s: own.agrees(now_s) and not self.fallback.is_all
@@ -190,9 +169,8 @@ class AttitudeService:
         self._was_pushing = False
         self._said: tuple[str, float] = ("", -math.inf)
         self._warned: str | None = None
-        self._running = False
-        self._started_s, self._late_told = math.inf, False
-        self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
+        self._runs = core.only_listening is None
+        self._started_s = math.inf
         if self._autopilot_imu is not None:
             take = self._guarded(self._on_imu)
             self._autopilot_imu.on_counting.add(lambda sample: take((sample,), sample.t_s))
@@ -252,9 +230,8 @@ class AttitudeService:
     # --- the rhythm
 
     async def run(self) -> None:
-        """Do everything that is less urgent than a sample, until cancelled."""
         loop = asyncio.get_running_loop()
-        self._running, self._started_s = True, loop.time()
+        self._started_s = loop.time()
         try:
             while True:
                 self.turns += 1
@@ -267,7 +244,6 @@ class AttitudeService:
                     await asyncio.sleep(1.0)
                 await asyncio.sleep(TICK_S)
         finally:
-            self._running = False
             self.health.stop("the companion ends")
 
     async def _turn(self, now_s: float) -> None:
@@ -285,7 +261,6 @@ class AttitudeService:
         self._tell(now_s)
 
     def close(self) -> None:
-        """Stop the push, and request another heading where no script does."""
         self.health.stop("the companion ends")
         self.fallback.close(asyncio.get_running_loop().time())
 
@@ -294,8 +269,8 @@ class AttitudeService:
             self._say_once(Severity.NOTICE, "Attitude: heading pushed to the autopilot", now_s)
         elif self._was_pushing and not self.health.pushing:
             self._say_once(Severity.WARNING, f"Attitude push stopped: {self.health.why_not}", now_s)
-        elif self._restarted and not self._late_told and now_s - self._started_s >= LATE_S:
-            self._late_told = True
+        elif self._restarted and now_s - self._started_s >= LATE_S:
+            self._started_s = math.inf  # told once
             self._say_once(Severity.WARNING, f"Attitude not pushed: {self.health.why_not}", now_s)
         self._was_pushing = self.health.pushing
         warning = self.health.warning
@@ -318,7 +293,6 @@ class AttitudeService:
 
     @property
     def concern(self) -> str | None:
-        """Return the warning for the pilot of an armed aircraft."""
         if self._restarted:
             return f"attitude not pushed: {self.health.why_not}"
         if self.carrier.phase == "flight" and not self.health.pushing and self.carrier.alignments:
@@ -326,11 +300,10 @@ class AttitudeService:
         return self.health.warning
 
     def status(self) -> Object:
-        """Return the attitude's line among the devices."""
         # A missing calibration is no fault of a device.
         calibrated = self.carrier.alignments > 0 or self._restarted
-        good = not self._running or self.health.pushing or not calibrated
-        summary = self._summary() if self._running else "starts with companion run"
+        good = not self._runs or self.health.pushing or not calibrated
+        summary = self._summary() if self._runs else "starts with companion run"
         return {"name": "attitude", "kind": "attitude", "good": good, "summary": summary}
 
     def _summary(self) -> str:
@@ -342,7 +315,6 @@ class AttitudeService:
         return f"heading {seen['heading_deg']:.1f} +- {seen['sigma_deg']['heading']:.1f} deg pushed{differs}"
 
     def view(self) -> Object:
-        """Return the attitude for the status."""
         now_s = asyncio.get_running_loop().time()
         attitude, difference = self.carrier.now(), self.difference
         known = attitude is not None and difference.is_known(now_s)
@@ -364,7 +336,6 @@ class AttitudeService:
         }
 
     def pose(self) -> Object | None:
-        """Return the pushed attitude in the keys of the pose; None while nothing is pushed."""
         attitude = self.carrier.now() if self.health.pushing else None
         if attitude is None:
             return None

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.attitude.estimator import Attitude, AttitudeEstimator, AttitudeSettings, Phase
-from companion.attitude.quaternion import Quaternion, Triple, conjugate, from_matrix, multiply, rotate
+from companion.attitude.quaternion import Quaternion, conjugate, from_matrix, multiply, rotate
 from companion.attitude.strapdown import HEADING_UNKNOWN_RAD
 from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
@@ -56,7 +56,6 @@ def carrying_imu(config: Config) -> Imu:
 
 
 def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s: float) -> AttitudeSettings | None:
-    """Return the estimator's settings from the active record; None without calibrated gyros."""
     serial = imu.source == "serial"
     gyro = record.gyro_bias_rad_s if serial else _left(record, record.residual_gyro_rad_s, "gyro")
     accel = record.accel_bias_m_s2 if serial else _left(record, record.residual_accel_m_s2, "accel")
@@ -90,15 +89,12 @@ def _left(record: ImuRecord, residual: Vector | None, triad: Triad) -> Vector | 
 
 
 def without_truncation(sample: ImuSample, step_rad_s: float) -> ImuSample:
-    """Correct rates that were truncated towards zero by half a step."""
     x, y, z = (rate + math.copysign(0.5 * step_rad_s, rate) if rate else 0.0 for rate in sample.gyro_rad_s)
     return ImuSample(t_s=sample.t_s, gyro_rad_s=(x, y, z), accel_m_s2=sample.accel_m_s2)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandingAttitude:
-    """Attitude of the standing aircraft at the end of a window."""
-
     t_s: float
     body_from_ned: Matrix
     covariance: Matrix
@@ -120,16 +116,7 @@ def standing_attitude(
     return StandingAttitude(window.end_s, turn, covariance, truth.heading_rad is not None, local)
 
 
-def turn_between(ours: Quaternion, theirs: Quaternion) -> Triple:
-    """Return the rotation from ours to theirs about north, east and down in rad; 2 sin(angle / 2) of large ones."""
-    error = multiply(theirs, conjugate(ours))
-    sign = math.copysign(2.0, error[0])
-    return sign * error[1], sign * error[2], sign * error[3]
-
-
 class Carrier:
-    """Carries the attitude of one IMU."""
-
     def __init__(self, core: Core, imu: Imu, in_force: ActiveCalibration, alignment: ActiveAlignment) -> None:
         self.imu = imu
         self.estimator: AttitudeEstimator | None = None
@@ -158,7 +145,6 @@ class Carrier:
     # --- samples, in the turn of the loop in which they were read
 
     def add(self, samples: Sequence[ImuSample]) -> None:
-        """Add the samples of one read."""
         self.heard_s = samples[-1].t_s
         if self.phase == "ground" or self.estimator is None:
             recent = self._recent
@@ -169,7 +155,6 @@ class Carrier:
             self.estimator.update(samples, phase=self.phase, still=self.still, airspeed_m_s=self.airspeed_m_s)
 
     def take_compass(self, samples: Sequence[Sample]) -> None:
-        """Add headings of the compass."""
         estimator, compass, local = self.estimator, self._compass, self._local
         if estimator is None or compass is None or local is None:
             return
@@ -189,16 +174,13 @@ class Carrier:
             estimator.add_heading(sample.t_s, heading, sigma_deg * DEG)
 
     def forget(self) -> None:
-        """Start anew, with the active calibration."""
         self.estimator = self._record = None
         self._recent.clear()
 
     def now(self) -> Attitude | None:
-        """Return the attitude at the last sample; None while there is none."""
         return None if self.estimator is None else self.estimator.attitude()
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return the remembered instant nearest before a time, and the attitude then (body to NED)."""
         return None if self.estimator is None else self.estimator.kept_at(t_s)
 
     def _on_event(self, event: VehicleEvent) -> None:
@@ -211,7 +193,6 @@ class Carrier:
     # --- calibration and alignment, a few times a second
 
     async def update(self, now_s: float) -> None:
-        """Follow arming, calibrations and stillness; align when needed."""
         disarmed = self._vehicle.arm_state is ArmState.DISARMED
         # With an unknown arm state the rules of flight are safe.
         self.phase = "ground" if disarmed else "flight"
@@ -240,9 +221,8 @@ class Carrier:
         if found is self._record:
             return
         self._record = found
-        self.estimator = self.estimator if found is not None else None
         if found is None:
-            self.waiting_for = "waiting for a calibration"
+            self.estimator, self.waiting_for = None, "waiting for a calibration"
             return
         local = self._local = await self._core.local_earth()
         settings = settings_of(self._core.profiles.imu(self.imu.name), found, local, self.gyro_step_rad_s)
@@ -255,7 +235,6 @@ class Carrier:
             self.align_wanted = True
 
     def resume(self, settings: AttitudeSettings, stand: StandingAttitude) -> None:
-        """Start in flight."""
         self.estimator, self._local = AttitudeEstimator(settings), stand.local
         self._align(stand)
 
@@ -275,7 +254,9 @@ class Carrier:
         now = self.now()
         if now is None:
             return True
-        north, east, down = turn_between(now.quaternion, from_matrix(stand.body_from_ned.T))
+        error = multiply(from_matrix(stand.body_from_ned.T), conjugate(now.quaternion))
+        # The turn about north, east and down in rad; where it is large, 2 sin(angle / 2).
+        north, east, down = (math.copysign(2.0, error[0]) * part for part in error[1:])
         tilt = math.hypot(north, east)
         own = max(now.sigma_rad[0], now.sigma_rad[1])
         tilt_sigma = math.hypot(own, math.sqrt(max(stand.covariance[0, 0], stand.covariance[1, 1])))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable
 from typing import Final
 
 import msgspec
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.estimator import REFUSED_S, Attitude, AttitudeEstimator
@@ -23,6 +25,7 @@ from companion.attitude.quaternion import (
 )
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.daemon.heading.carrier import Carrier
+from companion.physics.frames import vector
 from companion.physics.units import DEG
 
 SILENT_S: Final = 0.2
@@ -36,7 +39,6 @@ THEIR_TILT_DEG: Final = 2.0
 THEIR_HEADING_DEG: Final = 5.0
 """One sigma of the error of the autopilot's heading, from a compass or the companion."""
 GOOD_S: Final = 3.0
-"""Time without a fault before a stopped push begins again."""
 TOLD_TILT_DEG: Final = 4.0
 TOLD_HEADING_DEG: Final = 8.0
 """Smoothed differences that cause a warning; it ends at half of them."""
@@ -54,11 +56,9 @@ STRAYS_RAD: Final = math.radians(5.0)
 FADES_S: Final = 4.0
 """Time in which the sum fades: a drift of 1.25 deg/s goes unnoticed, and the compass corrects it."""
 STRAYS_SIGMAS: Final = 3.0
-"""Allowed turn in sigmas of the heading: the compass may correct a poorly known one."""
 SCALES: Final = 0.01
 """Share of a turn by which two gyros may differ."""
 LATE_S: Final = 0.03
-"""Usual difference of the two times."""
 LONGEST_STEP_S: Final = 0.25
 """Longest step that is compared: it hides a turn to and fro."""
 
@@ -73,7 +73,6 @@ class HeadingDriftMonitor:
         self._turned_rad = self._sigma_rad = self._apart_rad = 0.0
 
     def skip(self) -> None:
-        """Skip the step to the next instant, as the delays of its ends differ."""
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
@@ -100,8 +99,6 @@ class HeadingDriftMonitor:
 
 
 class Difference:
-    """Difference of our attitude to the latched autopilot's, by its ATTITUDE messages."""
-
     def __init__(self, vehicle: Vehicle, carrier: Carrier) -> None:
         self._carrier = carrier
         self._offset_s: float | None = None
@@ -116,30 +113,25 @@ class Difference:
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
 
     def forget(self) -> None:
-        """Start anew after an alignment."""
-        self._sine = self._cosine = 0.0
-        self._down: Triple = (0.0, 0.0, 0.0)
-        self._down_now: Triple = (0.0, 0.0, 0.0)
+        self._heading = 0j
+        self._down = self._down_now = np.zeros(3)
         self._since_s = math.inf
         self.straying = HeadingDriftMonitor()
 
     def is_heard(self, now_s: float) -> bool:
-        """Return whether the autopilot sends its attitude."""
         return now_s - self.heard_s < OLD_S
 
     def is_known(self, now_s: float) -> bool:
-        """Return whether the difference has been smoothed long enough."""
         return self.is_heard(now_s) and now_s - self._since_s > SMOOTHED_S
 
     @property
     def tilt_rad(self) -> float:
-        """Smoothed angle between the two verticals."""
-        return math.hypot(*self._down)
+        return float(np.linalg.norm(self._down))
 
     @property
     def heading_rad(self) -> float:
         """Smoothed heading of the autopilot less ours, in [-pi, pi]."""
-        return math.atan2(self._sine, self._cosine)
+        return cmath.phase(self._heading)
 
     def levelled(self, attitude: Attitude, now_s: float) -> Attitude:
         """Return our attitude turned by the shortest arc to the autopilot's vertical, if known.
@@ -151,8 +143,7 @@ class Difference:
         if not self.is_heard(now_s):
             return attitude
         ours = rotate(conjugate(attitude.quaternion), _DOWN)
-        x, y, z = (a + b for a, b in zip(ours, self._down_now, strict=True))
-        turn = multiply(attitude.quaternion, shortest_arc((x, y, z), ours))
+        turn = multiply(attitude.quaternion, shortest_arc(vector(np.add(ours, self._down_now)), ours))
         roll, pitch, yaw = roll_pitch_yaw(turn)
         return msgspec.structs.replace(attitude, quaternion=turn, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
 
@@ -185,18 +176,15 @@ class Difference:
         if first:
             self._since_s = t_s
         gain = 1.0 if first else 1.0 - math.exp(-span_s / SMOOTHED_S)
-        mine, other = rotate(conjugate(ours), _DOWN), rotate(conjugate(theirs), _DOWN)
-        down = [b - a for a, b in zip(mine, other, strict=True)]
-        self._down_now = (down[0], down[1], down[2])
-        x, y, z = (kept + gain * (new - kept) for kept, new in zip(self._down, down, strict=True))
-        self._down = (x, y, z)
+        self._down_now = np.subtract(rotate(conjugate(theirs), _DOWN), rotate(conjugate(ours), _DOWN))
+        self._down = self._down + gain * (self._down_now - self._down)
         self.latest = None
         _, pitch, yaw = roll_pitch_yaw(ours)
         _, their_pitch, their_yaw = roll_pitch_yaw(theirs)
         if max(abs(pitch), abs(their_pitch)) < STEEP_RAD:
-            self.latest = math.hypot(*down), math.remainder(their_yaw - yaw, 2.0 * math.pi)
-            self._sine += gain * (math.sin(their_yaw - yaw) - self._sine)
-            self._cosine += gain * (math.cos(their_yaw - yaw) - self._cosine)
+            heading = cmath.rect(1.0, their_yaw - yaw)
+            self.latest = float(np.linalg.norm(self._down_now)), cmath.phase(heading)
+            self._heading += gain * (heading - self._heading)
 
     def _late_s(self, boot_s: float, t_s: float) -> float:
         offset_s = t_s - boot_s
@@ -215,17 +203,14 @@ class Difference:
 
 
 def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tuple[str | None, str | None]:
-    """Return in words whether tilt and heading differ by more than both errors allow; None where they do not."""
-    roll, pitch, yaw = (sigma / DEG for sigma in attitude.sigma_rad)
-    words: list[str | None] = []
-    for name, found_rad, ours_deg, theirs_deg in (
-        ("tilt", tilt_rad, max(roll, pitch), THEIR_TILT_DEG),
-        ("heading", heading_rad, yaw, THEIR_HEADING_DEG),
-    ):
+    def differs(name: str, found_rad: float, ours_rad: float, theirs_deg: float) -> str | None:
         found_deg = abs(found_rad) / DEG
-        beyond = found_deg > DIFFERS_SIGMAS * math.hypot(ours_deg, theirs_deg)
-        words.append(f"{name} differs by {found_deg:.0f} deg from the autopilot's" if beyond else None)
-    return words[0], words[1]
+        beyond = found_deg > DIFFERS_SIGMAS * math.hypot(ours_rad / DEG, theirs_deg)
+        return f"{name} differs by {found_deg:.0f} deg from the autopilot's" if beyond else None
+
+    roll, pitch, yaw = attitude.sigma_rad
+    tilt = differs("tilt", tilt_rad, max(roll, pitch), THEIR_TILT_DEG)
+    return tilt, differs("heading", heading_rad, yaw, THEIR_HEADING_DEG)
 
 
 class Health:
@@ -255,7 +240,6 @@ class Health:
         self._has_ours &= event != "rebooted"
 
     def judge(self, now_s: float) -> None:
-        """Update `pushing`, `why_not` and `warning`."""
         if self._alignments != self._carrier.alignments:
             self._alignments = self._carrier.alignments
             self._agreed, self._differs_since_s, self._strayed = False, None, None
@@ -274,7 +258,6 @@ class Health:
             self.why_not = f"well again, pushed after {GOOD_S:.0f} s of it"
 
     def stop(self, why: str) -> None:
-        """Stop the push at once."""
         self._stopped |= self.pushing
         self.pushing, self.why_not, self._good_since_s = False, why, None
 

@@ -6,7 +6,6 @@ Roll and pitch come from the autopilot, the heading from our compass. Nothing is
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Final
 
 import msgspec
@@ -28,29 +27,18 @@ from companion.physics.frames import vector
 from companion.physics.units import DEG
 
 AGREES_S: Final = 0.7
-"""Time of agreement before the push, and of disagreement before a new start."""
 FRESH_S: Final = 1.0
-"""Largest age of the autopilot's attitude; the gyros carry it on."""
 LATEST: Final = 10
-"""Records searched for one that is not cancelled or failed."""
 DECLINATION_SIGMA_DEG: Final = 1.0
 """Error of a stored declination: 0.3 to 0.5 deg of the model, and the distance flown since."""
 
 
 class Resume:
-    """Resumes the attitude in flight; `step` several times a second until `pending` is false."""
-
     def __init__(
-        self,
-        core: Core,
-        carrier: Carrier,
-        difference: Difference,
-        calibrating: Calibrating,
-        imus: Mapping[str, AutopilotImu],
+        self, core: Core, carrier: Carrier, difference: Difference, calibrating: Calibrating, imu: AutopilotImu | None
     ) -> None:
-        self._core, self._carrier, self._difference = core, carrier, difference
+        self._core, self._carrier, self._difference, self._imu = core, carrier, difference, imu
         self._store, self._memory = calibrating.store, calibrating.memory
-        self._imu = imus.get(carrier.imu.name)
         self.pending = True
         self._record: Record | None = None
         self._looked = False
@@ -59,7 +47,6 @@ class Resume:
         self._since_s = self._unknown_s = 0.0
 
     async def step(self, now_s: float) -> None:
-        """Start, compare, and start anew where the two attitudes do not agree."""
         carrier = self._carrier
         if not self.pending or self._core.vehicle.system_id is None:
             return

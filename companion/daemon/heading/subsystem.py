@@ -31,8 +31,6 @@ DECLINATION_EVERY_S: Final = 60.0
 
 
 class Heading(Subsystem):
-    """Wires the shown pose and the pushed attitude."""
-
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
         self._core = core
         self.attitude: AttitudeService | None = None
@@ -43,6 +41,10 @@ class Heading(Subsystem):
             self.attitude = AttitudeService(core, devices, arming.in_force, calibrating)
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
         devices.on_pose.add(self.pose.add)
+
+    @property
+    def concern(self) -> str | None:
+        return None if self.attitude is None else self.attitude.concern
 
     def commands(self) -> Mapping[str, Handler]:
         return {"autopilot-setup": self._answer_setup}
@@ -77,12 +79,11 @@ class Heading(Subsystem):
             "parameters": [
                 {
                     "parameter": one.parameter,
-                    "now": now,
-                    "wanted": None if now is None else one.after(found),
+                    "now": found.get(one.parameter),
+                    "wanted": one.after(found) if one.parameter in found else None,
                     "why": one.why,
                 }
                 for one in firmware.heading_settings
-                for now in (found.get(one.parameter),)
             ],
             "risks": list(firmware.heading_risks) if concerned else [],
             "gate": {"at_arm": self._core.wanted.at_arm, "problem": gate},
@@ -100,14 +101,13 @@ class Heading(Subsystem):
         }
 
     def close(self) -> None:
-        """Stop the push, and request the fallback."""
         if self.attitude is not None:
             self.attitude.close()
 
     def tasks(self) -> Sequence[Task]:
         if self.attitude is None:
             return []
-        return [("attitude", self.attitude.run), ("fallback", self.attitude.fallback.run)]
+        return [("attitude", self.attitude.run), ("fallback", self.attitude.fallback.reading.run)]
 
 
 class PoseNow:
@@ -122,7 +122,6 @@ class PoseNow:
         self._looked_up_s = -math.inf
 
     def add(self, sample: Sample) -> None:
-        """Add a reading of gradienter or compass."""
         if isinstance(sample, TiltSample):
             self._tilt = sample
         elif isinstance(sample, CompassSample):
@@ -134,7 +133,6 @@ class PoseNow:
         return tilt if tilt and tilt.t_s >= since_s else None, heading if heading and heading.t_s >= since_s else None
 
     async def refresh(self) -> Object | None:
-        """Return `now`, with the declination updated when due."""
         now_s = asyncio.get_running_loop().time()
         due = now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None
         if self._compass is not None and self._compass.magnetic and due:
@@ -177,7 +175,6 @@ class PoseNow:
         return pose
 
     def readings(self) -> dict[str, float | None]:
-        """Return the readings of gradienter and compass before any offset; None where nothing is fresh."""
         tilt, heading = self._fresh()
         return {
             "gradienter_x_deg": None if tilt is None else round(tilt.x_deg, 4),

@@ -33,22 +33,18 @@ REPORT_LIMIT: Final = 256 * 1024
 
 
 class Child:
-    """Keeps `python -m MODULE` running; `run` it as a task."""
-
     def __init__(self, name: str, module: str, settings: ChildSettings) -> None:
         self._name, self._module, self._settings = name, module, settings
         self._report: Object | None = None
-        self._restart = Reconnection(name, worth_s=WORTH_S, first_s=0.5, cap_s=4.0)
         self.process_id: int | None = None
+        self._restart = Reconnection(name, worth_s=WORTH_S, first_s=0.5, cap_s=4.0)
 
     def status(self) -> Object:
-        """Return the child's last report, or why there is none."""
         if self._report is not None:
             return self._report
         return {"good": False, "summary": self._restart.last_error or "starting"}
 
     async def run(self) -> None:
-        """Keep the child running until cancelled, then let it end."""
         await self._restart.keep(self._once)
 
     async def _once(self) -> str:

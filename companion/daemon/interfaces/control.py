@@ -38,8 +38,6 @@ URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
 
 
 class ControlServer:
-    """Serves the control socket; `async with` it."""
-
     def __init__(self, path: Path, handler: Handler, *, group: str | None = None) -> None:
         self._path, self._group = path, group
         self._handler = handler
@@ -131,7 +129,6 @@ class ControlServer:
 
 
 async def _finish(writer: asyncio.StreamWriter) -> None:
-    """Close when the client has read everything; an OSError where it is gone, or does not read."""
     writer.close()
     async with asyncio.timeout(READ_TIMEOUT_S):
         await writer.wait_closed()
@@ -166,7 +163,6 @@ def _open_to(path: Path, group: str) -> None:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove a socket without a listener; a LinkError where there is one, or it is no socket."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:

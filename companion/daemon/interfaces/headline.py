@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import ArmAnswer
@@ -11,13 +11,11 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
+from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.estimation.machine import State
 from companion.formats import Object
-
-if TYPE_CHECKING:
-    from companion.daemon.heading.attitude_service import AttitudeService
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
@@ -25,29 +23,22 @@ Tone = Literal["good", "wait", "busy", "bad"]
 
 
 Headline = tuple[str, str, Tone]
-"""One to three words, the reason in one line, and the tone."""
 
 
 class Headlines:
-    """Works out the headline, for all interfaces alike."""
-
-    def __init__(self, core: Core, devices: Devices, arming: Arming, attitude: AttitudeService | None) -> None:
+    def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
-        self._devices, self._attitude = devices, attitude
+        self._devices, self._heading = devices, heading
 
     def now(self) -> Object:
-        """Return the headline of this moment."""
         word, reason, tone = self._now()
         good = tone == "good"
-        concern = self._concern() if good or word == ARMED else None
-        if concern is not None:
+        devices = self._devices
+        concern = devices.watch.implausible() or devices.signing.warning or self._heading.concern
+        if concern is not None and (good or word == ARMED):
             reason, tone = f"{concern}; {reason}", "wait" if good else tone
         return {"word": word, "reason": reason, "tone": tone}
-
-    def _concern(self) -> str | None:
-        attitude = None if self._attitude is None else self._attitude.concern
-        return self._devices.watch.implausible() or self._devices.signing.warning or attitude
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()

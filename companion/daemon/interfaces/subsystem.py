@@ -41,12 +41,9 @@ POSE_EVERY_S: Final = 0.2
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
 """Child processes by their name in a request, and as a record names the requester ("cancelled by mqtt cancel")."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
-"""Keys of the page's status while its process reports nothing."""
 
 
 class Interfaces(Subsystem):
-    """The MAVLink component, the control socket's answers, and the child processes."""
-
     def __init__(
         self,
         core: Core,
@@ -69,7 +66,7 @@ class Interfaces(Subsystem):
             Senders(core.config.mavlink.allow),
         )
         calibrating.manager.on_ended.add(self._show_result)
-        self._headlines = Headlines(core, devices, arming, heading.attitude)
+        self._headlines = Headlines(core, devices, arming, heading)
         self._pose, self._readiness = heading.pose, arming.readiness
         self._manager = calibrating.manager
         self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
@@ -127,12 +124,10 @@ class Interfaces(Subsystem):
             await asyncio.sleep(POSE_EVERY_S)
 
     async def refresh(self) -> Object:
-        """`all_status`, with the declination of the place looked up when it is time to."""
         await self._pose.refresh()
         return self.all_status()
 
     def all_status(self) -> Object:
-        """Return the daemon's status for JSON."""
         # Headline and arming line must belong to the same moment.
         self._readiness.update()
         return joined([subsystem.status() for subsystem in self._subsystems])
@@ -185,7 +180,6 @@ class Interfaces(Subsystem):
         return {"mqtt": report, "fleet": fleet}
 
     async def settled(self, within_s: float) -> None:
-        """Wait until the MQTT process has reached its broker, or reports an error, or the time is over."""
         deadline_s = asyncio.get_running_loop().time() + within_s
         while self.mqtt is not None and asyncio.get_running_loop().time() < deadline_s:
             report = self.mqtt.status()
@@ -203,7 +197,6 @@ class Interfaces(Subsystem):
 
 
 def own_parameters(wanted: RuntimeSettings) -> list[Parameter]:
-    """List the CMP_* parameters. What a ground station sets holds until the daemon restarts."""
     assert set(AT_ARM) == set(get_args(AtArm))
     gyro, accel = wanted.settings.target_gyro_sigma_rad_s / DEG_H, wanted.settings.target_accel_sigma_m_s2 / MG
 

@@ -37,8 +37,6 @@ _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 @dataclass(frozen=True, slots=True)
 class CheckLine:
-    """One line of the check; `remedy`: what to type, if anything."""
-
     name: str
     good: bool
     words: str
@@ -46,7 +44,6 @@ class CheckLine:
 
     @property
     def verdict(self) -> Literal["ok", "warning", "wrong"]:
-        """The line in one word; a good one with a remedy may not stay good."""
         if not self.good:
             return "wrong"
         return "warning" if self.remedy or self.name == "warning" else "ok"
@@ -64,7 +61,6 @@ def _ports(config: Config) -> dict[str, str]:
 
 
 def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[CheckLine]:
-    """List the system's faults of the configured ports."""
     ports = _ports(config)
     among = list_ports(root)
     fast = {sensor.name for sensor in serial_devices(config) if sensor.kind == "imu"}
@@ -142,7 +138,6 @@ def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
 async def run_check(
     config: Config, seconds: float, say: Callable[[str], object] = lambda _words: None
 ) -> list[CheckLine]:
-    """Check everything the configuration names; without a daemon listen to the ports for some seconds."""
     findings = [CheckLine("configuration", good=True, words="understood")]
     status: Object | None = None
     ours = {os.getpid()}
@@ -247,10 +242,6 @@ async def _heading(config: Config) -> CheckLine:
 
 
 def _storage(directory: Path) -> CheckLine:
-    place = directory
-    while not place.exists() and place != place.parent:
-        place = place.parent
+    place = next(path for path in (directory, *directory.parents) if path.exists())
     good = place.is_dir() and os.access(place, os.W_OK)
-    return CheckLine(
-        "storage", good, f"{directory}" if good else f"{directory}: cannot be written by this user ({place})"
-    )
+    return CheckLine("storage", good, f"{directory}" + ("" if good else f": cannot be written by this user ({place})"))

@@ -152,7 +152,6 @@ class Service:
             self.core.vehicle.close()
 
     def status(self) -> Object:
-        """Return the daemon's status for JSON."""
         return self.faces.all_status()
 
 
@@ -164,20 +163,16 @@ class WatchedTask:
     task: str
     within_s: float
     who: Any
-    """Object that counts its `turns`."""
     seen: int = 0
     age_s: float = 0.0
-    """Age of the latest turn in calls of `overdue`: while the whole event loop stands still, no task ages."""
 
     def overdue(self, passed_s: float) -> bool:
-        """Let time pass; returns whether the task has not gone on for too long."""
         before, self.seen = self.seen, self.who.turns
         self.age_s = self.age_s + passed_s if self.seen == before else 0.0
         return self.age_s > self.within_s
 
 
 def watched_tasks(service: Service) -> list[WatchedTask]:
-    """List the tasks of a service that must go on."""
     link_s = bytestream.BEAT_WITHIN_S + MARGIN_S
     attitude = service.heading.attitude
     return [
@@ -195,7 +190,6 @@ def watched_tasks(service: Service) -> list[WatchedTask]:
 
 
 def main(path: str, *verbose: str) -> int:
-    """Run the daemon with a configuration file until SIGTERM or SIGINT; return the command line's exit code."""
     # The watchdog's SIGABRT may be the only witness of a process that hangs: let it print where.
     faulthandler.enable()
     set_up_logs("debug" if verbose else "info")
@@ -214,7 +208,6 @@ def main(path: str, *verbose: str) -> int:
 
 
 async def run(wanted: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
     manager = ServiceManager.from_environment()
     try:
         await Supervisor(Service(wanted), manager).run()
@@ -235,8 +228,6 @@ def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
 
 
 class Supervisor:
-    """Runs a service until a signal or a fault, and feeds the watchdog meanwhile."""
-
     def __init__(self, service: Service, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager
         self.watched = watched_tasks(service)
@@ -246,7 +237,6 @@ class Supervisor:
         self._status_failed = False
 
     async def run(self) -> None:
-        """Run until a signal or a fault."""
         loop = asyncio.get_running_loop()
         self._work = work = loop.create_task(self._service.run(lambda: self._manager.notify("READY=1")), name="service")
         watching = loop.create_task(self._watch(), name="supervisor")
@@ -306,7 +296,6 @@ class Supervisor:
         self._missed = missed
 
     def _words(self, overdue: Sequence[WatchedTask]) -> str:
-        """Describe the status in one line, most important first."""
         if not self._manager.listens:
             return ""
         notes = ["stopping"] if self._stopping else []

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.arm_authorisation import ArmingScript
+from companion.component.component import ArmingScript
 from companion.component.own_parameters import Parameter
 from companion.component.service import ArmAnswer
 from companion.component.statustext import GOES_ON, Severity, StatusText, Weight, as_lines, to_ascii

@@ -23,7 +23,7 @@ def words_of(autopilot: ScriptedAutopilot) -> tuple[bool, str]:
         parameters = ParameterClient(link, vehicle)
         reach = Reach(link, vehicle, parameters, "serial:/dev/serial0:921600")
         async with flying_on(link, autopilot):
-            running = asyncio.create_task(reach.run())
+            running = asyncio.create_task(reach.reading.run())
             await asyncio.sleep(8.0)
             found = reach.text()
             running.cancel()

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from companion.commands import Calibrate, Cancel, Undo
-from companion.component.commands import Refused, Request, judge
+from companion.component.commands import Request, judge
+from companion.component.service import Refusal
 from companion.estimation.machine import What
 from tests.support.component import command_long
 
@@ -33,7 +34,7 @@ def test_every_action_goes_to_the_companion_and_is_understood(action: dict[str, 
     command = action["mavCmd"]
     assert isinstance(command, int)
     asked = judge(command_long(command, *(float(str(action.get(f"param{n}", 0))) for n in range(1, 8))))
-    assert not isinstance(asked, Refused), asked
+    assert not isinstance(asked, Refusal), asked
 
 
 class _MissionPlanner:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.arm_authorisation import ArmingScript
+from companion.component.component import ArmingScript
 from companion.component.service import ArmAnswer
 from companion.links.mavlink.link import MavlinkLink
 from companion.lua import ARMING_SCRIPT
