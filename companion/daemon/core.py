@@ -49,13 +49,11 @@ class RuntimeSettings:
         self._retargeted = retargeted
 
     def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None, tunes: bool | None = None) -> None:
-        """Change what is given."""
         self.at_arm = self.at_arm if at_arm is None else at_arm
         self.push = self.push if push is None else push
         self.tunes = self.tunes if tunes is None else tunes
 
     def retarget(self, **targets: float) -> None:
-        """Change targets: `target_...` as in `Settings`."""
         self.settings = msgspec.structs.replace(self.settings, **targets)
         self._retargeted(self.settings)
 
@@ -94,8 +92,6 @@ class RepeatedRead:
 
 
 class Core:
-    """The configuration, the autopilot's link and the collector, which all subsystems share; `link` is for tests."""
-
     def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
         self.config, self.offload = config, offload
         self.only_listening = only_listening
@@ -106,7 +102,6 @@ class Core:
         self.parameters = ParameterClient(self.link, self.vehicle)
         self.profiles, self.collector, self.machine = Profiles(config), models.collector(config), Machine()
         self.on_tick: Listeners[[float]] = Listeners()
-        """Notified of the time of every tick, before the collector."""
         self.wanted, self.texts = RuntimeSettings(config, self._retarget), StatusText(self.link)
         self.tunes = Tunes(self.link, self.vehicle, lambda: self.wanted.tunes, self.texts.woken)
 
@@ -120,12 +115,10 @@ class Core:
             self.collector.retarget(settings)
 
     async def local_earth(self) -> LocalEarth:
-        """Return gravity and the Earth's rate at the present place."""
         found: LocalEarth = await self.offload(local_earth, models.whereabouts(self.config, self.vehicle))
         return found
 
     async def keep_ticking(self) -> None:
-        """Tell the collector the time until cancelled."""
         while True:
             now_s = asyncio.get_running_loop().time()
             self.on_tick.tell(now_s)
@@ -141,41 +134,32 @@ class Core:
             self.collector.accept(work, await self.offload(work.run))
 
     async def window(self, *, since_s: float | None = None) -> Window:
-        """Return `RollingCollector.window` as of now; refused as there."""
         await self.catch_up(since_s=since_s)
         return self.collector.window(asyncio.get_running_loop().time(), since_s=since_s)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
-        """Send a text to the ground stations; see `StatusText.say`."""
         return self.texts.say(severity, text[:1].upper() + text[1:], weight)
 
     def prompt(self, tune: Tune, text: str) -> None:
-        """Prompt the operator by the buzzer and by a spoken text."""
         self.tunes.play(tune)
         self.say(Severity.NOTICE, text)
 
 
 class Subsystem:
-    """A part of the daemon, for the service."""
-
     def load(self) -> None:
         """Load stored data before anything runs; blocking."""
 
     def status(self) -> Object:
-        """Return its part of the status."""
         return {}
 
     def commands(self) -> Mapping[str, Handler]:
-        """Return the handlers by command name."""
         return {}
 
     def tasks(self) -> Sequence[Task]:
-        """Return the tasks that run as long as the daemon."""
         return ()
 
 
 def joined(parts: Sequence[Object]) -> Object:
-    """Join the status of several subsystems; lists under the same key are concatenated."""
     whole: Object = {}
     for part in parts:
         for key, value in part.items():

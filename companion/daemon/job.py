@@ -25,8 +25,7 @@ GoOn = Callable[[str], None]
 """Called now and then with words for progress; raises `JobCancelledError`."""
 
 
-class JobCancelledError(Exception):
-    """Raised inside a job at the next safe point after somebody cancelled it."""
+class JobCancelledError(Exception): ...
 
 
 class Job:
@@ -45,9 +44,7 @@ class Job:
         loop = asyncio.get_running_loop()
         self.kind, self.what, self.requester = kind, what, requester
         self.reboot = reboot
-        """Restart the autopilot once the result is stored."""
         self.automatic = automatic
-        """Started by the daemon itself."""
         self.was_armed = False
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
         """Loop time by which measuring must end; None: no limit."""
@@ -56,7 +53,6 @@ class Job:
         self.undid_calibration = kind == "undo"
         """False also where an alignment or a temperature curve was undone: the last calibration stays."""
         self.words = ""
-        """Present activity, for people."""
         self.hold_still_s: int | None = None
         """Time to hold still before anything else goes on."""
         self.progress_percent = 0
@@ -67,36 +63,28 @@ class Job:
 
     @property
     def is_running(self) -> bool:
-        """Return whether it has not finished."""
         return not self.finished.done()
 
     @property
     def record(self) -> Record | None:
-        """Record of a calibration."""
         return self.product if isinstance(self.product, Record) else None
 
     @property
     def short(self) -> str:
-        """The job as the command line calls it."""
         return {FACES: "faces", TURN: "turn", TEMPERATURE: BY_TEMPERATURE}.get(self.kind, self.kind)
 
     @property
     def left_s(self) -> float:
-        """Estimated remaining time of the present activity."""
         return max(0.0, self._until_s - asyncio.get_running_loop().time())
 
     def lasts(self, seconds: float) -> None:
-        """Set the expected duration of the present activity."""
         self._until_s = asyncio.get_running_loop().time() + seconds
 
     def progress(self, percent: float, words: str, hold_still_s: int | None = None) -> None:
-        """Set percentage and present activity; and the time to hold still, where that is all."""
         self.progress_percent = max(self.progress_percent, min(99, int(percent)))
         self.words, self.hold_still_s = words, hold_still_s
 
     def going_on(self, percent: float, otherwise: str = "") -> GoOn:
-        """Make a `GoOn` that shows its words, or `otherwise`, at this percentage."""
-
         def go_on(words: str) -> None:
             self.check_cancelled()
             self.progress(percent, words or otherwise)
@@ -104,17 +92,14 @@ class Job:
         return go_on
 
     def cancel(self, by: str) -> None:
-        """Ask it to stop at the next safe point."""
         self.cancelled_by = self.cancelled_by or by
         self._nudge.set()
 
     def check_cancelled(self) -> None:
-        """Raise JobCancelledError, with the canceller, if it was cancelled: a safe point."""
         if self.cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self.cancelled_by}")
 
     def check_time(self) -> None:
-        """Raise CalibrationRefusedError after the deadline."""
         if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
             boat = '; on a boat? set vehicle.platform = "deck"' if self.words.startswith("hold still: ") else ""
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
@@ -127,11 +112,9 @@ class Job:
             self.check_cancelled()
 
     def look_again(self) -> None:
-        """End a `pause` under way: its cause may be over."""
         self._nudge.set()
 
     def finish(self, result: JobResult) -> None:
-        """Set the result."""
         self.progress_percent = 100
         if not self.finished.done():
             self.finished.set_result(result)

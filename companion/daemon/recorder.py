@@ -104,7 +104,7 @@ class Recorder(Subsystem):
             lambda reading: self.tape.put_state(messages.EKF_BIAS, _now_s(), messages.encode(reading))
         )
         calibrating.measuring.on_measured.add(self._on_measured)
-        calibrating.on_solved.add(self._on_solved)
+        calibrating.estimator.on_solved.add(self._on_solved)
         calibrating.manager.on_ended.add(self._on_ended)
 
     # --- inputs

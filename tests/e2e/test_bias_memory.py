@@ -48,7 +48,7 @@ def power_up(
             before(rig)
         records = []
         async with rig.running():
-            rig.service.calibrating.memory.identities.power_up = lambda name, unix_s: since(run)  # type: ignore[method-assign]
+            rig.service.calibrating.memory.power_up = lambda name, unix_s: since(run)  # type: ignore[method-assign]
             await rig.ready()
             for _ in range(times):
                 result, record = await calibrated(rig)
@@ -165,7 +165,7 @@ def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: 
 
     _, _, rig = power_up(tmp_path, 8, own_imu=False)
     memory = rig.service.calibrating.memory
-    assert memory.curves.of("fc", "gyro") is not None
+    assert memory.curve("fc", "gyro") is not None
     assert memory.temperature()[0]["curve"]
 
     def exchanged(rig: Rig) -> None:
@@ -180,7 +180,7 @@ def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: 
     (record,), _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False)
     assert record.imus[0].prior is None
     assert "imu fc: gyro (device id) changed since then: its earlier biases are forgotten" in record.imus[0].warnings
-    assert rig.service.calibrating.memory.curves.of("fc", "gyro") is None
+    assert rig.service.calibrating.memory.curve("fc", "gyro") is None
     assert len(store.read()["fc"].points) == 1
 
 

@@ -144,8 +144,8 @@ async def test_what_was_learned_stays_and_goes_on_while_the_autopilot_takes_a_pa
         await rig.rest(60.0)
         memory = rig.service.calibrating.memory
         assert memory.forgotten() == {}
-        assert memory.curves.of("fc", "gyro") is not None
-        drift = memory.curves.drift("fc", "gyro", 20.0, 30.0)
+        assert memory.curve("fc", "gyro") is not None
+        drift = memory.drift("fc", "gyro", 20.0, 30.0)
         assert drift is not None
         assert np.abs(drift[0]).max() < 5.0 * DEG_H
         latest = max(BiasStore(tmp_path).read()["fc"].points, key=lambda point: point.unix_s)

@@ -107,7 +107,7 @@ class ActiveCalibration:
             else:
                 model = noise_profile(self._core.profiles.of(name)).of(triad)
                 degc = self.temperatures_degc.get(name)
-                drift = self._memory.curves.drift(name, triad, held.temperature_degc, degc)
+                drift = self._memory.drift(name, triad, held.temperature_degc, degc)
                 against = judge(
                     (name, triad), held, model, self._config.calibration,
                     now_s=now_s, temperature_degc=degc, present=state.present, drift=drift,

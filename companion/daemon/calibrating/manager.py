@@ -36,11 +36,10 @@ logger = logging.getLogger(__name__)
 STARTS_PER_S: Final = 1.0
 """Requests a second that are served for long: nobody presses faster, a script that starts and cancels does."""
 BURST: Final = 10.0
-_SEVERITIES: Final = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}
 
 
 class Precondition(enum.Enum):
-    """Conditions for starting a calibration, in the order in which they are reported."""
+    """Conditions for a start, in the order in which they are reported."""
 
     STORAGE = enum.auto()
     ONE_AUTOPILOT = enum.auto()
@@ -49,7 +48,6 @@ class Precondition(enum.Enum):
     ARM_STATE_KNOWN = enum.auto()
     ONE_COMPANION = enum.auto()
     RESTORED = enum.auto()
-    """No restore of an interrupted write is pending."""
 
 
 REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = {
@@ -63,7 +61,6 @@ REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = 
 
 
 def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple[Precondition, str]]:
-    """Yield every condition that is not met, with the reason in words."""
     if ledger.fault is not None:
         yield Precondition.STORAGE, ledger.fault
     if vehicle.conflict is not None:
@@ -83,8 +80,6 @@ def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple
 
 
 class CalibrationManager:
-    """The calibration service behind MAVLink, the control socket, MQTT and the page."""
-
     def __init__(self, parts: CalibrationParts, store: RecordStore, by_hand: ByHand) -> None:
         core = parts.core
         self._parts, self._core, self._machine, self._vehicle = parts, core, core.machine, core.vehicle
@@ -95,14 +90,11 @@ class CalibrationManager:
         """The running or the latest job."""
         self.reason = ""
         self.last: Record | None = None
-        """Record of the latest calibration, loaded from disk at start."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
-        """Notified of the end of a job, before its requester."""
         core.vehicle.on_event.add(self._on_event)
         self._recovery.on_recovered = self._recovered
 
     def load(self) -> None:
-        """Load the latest record; blocking."""
         try:
             self.last = next(iter(self._store.history(limit=1)), None)
         except StorageError as error:
@@ -119,27 +111,22 @@ class CalibrationManager:
 
     @property
     def state(self) -> State:
-        """State of the calibration."""
         return self._machine.state
 
     @property
     def running(self) -> Job | None:
-        """The job under way."""
         return self.job if self.job is not None and self.job.is_running else None
 
     @property
     def last_good(self) -> Record | None:
-        """The latest record, if it was good and has not been undone."""
         return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
 
     def blocking_reason(self, among: Collection[Precondition] = tuple(Precondition)) -> tuple[Precondition, str] | None:
-        """Return the first of these conditions that is not met, with the reason in words."""
         unmet = blocked(self._vehicle, self._recovery.ledger, self.running)
         return next((found for found in unmet if found[0] in among), None)
 
     @property
     def mav_state(self) -> int:
-        """MAV_STATE_* for the heartbeat."""
         if self._machine.state.busy:
             return mavlink.MAV_STATE_CALIBRATING
         if self._recovery.ledger.fault is not None:
@@ -155,7 +142,6 @@ class CalibrationManager:
         automatic: bool = False,
         reboot: bool = False,
     ) -> Job | Refusal:
-        """Start a calibration, adopt a running automatic one that includes this request, or refuse."""
         own = self._automatic_run()
         if isinstance(own, CalibrationRun) and own.is_adoptable and own.what in (what, What.BOTH):
             own.adopt(requester, timeout_s, reboot=reboot)
@@ -189,7 +175,6 @@ class CalibrationManager:
         return self._start(job, None, self._undo_instead(self._task, running, job, force=force))
 
     def cancel(self, requester: str) -> bool:
-        """Cancel the running job; returns whether there was one."""
         if self.running is None:
             return False
         self.running.cancel(requester)
@@ -258,7 +243,6 @@ class CalibrationManager:
         self._end(job, result)
 
     async def _undo_instead(self, task: asyncio.Task[None] | None, before: Job, job: Job, *, force: bool) -> None:
-        """Undo while an automatic calibration ran: what that has written goes first."""
         assert task is not None
         await asyncio.wait([task])
         record = before.record
@@ -277,11 +261,10 @@ class CalibrationManager:
         return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 
     def _end(self, job: Job, result: JobResult) -> None:
-        """End a job; the state table has its `done` already."""
         if result.outcome != "done":
             self._machine.on(Event.FAULT if result.outcome == "failed" else Event.CANCEL)
         self.reason = result.reason
-        severity = _SEVERITIES[result.outcome]
+        severity = Severity.ERROR if result.outcome == "failed" else Severity.NOTICE
         outcome = "" if result.outcome == "cancelled" else f"{result.outcome}: "  # a cancel's reason says so itself
         words = f"{job.kind.capitalize()} {outcome}{result.reason}"
         logger.log(logging.ERROR if result.outcome == "failed" else logging.INFO, "%s", words)
@@ -296,7 +279,6 @@ class CalibrationManager:
         job.finish(result)
 
     async def _recovered(self, step: ChangeSet, words: str, *, undone: bool) -> None:
-        """Note that the recovery has ended an interrupted write, or an undo."""
         if undone:
             job = Job("undo", What.BOTH, "recovery")
             job.undid_calibration = await self._note_undone(step)

@@ -19,7 +19,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.component.service import WRITTEN_PERCENT, JobResult
 from companion.component.statustext import Severity, Tune
-from companion.daemon.biases.memory import BiasMemory
+from companion.daemon.biases import BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -44,10 +44,7 @@ from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn
-from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.solve import ImuSolution, Solution
-from companion.estimation.solution.truth import Otherwise
-from companion.links.system.events import Listeners
 from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.changes import AUTOMATIC
@@ -55,7 +52,6 @@ from companion.storage.changes import AUTOMATIC
 logger = logging.getLogger(__name__)
 
 Key = tuple[str, Triad]
-"""Name of an IMU, and its gyros or its accelerometers."""
 
 WRONG_IMU_ATTEMPTS: Final = 3
 """Most writes that act on the wrong IMU: two of three may be mistaken for the right one."""
@@ -63,21 +59,15 @@ _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers
 
 
 class CalibrationParts(NamedTuple):
-    """Parts of the daemon that every calibration uses."""
-
     core: Core
     imus: Mapping[str, AutopilotImu]
     measuring: Measuring
     estimator: Estimator
     memory: BiasMemory
     offsets: Offsets
-    on_solved: Listeners[Whereabouts, Otherwise, What, Expectation]
-    """Listeners to estimates: place, fallbacks, request, earlier biases."""
 
 
 class CalibrationRun(Job):
-    """One calibration; `Job` adds request, progress, cancel and outcome."""
-
     def __init__(
         self,
         parts: CalibrationParts,
@@ -94,26 +84,24 @@ class CalibrationRun(Job):
         super().__init__(kind, what, requester, timeout_s, reboot=reboot, automatic=automatic)
         self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
         self._imus, self._measuring, self._offsets = parts.imus, parts.measuring, parts.offsets
-        self.before, self.system_id = before, parts.core.vehicle.system_id
+        self.system_id = parts.core.vehicle.system_id
+        self._before = {} if before is None else {imu.name: imu for imu in before.imus}
         self.begun_s = asyncio.get_running_loop().time()
         self.log = WriteLog()
         self.alignment: AlignmentUsed | None = None
         """Active alignment of the gradienter; None: zero and sigma of the configuration."""
-        self.device_ids: dict[str, tuple[int | None, int | None]] = {}
-        """Gyro and accelerometer ids by IMU of the autopilot."""
+        self.calibrations: dict[str, ImuCalibration] = {}
+        """Calibrations in force in the autopilot while its IMUs were measured."""
         self.held_back: dict[Key, Doubt] = {}
         """Triads that contradict earlier calibrations and are not written, as nobody requested it."""
         self._forget()
 
     def _forget(self) -> None:
         self.measured: Window | None = None
-        """Window of telemetry under the active offsets."""
         self.solution: Solution | None = None
         """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
         self.points: dict[str, Point] = {}
-        """Biases by IMU for later predictions, once this calibration has ended well."""
         self.unchanged: set[Key] = set()
-        """Triads whose offsets are as good as new ones, and stay."""
         self.plan: Plan | None = None
         self.held_back.clear()
         self.log.written.clear()
@@ -143,11 +131,9 @@ class CalibrationRun(Job):
 
     @property
     def is_adoptable(self) -> bool:
-        """Return whether a request may still adopt this automatic run."""
         return self.automatic and self.cancelled_by is None and not self.held_back
 
     def adopt(self, requester: str, timeout_s: float | None, *, reboot: bool) -> None:
-        """Turn an automatic calibration into a requested one."""
         self.reboot |= reboot
         self.kind, self.requester, self.automatic = "calibration", requester, False
         self.deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
@@ -161,7 +147,6 @@ class CalibrationRun(Job):
             self._core.say(Severity.NOTICE, "Calibration started: the deck may sway")
 
     def _begin_again(self, error: WriteFailedError) -> None:
-        """Measure anew after a write that acted on another IMU, or on none; the old values are restored."""
         self._machine.on(Event.MOVED)
         logger.warning("%s; put back, measuring again", error.reason)
         self._forget()
@@ -194,8 +179,8 @@ class CalibrationRun(Job):
         for name, words in memory.forgotten().items():
             self.log.warn(name, words)
         expectation: Expectation = await core.offload(memory.expectation, solution, unix_s)
-        self._parts.on_solved.tell(where, otherwise, self.what, expectation)
-        self.device_ids = memory.device_ids()
+        estimator.on_solved.tell(where, otherwise, self.what, expectation)
+        self.calibrations = {imu.name: self._imus[imu.name].in_force for imu in solution.imus if imu.name in self._imus}
         solution = memory.with_offsets(solution)
         weighed: Solution = await core.offload(weigh, solution, expectation)
         # From here on nobody can adopt this run: a request must not get half of a result.
@@ -216,7 +201,6 @@ class CalibrationRun(Job):
             core.say(Severity.WARNING, f"Held back: {kept}; calibrate on request to write it all the same")
 
     async def _make_plan(self) -> None:
-        """Compute new offsets of every IMU that the autopilot uses, and the rivals to switch off."""
         assert self.solution is not None
         core, rivalry, slots = self._core, self._offsets.rivalry, self._offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}
@@ -252,9 +236,7 @@ class CalibrationRun(Job):
 
     def _keep_as_good(self, calibration: ImuCalibration, found: ImuSolution) -> frozenset[Triad]:
         assert self.solution is not None
-        earlier = () if self.before is None else self.before.imus
-        before = next((imu for imu in earlier if imu.name == found.name), None)
-        kept = as_good(calibration, found, self.solution.shared, before)
+        kept = as_good(calibration, found, self.solution.shared, self._before.get(found.name))
         self.unchanged |= {(found.name, triad) for triad in kept}
         return kept
 
@@ -269,7 +251,6 @@ class CalibrationRun(Job):
         await self._offsets.settle(self, self.plan, self.measured, self.log)
 
     def _watching(self, words: str) -> None:
-        """Show progress while the telemetry is watched, and report movement."""
         self.check_cancelled()
         now_s, collector = asyncio.get_running_loop().time(), self._core.collector
         moves = collector.glance(now_s).moves
@@ -279,7 +260,6 @@ class CalibrationRun(Job):
         self.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or WATCHING)
 
     async def _remember(self) -> None:
-        """Let later calibrations learn from this one."""
         points = self.points
         if self._core.wanted.push and not self.automatic:
             # The requester knows of every contradiction, and the measured biases are active. But gyros that may have
@@ -293,7 +273,6 @@ class CalibrationRun(Job):
     # --- the record
 
     def make_record(self, result: JobResult) -> Record:
-        """Build the record, after a failure from what was known until then."""
         record = record_of(
             self.solution,
             self.log.started_at,
@@ -306,7 +285,9 @@ class CalibrationRun(Job):
         return msgspec.structs.replace(record, system_id=self.system_id, alignment=self.alignment)
 
     def _imu_records(self) -> tuple[ImuRecord, ...]:
-        before = {} if self.before is None else {imu.name: imu for imu in self.before.imus}
+        if self.solution is None:
+            return ()
+        known = self.calibrations
         return tuple(
             msgspec.structs.replace(
                 imu,
@@ -314,15 +295,14 @@ class CalibrationRun(Job):
                 written=self.log.written.get(imu.name, {}),
                 held_back=tuple(triad for name, triad in self.held_back if name == imu.name),
                 unchanged=tuple(sorted(triad for name, triad in self.unchanged if name == imu.name)),
-                gyro_id=self.device_ids.get(imu.name, (None, None))[0],
-                accel_id=self.device_ids.get(imu.name, (None, None))[1],
-            ).confirming(before.get(imu.name))
+                gyro_id=known[imu.name].gyro_id if imu.name in known else None,
+                accel_id=known[imu.name].accel_id if imu.name in known else None,
+            ).confirming(self._before.get(imu.name))
             for imu in imu_records(self.solution)
         )
 
 
 def in_short(triads: Collection[Key]) -> str:
-    """Name triads in few words."""
     return " and ".join(
         f"{words} {', '.join(name for name, of in triads if of == triad)}"
         for triad, words in _TRIADS.items()

@@ -15,7 +15,7 @@ from companion.autopilot.parameters.change import same_float32
 from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.commands import Align, Calibrate, Cancel, Temperature, Undo
 from companion.component.service import MEASURED_PERCENT, Refusal
-from companion.daemon.biases.memory import LOOK_K, BiasMemory
+from companion.daemon.biases import LOOK_K, BiasMemory
 from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.core import Core, Handler, Subsystem
@@ -33,11 +33,8 @@ from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
 from companion.estimation.machine import Event, What
 from companion.estimation.means.windows import Window
 from companion.estimation.solution.curve import Curve, Polynomial, of_curve
-from companion.estimation.solution.prior import Expectation
-from companion.estimation.solution.site import Whereabouts
-from companion.estimation.solution.truth import Otherwise
 from companion.formats import Object
-from companion.links.system.events import Listeners, comes
+from companion.links.system.events import comes
 from companion.storage.changes import BY_TEMPERATURE
 from companion.storage.records import RecordStore
 
@@ -55,8 +52,6 @@ _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
 
 
 class Calibrating(Subsystem):
-    """Wires calibrations and alignments, and answers their commands."""
-
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
         self._core, self._offsets, self._imus = core, offsets, imus
@@ -67,10 +62,9 @@ class Calibrating(Subsystem):
         self.faces = ActiveSixPosition(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
         self.estimator = Estimator(core, self.alignment, self.faces, own)
-        self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
         self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
-        parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets, self.on_solved)
+        parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
     def load(self) -> None:
@@ -217,20 +211,21 @@ class Calibrating(Subsystem):
             if _KINDS[action] == ALIGNMENT:
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
             return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+        biases = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
+        job = Job(_KINDS[action], biases, by, asked.timeout_s or ALIGN_TIMEOUT_S)
+        return self.manager.start_job(job, partial(self._align_by, request), self._why_not_aligned(request))
+
+    async def _align_by(self, request: AlignmentRequest, job: Job) -> str:
         task: PoseTask
-        if action == "faces":
+        if request.action == "faces":
             task = SidesTask(request, self._imus, self.faces)
-        elif on_turn:
+        elif request.action == "turn":
             task = TurnTask(self._core, request, self._imus, self.faces)
         else:
             task = ZeroTask(self._core, request, self.alignment)
-        biases = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
-        job = Job(_KINDS[action], biases, by, asked.timeout_s or ALIGN_TIMEOUT_S)
-        run = partial(self.stands.run, request=request, task=task)
-        return self.manager.start_job(job, run, self._why_not_aligned(request))
+        return await self.stands.run(job, task)
 
     def _why_not_aligned(self, request: AlignmentRequest) -> str | None:
-        """Say why there is nothing to measure, or nothing could be written; None when there is."""
         if _KINDS[request.action] == ALIGNMENT:
             has_one = self._core.config.gradienter is not None
             return None if has_one else "there is no gradienter to align: none is configured"
@@ -241,7 +236,6 @@ class Calibrating(Subsystem):
         return self._why_not_written(write=request.write or request.level)
 
     def _why_not_written(self, *, write: bool) -> str | None:
-        """Say why no IMU of the autopilot can be measured, or written to; None when it can."""
         if not self._imus:
             return "there is no IMU of the autopilot: none is configured"
         if write and not self._core.wanted.push:
@@ -249,7 +243,6 @@ class Calibrating(Subsystem):
         return None
 
     async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
-        """Yield progress, then the result with the job's product under this key."""
         async for reply in self._progress(job):
             yield reply
         result, made = job.finished.result(), msgspec.to_builtins(job.product)
@@ -269,7 +262,6 @@ class Calibrating(Subsystem):
     # --- bias curves over temperature, into the temperature calibration of the autopilot
 
     def _why_no_curve_undo(self) -> str | None:
-        """Return why the write of curves cannot be undone; None where it is the latest write."""
         steps = self._offsets.ledger.steps(self._core.vehicle.system_id)
         after = [step.origin.what or "a write" for step in steps]
         if BY_TEMPERATURE not in after:
@@ -299,19 +291,17 @@ class Calibrating(Subsystem):
             return "already in force"
         plan = await self._offsets.write(job, Plan(tuple(targets), self._core.vehicle.boots), window, log)
         await self._offsets.settle(job, plan, window, log)
-        warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
-        job.product = {"imus": log.written, "warnings": warnings}
+        job.product = {"imus": log.written, "warnings": log.all_warnings}
         return f"written: {'; '.join(words)}"
 
     async def _curve_targets(self, window: Window, *, overwrite: bool) -> tuple[list[ImuPlan], list[str], list[str]]:
-        """Return the targets of the write, their words, and why other IMUs are left as they are."""
         exchanged = self.memory.forgotten()  # the curve of an IMU that was replaced must not be written
         targets: list[ImuPlan] = []
         words: list[str] = []
         left: list[str] = []
         for means in (means for means in window.imus if means.name in self._imus):
             name, degc = means.name, means.temperature_degc
-            curve, calibration = self.memory.curves.of(name, "gyro"), self._imus[name].in_force
+            curve, calibration = self.memory.curve(name, "gyro"), self._imus[name].in_force
             enabled_by = calibration.thermal.enabled_by
             if curve is None:
                 left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
@@ -335,13 +325,12 @@ class Calibrating(Subsystem):
 
     def _accelerometer_curve(self, name: str, gyro: Curve) -> Polynomial | None:
         """Return the accelerometers' curve if it spans the gyros' temperatures: an autopilot has one span for both."""
-        curve, calibration = self.memory.curves.of(name, "accel"), self._imus[name].in_force
+        curve, calibration = self.memory.curve(name, "accel"), self._imus[name].in_force
         if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
             return None
         return of_curve(curve, calibration.orientation, calibration.accel_scale)
 
     def _wrote_curve(self, thermal: Thermal) -> bool:
-        """Return whether the values are those of our latest write."""
         ours: dict[str, float | None] = {}
         for step in reversed(self._offsets.ledger.steps(self._core.vehicle.system_id)):
             if step.origin.what == BY_TEMPERATURE:

@@ -8,19 +8,18 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
+from companion.autopilot.firmware.imu_calibration import output_step
 from companion.autopilot.firmware.imu_messages import MRAD
-from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import EffectVerdict, Observation, judge
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleTimer
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
-from companion.daemon.offsets.plan import ImuPlan, Plan, Residual
+from companion.daemon.offsets.plan import ImuPlan, Plan
 from companion.daemon.offsets.px4_writes import OnTheWay, Px4Writes
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import MIN_BATCHES
@@ -32,7 +31,6 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
 
 VERIFY_MAX_S: Final = 60.0
-"""Longest wait for stillness after the write before its effect counts as not seen."""
 VERIFY_ON_DECK_S: Final = 180.0
 """Longest wait on a deck, where it takes the better part of a minute to see a step."""
 LOOK_S: Final = 10.0
@@ -46,7 +44,6 @@ TELEMETRY: Final = "waiting for the telemetry"
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[EffectVerdict]]
-"""Verdicts by IMU."""
 
 # Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
 # and 50 micro-g), not for the worst there is as over the minutes of sigma_use: else no step could ever be seen.
@@ -97,7 +94,6 @@ async def watch_effect(
 
 
 def _in_the_way(core: Core, looked_s: float) -> str:
-    """Say what has to be waited for before the telemetry can be judged; empty: nothing."""
     now_s = asyncio.get_running_loop().time()
     status = core.collector.status(now_s)
     words = status.waiting_for or ""
@@ -115,20 +111,12 @@ def _in_the_way(core: Core, looked_s: float) -> str:
 
 def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: Window) -> list[EffectVerdict]:
     first, second = (next(imu for imu in window.imus if imu.name == target.name) for window in (before, after))
-    return judge_vectors(
-        first,
-        second,
-        target.residual,
-        target.calibration,
-        target.changes,
-        core.profiles.of(target.name),
-        px4.on_the_way(target.calibration.instance),
-        apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
-    )
+    profile, on_the_way = core.profiles.of(target.name), px4.on_the_way[target.calibration.instance]
+    apart_s = (after.start_s + after.end_s - before.start_s - before.end_s) / 2.0
+    return judge_vectors(target, first, second, profile, on_the_way, apart_s=apart_s)
 
 
 def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
-    """Say why the watch goes on; empty when the verdicts are final."""
     found = [verdict for each in verdicts.values() for verdict in each]
     # The scatter of two seconds says little of their mean: nothing is called wrong on so little.
     hasty = looked_s < LOOK_S and not all(verdict.ok for verdict in found)
@@ -143,11 +131,9 @@ def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
 
 
 def judge_vectors(
+    target: ImuPlan,
     first: ImuWindow,
     second: ImuWindow,
-    residual: Residual,
-    calibration: ImuCalibration,
-    changes: Sequence[Change],
     profile: str | NoiseProfile | None,
     on_the_way: OnTheWay,
     *,
@@ -158,14 +144,14 @@ def judge_vectors(
     Where the output followed a far value and then left it as it had to, the new value is in use, however small the
     change as a whole. `apart_s`: time between the middles of both windows.
     """
-    gyro_step, accel_step = output_step(calibration, changes, first.accel_m_s2)
-    names, noise = calibration.parameters, noise_profile(profile)
+    gyro_step, accel_step = output_step(target.calibration, target.changes, first.accel_m_s2)
+    names, noise = target.calibration.parameters, noise_profile(profile)
     spans_s = (first.duration_s, second.duration_s)
     flicker: Mapping[Triad, float] = {} if profile is not None else ORDINARY_FLICKER
     verdicts: list[EffectVerdict] = []
     halves: tuple[tuple[Triad, Array | None, Vector, tuple[str, str, str], str], ...] = (
-        ("accel", residual[1], accel_step, names.accel_offset, "m/s^2"),
-        ("gyro", residual[0], gyro_step, names.gyro_offset, "rad/s"),
+        ("accel", target.residual[1], accel_step, names.accel_offset, "m/s^2"),
+        ("gyro", target.residual[0], gyro_step, names.gyro_offset, "rad/s"),
     )
     for triad, excess, step, parameters, unit in halves:
         if excess is None:
@@ -186,7 +172,7 @@ def judge_vectors(
             expected_step=step,
             truth=vector(np.subtract(before, excess)),
             tolerance=TOLERANCE_SIGMAS * max(use),
-            orientation=calibration.orientation,
+            orientation=target.calibration.orientation,
         )
         verdict = judge(observation)
         if verdict.ok and triad in on_the_way:
@@ -241,7 +227,6 @@ def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> V
 
 
 def in_short(verdict: EffectVerdict) -> str:
-    """Summarise a verdict in one short line for people; `verdict.problems` has the figures."""
     unused = [name for name, word in verdict.axes.items() if word == "not seen"]
     if unused:
         return f"the autopilot stored {', '.join(unused)} but does not use {'it' if len(unused) == 1 else 'them'}"

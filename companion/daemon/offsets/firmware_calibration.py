@@ -49,8 +49,6 @@ SETTLE_ALONE_S: Final = 150.0
 
 
 class FirmwareCalibration:
-    """Decides whether the firmware's gyro calibration is wanted, and writes around it."""
-
     def __init__(self, core: Core, writer: ParameterWriter, ledger: Ledger) -> None:
         self._vehicle, self._parameters = core.vehicle, core.parameters
         self._on_deck = core.config.vehicle.platform == "deck"
@@ -148,5 +146,4 @@ class FirmwareCalibration:
 
 
 def settles_within_s(outcome: GyroOutcome | None) -> float:
-    """Return the longest wait for the EKF after a write, by the outcome of the firmware's calibration."""
     return SETTLE_RESET_S if outcome == "reset" else SETTLE_ALONE_S

@@ -34,8 +34,6 @@ POLL_S: Final = 0.2
 
 
 class Ledger:
-    """Journal and undo steps of one storage folder."""
-
     def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
         self._log, self._offload, self.why_yield = log, offload, why_yield
         """`why_yield`: reason not to write because another companion does; None without one."""
@@ -45,13 +43,10 @@ class Ledger:
         self._orphaned = asyncio.Event()
         self._undoable: dict[int, Undoable] = {}
         self.unusable: tuple[str, ...] = ()
-        """Damaged files that were set aside, each in a line."""
         self.lost_write = False
-        """The journal was damaged, so an interrupted write stays as it is."""
 
     @property
     def pending(self) -> bool:
-        """The restore of an interrupted write is pending."""
         return self._orphaned.is_set()
 
     def load(self) -> None:
@@ -71,26 +66,21 @@ class Ledger:
 
     @property
     def undoable(self) -> list[int]:
-        """System ids of the vehicles with something to undo."""
         return sorted(system_id for system_id, each in self._undoable.items() if each.all)
 
     def steps(self, system_id: int | None) -> tuple[ChangeSet, ...]:
-        """Return the undo steps of one vehicle, the latest first."""
         found = self._undoable.get(system_id or 0)
         return () if found is None else found.all
 
     @property
     def orphaned(self) -> ChangeSet | None:
-        """Interrupted write whose restore is pending."""
         return self._open if self.pending else None
 
     def is_undoable(self, changes: ChangeSet) -> bool:
-        """Check whether these changes are in an undo step."""
         kept = self._undoable.get(changes.system_id)
         return kept is not None and kept.without(changes) is not kept
 
     async def interrupted(self) -> ChangeSet:
-        """Wait until there is an interrupted write; it stays one until `undone`."""
         while self._open is None or not self.pending:
             await self._orphaned.wait()
         return self._open
@@ -162,8 +152,6 @@ class Ledger:
 
 
 class Recovery:
-    """Restores interrupted writes, and undoes finished ones."""
-
     def __init__(
         self,
         core: Core,
@@ -179,12 +167,10 @@ class Recovery:
         """Called with a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
-        """List interrupted writes, the latest first; blocking."""
         pending = [] if self.ledger.orphaned is None else [Interruption.of(self.ledger.orphaned)]
         return [msgspec.to_builtins(each) for each in (*pending, *reversed(self._interruptions.read()))]
 
     def why_no_undo(self) -> str | None:
-        """Say why there is nothing to undo; None when there is."""
         if self.ledger.steps(self._vehicle.system_id):
             return None
         if elsewhere := self.ledger.undoable:
@@ -192,7 +178,6 @@ class Recovery:
         return "nothing to undo" + ("; what was kept could not be used" if self.ledger.unusable else "")
 
     async def run(self) -> None:
-        """End interrupted writes; runs until cancelled."""
         if self.ledger.lost_write:
             self._say(Severity.WARNING, "Interrupted write, file damaged: calibrate", Weight.RESULT)
         while True:

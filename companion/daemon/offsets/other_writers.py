@@ -52,20 +52,16 @@ class _Other(msgspec.Struct):
 
     @property
     def rank(self) -> tuple[bool, int]:
-        """Lower goes first."""
         return self.is_new, self.instance
 
     def words(self, does: str) -> str:
         return f"second companion ({self.system_id}/{self.component_id}) on this link {does}: stop one of them"
 
     def counts(self, now_s: float) -> bool:
-        """Check that it was heard twice, and lately."""
         return self.latest_s - self.first_s >= CONFIRM_S and now_s - self.latest_s < EXPIRE_S
 
 
 class OtherCompanions:
-    """Announces this companion and listens for others; `run` until cancelled."""
-
     def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
         self._link, self._say, self._writes = link, say, writes
         self._instance, self._is_new = int.from_bytes(os.urandom(4)) >> 32 - INSTANCE_BITS, True
@@ -74,18 +70,15 @@ class OtherCompanions:
         link.subscribe(mavlink.MAVLink_named_value_int_message, self._on_value)
 
     def why_not(self) -> str | None:
-        """Reason not to write, naming the companion that does; None without one."""
         other = self._other()
         return None if other is None or other.rank > (self._is_new, self._instance) else other.words("writes")
 
     @property
     def warning(self) -> str | None:
-        """Presence of another companion, for people; None without one."""
         other = self._other()
         return None if other is None else self.why_not() or other.words("waits")
 
     async def run(self) -> None:
-        """Announce this companion, and tell the pilot of others."""
         loop = asyncio.get_running_loop()
         started_s = loop.time()
         while True:
@@ -133,20 +126,16 @@ class Rivalry:
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._imus, self._say = imus, core.say
         self.stop_rivals = core.config.push.stop_rivals
-        """The next write switches rivals off."""
         self._told: set[str] = set()
-        """Rivals that the ground stations were told of since they were switched on; status shows them always."""
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about rivals that are switched on."""
         known = [imu.calibration for imu in self._imus.values() if imu.calibration is not None]
         return list(dict.fromkeys(rival.words for calibration in known for rival in calibration.rivals))
 
     def changes(self, calibrations: Sequence[ImuCalibration]) -> list[Change]:
-        """Return changes that switch rivals off, to be written before the biases."""
         if not self.stop_rivals:
             return []
         rivals = {rival.parameter: rival for calibration in calibrations for rival in calibration.rivals}

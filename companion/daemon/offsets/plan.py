@@ -22,7 +22,7 @@ from companion.estimation.records.validity import RESIDUAL_SIGMAS
 from companion.estimation.solution.solve import ImuSolution, Shared
 from companion.physics.frames import Array
 from companion.physics.units import MG
-from companion.samples import Triad, Vector, rows_of
+from companion.samples import TRIADS, Triad, rows_of
 
 COARSE_ACCEL_MG: Final = 5.0
 """Error of the autopilots' own calibrations on a level table; offsets with a larger sigma get a warning."""
@@ -33,23 +33,23 @@ AS_GOOD: Final = 1.5
 
 @dataclasses.dataclass(slots=True)
 class WriteLog:
-    """Parameters written and warnings given in one run; after a failure it holds what was known until then."""
+    """Parameters written (by IMU and name) and warnings of one run; after a failure, what was known until then."""
 
     started_at: datetime.datetime = dataclasses.field(default_factory=lambda: datetime.datetime.now(tz=datetime.UTC))
     written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
-    """Parameters by IMU."""
     warnings: list[str] = dataclasses.field(default_factory=list)
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
-    """Additions to the result in words."""
 
     @property
     def started(self) -> str:
-        """UTC start, ISO 8601."""
         return self.started_at.isoformat(timespec="milliseconds")
 
+    @property
+    def all_warnings(self) -> tuple[str, ...]:
+        return (*self.warnings, *(words for each in self.imu_warnings.values() for words in each))
+
     def warn(self, imu: str, *lines: str) -> None:
-        """Add warnings to one IMU, each once."""
         warnings = self.imu_warnings.setdefault(imu, [])
         warnings += [words for words in dict.fromkeys(lines) if words not in warnings]
 
@@ -60,45 +60,35 @@ Residual = tuple[Array | None, Array | None]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuPlan:
-    """New offsets of one autopilot IMU."""
-
     name: str
     calibration: ImuCalibration
     changes: tuple[Change, ...]
     residual: Residual
     watched: bool
     """The collector receives this IMU's output in the telemetry."""
-    read_m_s2: Vector = (0.0, 0.0, 0.0)
-    """Accelerometer output before the write; needed where scales change."""
     unseen: tuple[Change, ...] = ()
     """Changes that together leave the output as it is."""
 
     @property
     def all(self) -> tuple[Change, ...]:
-        """All changes in the order of writing."""
         return (*self.changes, *self.unseen)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Plan:
-    """Changes of one write."""
-
     targets: tuple[ImuPlan, ...]
     boots: int
     """Restarts of the autopilot seen when the plan was made."""
     collateral: tuple[Change, ...] = ()
     """Other changes by the firmware's own gyro calibration: offsets, temperatures and ids of other gyros."""
     firmware: GyroOutcome | None = None
-    """Outcome of the firmware's gyro calibration; None where it was not used."""
 
     @property
     def changes(self) -> tuple[Change, ...]:
-        """Our changes in the order of writing."""
         return tuple(change for target in self.targets for change in target.all)
 
     @property
     def gyros(self) -> tuple[Change, ...]:
-        """Our changes of gyro offsets."""
         return tuple(
             change
             for target in self.targets
@@ -107,13 +97,11 @@ class Plan:
         )
 
     def note(self, log: WriteLog, written: Mapping[str, WrittenParameter]) -> None:
-        """Enter the outcome of parameters."""
         for target in self.targets:
             kept = log.written.setdefault(target.name, {})
             kept.update({c.parameter: written[c.parameter] for c in target.all if c.parameter in written})
 
     def mark(self, log: WriteLog, parameters: Collection[str], outcome: Outcome) -> None:
-        """Change the outcome of entered parameters."""
         for target in self.targets:
             kept = log.written.get(target.name, {})
             for name in kept.keys() & set(parameters):
@@ -121,7 +109,6 @@ class Plan:
 
 
 def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
-    """Warn of planned changes that are known badly, or that the autopilot will not use."""
     name, found = target.name, list[str]()
     coarse_mg = math.sqrt(np.diag(estimate.covariance)[3:].max()) / MG if estimate.accel_m_s2 is not None else 0.0
     if coarse_mg > COARSE_ACCEL_MG:
@@ -159,14 +146,10 @@ def as_good(
     names, written = calibration.parameters, {name: one.after for name, one in before.written.items()}
     variance, kept = np.diag(found.covariance), set[Triad]()
     estimated = np.minimum(np.square(found.sigma_stat) + np.diag(shared.covariance), variance)
-    halves: tuple[tuple[Triad, Array | None, Sequence[str], Vector, Vector | None], ...] = (
-        ("gyro", found.gyro_rad_s, names.gyro_offset, calibration.gyro_offset_rad_s, before.gyro_sigma_stat_rad_s),
-        ("accel", found.accel_m_s2, names.accel_offset, calibration.accel_offset_m_s2, before.accel_sigma_stat_m_s2),
-    )
-    for triad, residual, offsets, offset, averaged in halves:
-        then = before.sigma_in_force(triad)
+    for triad, residual, offsets in zip(TRIADS, found.biases, (names.gyro_offset, names.accel_offset), strict=True):
+        then, averaged = before.sigma_in_force(triad), before.of(triad).sigma_stat
         # An IMU without offsets counts as uncalibrated to the autopilot itself.
-        if residual is None or then is None or not any(offset):
+        if residual is None or then is None or not any(calibration.offsets[name] for name in offsets):
             continue
         if triad == "accel" and calibration.accel_offset_may_be_unused:
             continue
@@ -182,7 +165,6 @@ def as_good(
 
 
 def without(found: ImuSolution, triads: Collection[Triad]) -> ImuSolution:
-    """Leave out triads that are not to be written."""
     return dataclasses.replace(
         found,
         gyro_rad_s=None if "gyro" in triads else found.gyro_rad_s,

@@ -30,6 +30,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.plan import ImuPlan
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.physics.frames import Array
 from companion.physics.units import DEG, MG
@@ -62,7 +63,6 @@ class ExpectedStep:
     sensor: Triad
     device_id: int
     slot: str
-    """For people: CAL_GYRO0."""
     step: Array
     """(3,), rad/s or m/s^2, vehicle FRD."""
     rest: Array
@@ -71,11 +71,9 @@ class ExpectedStep:
     """Share of the step by which the offsets in use may have differed from the parameters."""
 
     def moved(self, made: Array) -> bool:
-        """Check that an output that made this step followed the far value."""
         return bool(np.linalg.norm(made - self.step) < (self.unknown + MATCH) * np.linalg.norm(self.step))
 
     def stayed(self, made: Array) -> bool:
-        """Check that an output that made this step did not follow the far value."""
         return bool(np.linalg.norm(made) < (1.0 - self.unknown - MATCH) * np.linalg.norm(self.step))
 
 
@@ -86,36 +84,29 @@ OnTheWay = Mapping[Triad, tuple[Mean, Array]]
 
 
 class Px4Writes:
-    """Watches the telemetry over a write by far values, and learns the slots; other firmwares need none."""
-
     def __init__(
         self, link: MavlinkLink, vehicle: Vehicle, writer: ParameterWriter, ledger: Ledger, memory: SlotMemory, say: Say
     ) -> None:
         self._link, self._vehicle, self._writer, self._ledger = link, vehicle, writer, ledger
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
-        self._seen: dict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
+        self.on_the_way: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
         """`OnTheWay` of the latest write by instance; only of outputs that moved as expected."""
         self._learned = False
-        """The last verification learned something new of the slots."""
         self._boots = 0
         self._samples: defaultdict[int, deque[ImuSample]] = defaultdict(deque)
         self._before: dict[int, Mean | None] = {}
-        self._unknown: set[int] = set()
-        """IMUs that may exist and were not heard."""
+        self._unheard: set[int] = set()
 
     @contextlib.asynccontextmanager
     async def standing_by(
-        self, targets: Sequence[tuple[ImuCalibration, Sequence[Change], Vector]]
+        self, targets: Sequence[ImuPlan], before: Mapping[str, Vector]
     ) -> AsyncIterator[FarProbe | None]:
-        """Watch over a write of these changes; gives the probe of far values (None: there are none).
-
-        The third of each target is its accelerometers' output before.
-        """
+        """Watch over a write; gives the probe of far values, None without; `before`: output of the accelerometers."""
         self._learned, self._steps = False, {}
-        self._seen.clear()
-        for calibration, changes, read in targets:
-            self._steps |= far_steps(calibration, changes, read)
+        self.on_the_way.clear()
+        for target in targets:
+            self._steps |= far_steps(target.calibration, target.all, before.get(target.name, (0.0, 0.0, 0.0)))
         try:
             async with self._listening():
                 yield self.watch if self._steps else None
@@ -129,14 +120,11 @@ class Px4Writes:
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
             raise
         # Only a write that succeeded comes here.
-        for calibration, changes, _ in targets:
-            names, written = calibration.parameters.accel_offset, {change.parameter for change in changes}
+        for target in targets:
+            calibration, written = target.calibration, {change.parameter for change in target.all}
+            names = calibration.parameters.accel_offset
             if calibration.far_axis is not None and written.intersection(names):
-                self._memory.brought_into_use(names, accel_offset_with(calibration, changes), self._vehicle.boots)
-
-    def on_the_way(self, instance: int) -> OnTheWay:
-        """Return an IMU's output under the far values of the last write, where they were seen."""
-        return self._seen[instance]
+                self._memory.brought_into_use(names, accel_offset_with(calibration, target.all), self._vehicle.boots)
 
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
         """Bring offsets that may not be in use into use, unchanged; True when there were any.
@@ -144,15 +132,17 @@ class Px4Writes:
         After an AutopilotError the recovery restores what may be left; after a StorageError nothing was written.
         """
         unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
-        targets = [(imu.in_force, _same_again(imu.in_force), (0.0, 0.0, 0.0)) for imu in unsure]
-        changes = [change for _, each, _ in targets for change in each]
+        targets = [
+            ImuPlan(imu.name, imu.in_force, _same_again(imu.in_force), (None, None), watched=False) for imu in unsure
+        ]
+        changes = [change for target in targets for change in target.all]
         if not changes:
             return False
         logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
         try:
             async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
                 with changing(unsure):
-                    async with self.standing_by(targets) as probe:
+                    async with self.standing_by(targets, {}) as probe:
                         await self._writer.apply(changes, probe)
                 await self._ledger.undone()
         except WriteFailedError as error:
@@ -164,7 +154,6 @@ class Px4Writes:
     # --- the probe
 
     def watch(self, parameter: str) -> Callable[[], Awaitable[str | None]]:
-        """Keep the means until now, as a `FarProbe`."""
         step = self._steps.get(parameter)
         if step is not None:
             now_s = asyncio.get_running_loop().time()
@@ -192,7 +181,7 @@ class Px4Writes:
             return None
         moved, still = self._moves(step, from_s, loop.time())
         if step.instance in moved and (now := self._mean(step.instance, step.sensor, from_s, loop.time())):
-            self._seen[step.instance][step.sensor] = now, step.rest
+            self.on_the_way[step.instance][step.sensor] = now, step.rest
         return self._conclude(step, moved, still)
 
     def _conclude(self, step: ExpectedStep, moved: list[int], still: list[int]) -> str | None:
@@ -205,7 +194,7 @@ class Px4Writes:
             return f"the offsets in {step.slot} act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
         if not moved and step.instance in still:
             words = f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
-            if self._memory.holds_strangers(step.sensor, len(self._samples.keys() | self._unknown)):
+            if self._memory.holds_strangers(step.sensor, len(self._samples.keys() | self._unheard)):
                 self._correct(step, NO_IMU)
                 return words
             # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
@@ -220,7 +209,6 @@ class Px4Writes:
         self._memory.learn(step.sensor, step.device_id, instance)
 
     def _moves(self, step: ExpectedStep, from_s: float, to_s: float) -> tuple[list[int], list[int]]:
-        """Find the IMUs that made the step by then, and those that surely did not."""
         moved: list[int] = []
         still: list[int] = []
         for instance in self._vehicle.kind.imu_messages:
@@ -242,7 +230,7 @@ class Px4Writes:
             yield
             return
         self._samples.clear()
-        self._unknown.clear()
+        self._unheard.clear()
         self._boots = self._vehicle.boots
         messages = {instance: each[-1].message for instance, each in self._vehicle.kind.imu_messages.items()}
         subscriptions = [self._subscribe(instance) for instance in messages]
@@ -251,7 +239,7 @@ class Px4Writes:
             await asyncio.sleep(HEAR_S)
             for instance in messages.keys() - self._samples.keys():
                 asked.append(messages[instance].id)
-                self._unknown.add(instance)
+                self._unheard.add(instance)
                 answer = self._vehicle.commands.request_message_interval(messages[instance].id, RATE_HZ)
                 answer.add_done_callback(functools.partial(self._answered, instance))
             yield
@@ -263,7 +251,7 @@ class Px4Writes:
 
     def _answered(self, instance: int, answer: asyncio.Future[int | None]) -> None:
         if answer.result() is not None:
-            self._unknown.discard(instance)
+            self._unheard.discard(instance)
 
     def _subscribe(self, instance: int) -> Callable[[], None]:
         kind = self._vehicle.kind.imu_messages[instance][-1]
@@ -293,40 +281,33 @@ class Px4Writes:
 def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> dict[str, ExpectedStep]:
     """Return the step of the output when each far value comes into use, by parameter; `accel_m_s2` is read before."""
     names, found = calibration.parameters, dict[str, ExpectedStep]()
-    for change in changes:
-        if change.via is None:
-            continue
-        triad, old, far, new = _outputs(calibration, changes, change, accel_m_s2)
-        device_id, name = calibration.accel_id, names.accel_id
-        if triad == "gyro":
-            device_id, name = calibration.gyro_id, names.gyro_id
-        if (step := far - old).any() and device_id is not None:
-            unknown = MARGIN * IGNORED_STEP / abs(change.via - change.before)
-            slot = name.removesuffix("_ID")
-            found[change.parameter] = ExpectedStep(
-                calibration.instance, triad, device_id, slot, step, new - far, unknown
-            )
-    return found
-
-
-def _outputs(
-    calibration: ImuCalibration, changes: Sequence[Change], one: Change, accel_m_s2: Vector
-) -> tuple[Triad, Array, Array, Array]:
-    """Return triad and output, less that before all changes: before one far value, under it, and after all changes."""
-    names, done = calibration.parameters, set[str]()
-    vectors = (names.gyro_offset, names.accel_offset, names.accel_scale)
-    for earlier in changes[: changes.index(one)]:
-        if earlier.via is not None:
-            done |= {name for vector in vectors if earlier.parameter in vector for name in vector}
-    old = {change.parameter: change.after if change.parameter in done else change.before for change in changes}
     new = {change.parameter: change.after for change in changes}
-    triad: Triad = "gyro" if one.parameter in names.gyro_offset else "accel"
+    in_use = {change.parameter: change.before for change in changes}
 
-    def output(values: Mapping[str, float]) -> Array:
+    def output(values: Mapping[str, float], triad: Triad) -> Array:
+        """Return the output less that before all changes, (3,)."""
         there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
         return np.array(output_step(calibration, there, accel_m_s2)[0 if triad == "gyro" else 1])
 
-    return triad, output(old), output(old | {one.parameter: one.far}), output(new)
+    for change in changes:
+        if change.via is None:
+            continue
+        triad: Triad = "accel"
+        device_id, name = calibration.accel_id, names.accel_id
+        if change.parameter in names.gyro_offset:
+            triad, device_id, name = "gyro", calibration.gyro_id, names.gyro_id
+        far = output(in_use | {change.parameter: change.far}, triad)
+        if (step := far - output(in_use, triad)).any() and device_id is not None:
+            unknown = MARGIN * IGNORED_STEP / abs(change.via - change.before)
+            slot = name.removesuffix("_ID")
+            found[change.parameter] = ExpectedStep(
+                calibration.instance, triad, device_id, slot, step, output(new, triad) - far, unknown
+            )
+        # The whole vector is in use before the next far value is written.
+        for vector in (names.gyro_offset, names.accel_offset, names.accel_scale):
+            if change.parameter in vector:
+                in_use |= {one: new[one] for one in vector if one in new}
+    return found
 
 
 def _danger(step: ExpectedStep) -> str:
@@ -336,8 +317,8 @@ def _danger(step: ExpectedStep) -> str:
     return f"DISARM NOW: vertical acceleration wrong by {size / MG:.0f} mg"
 
 
-def _same_again(calibration: ImuCalibration) -> list[Change]:
+def _same_again(calibration: ImuCalibration) -> tuple[Change, ...]:
     offset, axis = calibration.accel_offset_m_s2, calibration.far_axis
     if axis is None:
-        return []
-    return vector_changes(calibration.parameters.accel_offset, offset, offset, axis, FAR_ACCEL_M_S2)
+        return ()
+    return tuple(vector_changes(calibration.parameters.accel_offset, offset, offset, axis, FAR_ACCEL_M_S2))

@@ -88,50 +88,40 @@ async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
 
 
 class _Owed(msgspec.Struct, frozen=True):
-    """Tilt kept by PX4, and when in the life of the autopilot and of the board that began."""
+    """Tilt kept by PX4: since when in the life of the autopilot and of the board (`host`, its boot; empty: unknown)."""
 
     system_id: int
     tilt_deg: float
     boot_s: float
-    """Time since the boot of the autopilot."""
     host: str
-    """Identity of the board's boot; empty: unknown."""
     host_s: float
-    """Time on the clock of that boot."""
 
 
 def owed_in(directory: Path) -> StateFile[_Owed]:
-    """Return the file in a storage directory."""
     return StateFile(directory / "reboot-owed.json", _Owed)
 
 
 class RebootOwed:
-    """Remembers that PX4 must be restarted; `run` forgets it when the restart was seen."""
-
     def __init__(self, core: Core) -> None:
         self._vehicle, self._offload, self._core = core.vehicle, core.offload, core
         self._file, self._host = owed_in(core.config.storage.path), this_boot()
         self._owed: _Owed | None = None
         self._boots = 0
         """Restarts seen when the restart became owed, or was loaded."""
-        self._earlier = False
-        """It was loaded from an earlier run of the companion."""
+        self._from_earlier_run = False
 
     def load(self) -> None:
-        """Load the file; blocking."""
         self._owed = self._file.load()
-        self._earlier = True
+        self._from_earlier_run = True
 
     @property
     def words(self) -> str | None:
-        """Reason to restart PX4 before it may arm, in few words; None without one."""
         owed = self._owed
         if owed is None or self._vehicle.system_id not in (None, owed.system_id) or self._restarted(owed):
             return None
         return f"reboot PX4: tilt {owed.tilt_deg:.1f} deg off"
 
     def say(self) -> None:
-        """Tell the pilot of an owed restart."""
         if (words := self.words) is not None:
             self._core.say(Severity.WARNING, f"Before flight: {words}", Weight.RESULT)
 
@@ -146,18 +136,17 @@ class RebootOwed:
         now_s, (boot_s, _) = asyncio.get_running_loop().time(), self._vehicle.boot.latest or (0.0, 0.0)
         owed = _Owed(self._vehicle.system_id or 0, round(tilt_deg, 2), boot_s, self._host, now_s)
         await self._offload(self._file.write, owed)
-        self._owed, self._boots, self._earlier = owed, self._vehicle.boots, False
+        self._owed, self._boots, self._from_earlier_run = owed, self._vehicle.boots, False
 
     def _restarted(self, owed: _Owed) -> bool:
         latest = self._vehicle.boot.latest
-        if not self._earlier or latest is None:
+        if not self._from_earlier_run or latest is None:
             return self._vehicle.boots != self._boots
         boot_s, heard_s = latest
         began_later = owed.host == self._host != "" and heard_s - boot_s > owed.host_s
         return began_later or boot_s < owed.boot_s - CLOCK_STEP_S or self._vehicle.boots != self._boots
 
     async def run(self) -> None:
-        """Forget the owed restart once it was seen; runs until cancelled."""
         while True:
             await asyncio.sleep(OWED_POLL_S)
             if self._owed is not None and self._vehicle.system_id == self._owed.system_id and self.words is None:

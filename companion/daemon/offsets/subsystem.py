@@ -57,8 +57,6 @@ Note = Callable[[Mapping[str, WrittenParameter], Collection[str]], None]
 
 
 class Offsets(Subsystem):
-    """Writes plans, each as a whole or not at all; wires what restores them and what else changes offsets."""
-
     def __init__(self, core: Core, devices: Devices) -> None:
         vehicle, imus = core.vehicle, devices.imus
         self._core, self._vehicle, self._machine, self._imus = core, vehicle, core.machine, imus
@@ -88,7 +86,6 @@ class Offsets(Subsystem):
         }
 
     def undoable(self) -> list[Object]:
-        """List the steps that can be undone on this aircraft, the latest first."""
         return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
 
     def tasks(self) -> Sequence[Task]:
@@ -144,7 +141,6 @@ class Offsets(Subsystem):
                 raise AutopilotError(await self._roll_back(made, imus, str(error), note)) from error
 
     async def _roll_back(self, made: Sequence[Change], imus: Collection[AutopilotImu], reason: str, note: Note) -> str:
-        """Restore the old values; returns the reason and what became of them."""
         left: Sequence[str] = ()
         end = "will be once disarmed"
         with contextlib.suppress(NotDisarmedError):
@@ -204,8 +200,8 @@ class Offsets(Subsystem):
                         plan, gyros, log, lambda words: job.progress(MEASURED_PERCENT, words)
                     )
                 else:
-                    reads = [(target.calibration, target.all, target.read_m_s2) for target in plan.targets]
-                    async with self._px4.standing_by(reads) as probe:
+                    outputs = {imu.name: imu.accel_m_s2 for imu in before.imus}
+                    async with self._px4.standing_by(plan.targets, outputs) as probe:
                         plan.note(log, await self.writer.apply(plan.changes, probe))
             except WriteFailedError as error:
                 plan.note(log, error.written)
@@ -223,7 +219,6 @@ class Offsets(Subsystem):
         return plan
 
     async def _problems(self, plan: Plan, before: Window, log: WriteLog, go_on: GoOn) -> list[str]:
-        """List reasons why written values must not stay."""
         verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, plan.boots)
         # Somebody else's change explains what the telemetry shows, so it comes first.
         problems: list[str] = []
@@ -245,7 +240,6 @@ class Offsets(Subsystem):
         return problems
 
     async def _not_as_written(self, plan: Plan, *, attempts: int) -> AsyncIterator[tuple[str, float]]:
-        """Yield name and present value of changed parameters, each as soon as it is read."""
         for change in plan.changes:
             for _ in range(attempts - 1):
                 with contextlib.suppress(AutopilotRebootedError, ParameterTimeoutError):
@@ -287,7 +281,6 @@ class Offsets(Subsystem):
         self._core.say(Severity.WARNING, words, Weight.NEWS)
 
     async def _survived(self, plan: Plan, log: WriteLog) -> None:
-        """After a restart that the companion did not ask for, check that the written values are still there."""
         await self._heartbeat(BACK_WITHIN_S)
         changed = [name async for name, _ in self._not_as_written(plan, attempts=READ_ATTEMPTS)]
         if changed:

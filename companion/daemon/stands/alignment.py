@@ -52,7 +52,6 @@ class ActiveAlignment:
         self.on_change: Listeners[[]] = Listeners()
 
     def load(self) -> None:
-        """Load the stored alignment; blocking."""
         self._take(self._store.load())
         if self._store.unusable is not None:
             self.unused = self._store.unusable
@@ -66,7 +65,6 @@ class ActiveAlignment:
         self.on_change.tell()
 
     async def forget(self) -> bool:
-        """Return to the configuration's zero; returns whether there was an alignment."""
         was = self.record is not None or self.unused is not None
         await self._offload(self._store.clear)
         self._take(None)
@@ -75,24 +73,20 @@ class ActiveAlignment:
         return was
 
     def settings(self) -> GradienterSettings | None:
-        """Settings that an alignment belongs to; None without a gradienter."""
         if self._gradienter is None:
             return None
         return msgspec.convert(self._gradienter, GradienterSettings, from_attributes=True)
 
     @property
     def used(self) -> AlignmentUsed | None:
-        """The active alignment, for the record of a calibration; None without one."""
         if self.record is None or self.unused is not None:
             return None
         return msgspec.convert(self.record, AlignmentUsed, from_attributes=True)
 
     def model(self) -> GradienterModel | None:
-        """Return the gradienter's model with the active zero."""
         return models.aligned(models.gradienter_model(self._gradienter), self.used)
 
     def status(self) -> dict[str, object] | None:
-        """Return the stored alignment for `companion status`; None without one."""
         if self.record is None and self.unused is None:
             return None
         kept = {key: getattr(self.record, key, None) for key in ("kind", "measured_at", "offset_deg", "sigma_deg")}
@@ -122,46 +116,40 @@ class ActiveSixPosition:
         self.record: FacesRecord | None = None
 
     def load(self) -> None:
-        """Load the stored record; blocking."""
         self.record = self._store.load()
 
     async def keep(self, record: FacesRecord) -> None:
-        """Replace the stored record; a StorageError leaves the one before."""
         await self._offload(self._store.write, record)
         self.record = record
 
     def status(self) -> list[Object]:
-        """List the bias and scale errors left in the output of each IMU, with their sigmas."""
-        known = {} if self.record is None else {imu.name: imu for imu in self.record.imus}
-        left = {name: self._now(name, kept.temperature_degc) for name, kept in known.items()}
+        if self.record is None:
+            return []
         return [
             {
-                "name": name,
-                "measured_at": None if self.record is None else self.record.measured_at,
-                "temperature_degc": known[name].temperature_degc,
+                "name": kept.name,
+                "measured_at": self.record.measured_at,
+                "temperature_degc": kept.temperature_degc,
                 "bias_left_mg": (now.figures[BIAS] / MG).round(4).tolist(),
                 "bias_sigma_mg": (now.sigma[BIAS] / MG).round(4).tolist(),
                 "scale_left": now.figures[SCALE].round(7).tolist(),
                 "scale_sigma": now.sigma[SCALE].round(7).tolist(),
             }
-            for name, now in left.items()
-            if now is not None
+            for kept in self.record.imus
+            if (now := self._now(kept.name, kept.temperature_degc)) is not None
         ]
 
     def running(self, name: str) -> Running | None:
-        """Return since when an IMU has been on; None where its device does not tell."""
         up_s = self._collector.up_s(name)
         if up_s is None or not self._host:
             return None
         return Running(host=self._host, started_s=asyncio.get_running_loop().time() - up_s, up_s=up_s)
 
     def sides(self, window: Window) -> dict[str, Sides]:
-        """Return the known errors by IMU, for a tilt from these means."""
         found = {imu.name: self._now(imu.name, imu.temperature_degc) for imu in window.imus}
         return {name: now for name, now in found.items() if now is not None}
 
     def _now(self, name: str, temperature_degc: float | None) -> Sides | None:
-        """Return `known` under the active offsets; None also where these are unknown."""
         calibration = self._imus[name].calibration if name in self._imus else None
         return None if calibration is None else self.known(name, calibration, temperature_degc)
 
@@ -188,7 +176,6 @@ class ActiveSixPosition:
         return Sides(figures, sigma, calibration.orientation)
 
     def _widened_m_s2(self, kept: FacesImuRecord, temperature_degc: float | None) -> float:
-        """Return the widening of the biases' sigma since: drift and temperature, or another power-up."""
         now, before = self.running(kept.name), kept.running
         gap_s = now.up_s - before.up_s if now is not None and before is not None and before.is_same(now) else None
         degrees = kept.temperature_degc, temperature_degc
@@ -197,19 +184,15 @@ class ActiveSixPosition:
 
 
 class ByHand:
-    """History of alignments and the parameters that they wrote, for `companion history` and `status`."""
-
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._file = alignments_in(core.config.storage.path)
         self._vehicle, self._offload, self._imus = core.vehicle, core.offload, imus
         self._done: list[Done] = []
 
     def load(self) -> None:
-        """Load the history; blocking."""
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:
-        """Add an alignment with a record, unless it was cancelled."""
         record = job.product
         if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
             return
@@ -227,7 +210,6 @@ class ByHand:
         await self._write([*self._done, done][-KEEP_DONE:])
 
     async def undone(self, step: ChangeSet) -> None:
-        """Note that the writes of a step were undone."""
         now = utc_now()
         await self._write(
             [
@@ -244,11 +226,9 @@ class ByHand:
             logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
 
     def history(self) -> list[Object]:
-        """List all alignments, the latest first, each with whether it is in force."""
         return [self._shown(done) for done in reversed(self._done)]
 
     def latest(self) -> list[Object]:
-        """List the last alignment of each kind on this aircraft, the latest first."""
         here = {done.what: done for done in self._done if done.system_id == self._vehicle.system_id}
         here.pop(PREDICTION, None)
         return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]

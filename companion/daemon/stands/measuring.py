@@ -22,6 +22,7 @@ from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.collector.intake import CollectorStatus
 from companion.estimation.machine import Event, State, What
 from companion.estimation.means.windows import Window
+from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
 from companion.estimation.solution.truth import Otherwise
@@ -37,19 +38,15 @@ MOST_UPSETS: Final = 5
 
 
 class Measuring:
-    """Measures still windows of one aircraft, for one job at a time."""
-
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
-        self._upsets: dict[str, int] = {}
-        """Number of upsets before this calibration, by IMU."""
+        self._upsets_before: dict[str, int] = {}
         self._said, self._said_s = "", -math.inf
         self.on_measured: Listeners[Window] = Listeners()
 
     def begin(self) -> None:
-        """Start a calibration, which may measure more than once."""
         self._said, self._said_s = "", -math.inf
-        self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
+        self._upsets_before = {name: imu.upsets for name, imu in self._imus.items()}
 
     async def read_state(self, job: Job, if_armed: str | None) -> tuple[CollectorStatus, str | None, int | None]:
         """Return the collector's status, the reason to wait, and the seconds to hold still where that is all.
@@ -77,14 +74,12 @@ class Measuring:
         return status, status.obstacle.words, status.obstacle.hold_still_s
 
     def show(self, *, measuring: bool) -> None:
-        """Report to the state table whether it measures."""
         if measuring and self._machine.state is State.WAITING:
             self._machine.on(Event.STILL)
         elif not measuring and self._machine.state is State.COLLECTING:
             self._machine.on(Event.MOVED)
 
     async def measure(self, job: Job) -> Window:
-        """Wait for a long enough still window and return it."""
         collector = self._core.collector
         settings = self._core.wanted.settings
         gyro = settings.target_gyro_sigma_rad_s if job.what.gyros else math.inf
@@ -114,7 +109,6 @@ class Measuring:
             collector.on_second.remove(job.look_again)
 
     def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
-        """Send the reason to wait when it changes, but not too often."""
         now_s = asyncio.get_running_loop().time()
         if words != self._said and not job.automatic and now_s - self._said_s >= every_s:
             self._said, self._said_s = words, now_s
@@ -126,20 +120,19 @@ class Measuring:
             if imu.failures - failures[name] >= READ_ATTEMPTS:
                 # An autopilot that does not answer is a fault, not a reason to wait.
                 raise AutopilotError(f"imu {name}: {imu.problem}")
-            if (upsets := imu.upsets - self._upsets.get(name, 0)) >= MOST_UPSETS:
+            if (upsets := imu.upsets - self._upsets_before.get(name, 0)) >= MOST_UPSETS:
                 raise AutopilotError(
                     f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
                 )
 
 
 class Estimator:
-    """Estimates biases with the alignment and the site in force."""
-
     def __init__(self, core: Core, alignment: ActiveAlignment, faces: ActiveSixPosition, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
+        self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
+        """Listeners to estimates of a calibration: place, fallbacks, request, earlier biases."""
 
     async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, Otherwise]:
-        """Estimate the biases; return the place and the fallbacks that were used, too."""
         config = self._core.config
         where, otherwise = models.whereabouts(config, self._core.vehicle), await self._otherwise(window)
         poses = self.alignment.model(), models.compass_model(config.compass)

@@ -63,11 +63,8 @@ class SessionState:
     windows: list[Window] = dataclasses.field(default_factory=list)
     poses: list[HeldPose] = dataclasses.field(default_factory=list)
     ups: list[Vector] = dataclasses.field(default_factory=list)
-    """Up in the aircraft's axes, of each stand, as its accelerometers read it."""
-    first: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
-    """Offsets and scales during the first stand, by IMU."""
+    first_calibrations: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
     outcome: str | None = None
-    """None while it runs."""
 
     # The present pose
     number: int = 1
@@ -75,7 +72,6 @@ class SessionState:
     wish: Wish = dataclasses.field(default_factory=lambda: Wish(""))
     words: str = ""
     objection: str = ""
-    """Fault of the latest stand, if it was not the one asked for."""
     share: float = 0.0
     since_s: float = 0.0
     """Time since which it has not moved."""
@@ -89,7 +85,6 @@ class SessionState:
     stop_said: bool = False
 
     def begin_pose(self, wish: Wish, total: int, now_s: float) -> None:
-        """Wait for the next pose; a time before its request does not count, the operator may still correct it."""
         self.number, self.wish = len(self.poses) + 1, wish
         self.total = max(total, self.number)
         self.since_s, self.moved = (self.windows[-1].end_s, False) if self.windows else (now_s, True)
@@ -98,11 +93,9 @@ class SessionState:
 
     @property
     def request(self) -> str:
-        """The request for the present pose, for people."""
         return f"{self.number} of {self.total}: {self.wish.words}"
 
     def shown(self) -> Object:
-        """Return the progress for the page."""
         return {
             "kind": self.job.kind,
             "number": self.number,
@@ -119,23 +112,20 @@ class SessionState:
 
 
 class PoseTask(abc.ABC):
-    """Poses, acceptance test, fit and record of one alignment, with its estimate."""
-
     imus_alone: ClassVar[bool] = True
     """Neither gradienter nor compass is waited for: turned over, either may fall silent."""
     if_armed: ClassVar[str | None] = None
     """Why it fails when the aircraft arms; None: it goes on once disarmed."""
+    request: AlignmentRequest
     total: int
     fit_from: int
     """Number of poses from which the estimate is made, after each."""
     board: Mounting | None = None
-    """Tilt of the board, where it can be known."""
     shortfall: str | None = None
     """Figure that is still unknown after the last pose; then nothing is written or kept."""
 
     @abc.abstractmethod
-    def wish(self, state: SessionState) -> Wish | None:
-        """Return the pose wanted next; None: there are enough."""
+    def wish(self, state: SessionState) -> Wish | None: ...
 
     @abc.abstractmethod
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
@@ -150,7 +140,6 @@ class PoseTask(abc.ABC):
         """Build the record of the measurement, before anything is written; add warnings to `log`."""
 
     def changes(self) -> dict[str, list[Change]]:
-        """Return the offsets and scales to write, by IMU."""
         return {}
 
     async def keep(self, record: HandRecord) -> None:
@@ -158,13 +147,10 @@ class PoseTask(abc.ABC):
         del record
 
     @abc.abstractmethod
-    def summary(self) -> str:
-        """Return the result in one line."""
+    def summary(self) -> str: ...
 
 
 class PoseSession:
-    """Guides one operator through the poses of one alignment at a time."""
-
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], measuring: Measuring, writes: AlignmentWrites
     ) -> None:
@@ -173,11 +159,12 @@ class PoseSession:
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
         self.state: SessionState | None = None
 
-    async def run(self, job: Job, request: AlignmentRequest, task: PoseTask) -> str:
+    async def run(self, job: Job, task: PoseTask) -> str:
         """Measure all poses, estimate, write and keep; returns the result in one line.
 
         After an error or a cancel the old values are restored, or the error names those that are not.
         """
+        request = task.request
         if request.write and request.action == "faces":
             await self._writes.path.offsets_still_hold()
         state = self._begin(job, task)
@@ -205,8 +192,7 @@ class PoseSession:
             elif request.level and task.board is not None:
                 level = await self._writes.write_level(job, task.board, last, log)
         finally:
-            warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
-            job.product = record = completed(record, warnings, log.written, level)
+            job.product = record = completed(record, log.all_warnings, log.written, level)
         if shortfall is None:
             await task.keep(record)
         elif request.write:
@@ -234,7 +220,6 @@ class PoseSession:
     # --- one pose
 
     async def _measure(self, state: SessionState, task: PoseTask, wish: Wish) -> None:
-        """Wait for the pose that is wanted, and measure it; refused if armed, out of time, or void."""
         loop, job = asyncio.get_running_loop(), state.job
         state.begin_pose(wish, task.total, loop.time())
         if state.number > 1:
@@ -270,7 +255,6 @@ class PoseSession:
             await job.pause(POLL_S)
 
     async def _accept(self, state: SessionState, task: PoseTask, now_s: float) -> bool:
-        """Take the stand if it is the pose that is wanted; else object."""
         window = await self._core.window(since_s=state.since_s + SETTLE_S)
         pose, objection = task.examine(state, window)
         forces = self._collector.imus[window.imus[0].name].forces_m_s2(window.start_s, window.end_s)
@@ -286,15 +270,16 @@ class PoseSession:
             return False
         state.windows.append(window)
         state.poses.append(pose)
-        if not state.first:
-            state.first = {name: imu.calibration for name, imu in self._imus.items() if imu.calibration is not None}
+        if not state.first_calibrations:
+            state.first_calibrations = {
+                name: imu.calibration for name, imu in self._imus.items() if imu.calibration is not None
+            }
         read = np.array(window.imus[0].accel_m_s2)
         state.ups.append(vector((read / max(float(np.linalg.norm(read)), 1e-9)).round(3)))
         self._machine.on(Event.ENOUGH)
         return True
 
     def _turned(self, state: SessionState, now_s: float) -> str:
-        """Return the turn since the stand before, read once a second; says once when to stop."""
         wanted_deg = state.wish.turn_deg
         if not state.windows or not wanted_deg:
             return ""
@@ -311,7 +296,6 @@ class PoseSession:
         return "" if math.isnan(state.turned_deg) else f"turned {state.turned_deg:.0f} of {wanted_deg:.0f} degrees"
 
     def _watch_movement(self, state: SessionState, now_s: float) -> bool:
-        """Note a movement; tell the operator if it ended a measurement or lasts long."""
         glance = self._collector.glance(now_s)
         if not glance.moving:
             state.moving_since_s = math.inf
@@ -336,7 +320,6 @@ class PoseSession:
     # --- the autopilot's side
 
     async def _check_offsets(self, state: SessionState) -> None:
-        """Read the offsets afresh, and refuse to go on if somebody has changed them unnoticed."""
         for name, imu in self._imus.items():
             holds = await imu.refresh()
             self._check_known(state)
@@ -345,7 +328,7 @@ class PoseSession:
 
     def _check_known(self, state: SessionState) -> None:
         for name, imu in self._imus.items():
-            first, now = state.first.get(name), imu.calibration
+            first, now = state.first_calibrations.get(name), imu.calibration
             if first is None or now is None or first.corrects_like(now):
                 continue
             for old, new in ((first.accel_id, now.accel_id), (first.gyro_id, now.gyro_id)):

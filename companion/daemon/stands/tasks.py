@@ -1,8 +1,4 @@
-"""Kinds of alignment: on one spot the gradienter's zero (and tilts), or level without one; on all sides accelerometers.
-
-On all sides (`SidesTask`) needs neither a gradienter nor a level spot: bias and scale follow from stands in any
-orientation. After each stand it says what is still unknown, and ends by itself.
-"""
+"""Kinds of alignment: on one spot the gradienter's zero, or level without one; on all sides the accelerometers."""
 
 from __future__ import annotations
 
@@ -35,20 +31,8 @@ from companion.estimation.alignment.poses import (
 )
 from companion.estimation.means.pose import CompassModel, up_in_vehicle, vehicle_heading_rad
 from companion.estimation.means.windows import ImuWindow, Window
-from companion.estimation.records.align_record import (
-    AlignmentRecord,
-    FaceRecord,
-    FacesRecord,
-    HandRecord,
-    StandRecord,
-    TurnImuRecord,
-    TurnRecord,
-    board_record,
-    faces_imu_record,
-    imu_record,
-    stand_record,
-    turn_imu_record,
-)
+from companion.estimation.records import align_record
+from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, HandRecord, TurnRecord
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
@@ -58,39 +42,40 @@ READING_SIGMA_DEG: Final = 0.005
 """Noise of one mean of a gradienter (table in method 3.4)."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
+EXPECTED: Final = 12
+MOST: Final = 24
+"""Stands on all sides; usually there are `EXPECTED`."""
+_FIRST: Final = Wish("any side down, propped up, hands off")
 LOOSE_M_S2: Final = 0.5 * MG
 """Sigma of the level above which the angle of the turn, not the marks, limits it."""
 
 
 class SpotTask(PoseTask):
-    """An alignment on one spot, with its estimate."""
-
     result: Alignment
     stands: Sequence[StandMeans] = ()
     zero_deg: tuple[float, float] = (0.0, 0.0)
 
     def __init__(self, core: Core, request: AlignmentRequest) -> None:
-        self._core, self._request = core, request
+        self._core, self.request = core, request
         self.total = self.fit_from = request.total
 
     def wish(self, state: SessionState) -> Wish | None:
-        return wanted_pose(self._request, state.poses) if len(state.poses) < self.total else None
+        return wanted_pose(self.request, state.poses) if len(state.poses) < self.total else None
 
     def _counted(self, state: SessionState, now: Window, up: Array, first_sigma_deg: float) -> HeldPose:
-        """Return a pose with the turn counted by the gyros of the first IMU, or as requested if samples are missing."""
         if not state.poses:
             return HeldPose(up, 0.0, first_sigma_deg)
         before, imu = state.windows[-1], now.imus[0]
         bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
         counted = self._core.collector.imus[imu.name].counted(before.end_s, now.start_s, bias)
-        turn_deg, sigma_deg = asked_turn_deg(self._request, state.poses), BY_EYE_SIGMA_DEG
+        turn_deg, sigma_deg = asked_turn_deg(self.request, state.poses), BY_EYE_SIGMA_DEG
         if counted is not None:
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
         return HeldPose(up, state.poses[-1].heading_deg + turn_deg, sigma_deg, counted=True)
 
-    def _stand_records(self, state: SessionState) -> tuple[StandRecord, ...]:
+    def _stand_records(self, state: SessionState) -> tuple[align_record.StandRecord, ...]:
         return tuple(
-            stand_record(stand, attitude, window.end_s - window.start_s, self.zero_deg)
+            align_record.stand_record(stand, attitude, window.end_s - window.start_s, self.zero_deg)
             for stand, attitude, window in zip(self.stands, self.result.attitudes, state.windows, strict=True)
         )
 
@@ -108,16 +93,16 @@ class SpotTask(PoseTask):
                     tilt_sigma_deg=(x_sigma_deg, y_sigma_deg),
                     heading_rad=(pose.heading_deg + north_deg) * DEG,
                     heading_sigma_rad=pose.heading_sigma_deg * DEG,
-                    on_spot=number < self._request.on_spot,
+                    on_spot=number < self.request.on_spot,
                     counted=pose.counted,
                 )
             )
         self.stands = stands
 
-    def _estimated(self, result: Alignment) -> None:
+    def _check_fit(self, result: Alignment) -> None:
         self.result = result
         if result.complaint is not None:
-            raise CalibrationRefusedError(in_words(result.complaint, gradienter=self._request.action != "turn"))
+            raise CalibrationRefusedError(in_words(result.complaint, gradienter=self.request.action != "turn"))
 
 
 class ZeroTask(SpotTask):
@@ -130,12 +115,12 @@ class ZeroTask(SpotTask):
         super().__init__(core, request)
         self.fit_from = LEAST_STANDS
         self._kept, self._compass = kept, models.compass_model(core.config.compass)
-        self._gradienter = models.gradienter_model(core.config.gradienter)
-        if core.config.gradienter is not None:
-            self.zero_deg = core.config.gradienter.offset_deg
+        gradienter = models.gradienter_model(core.config.gradienter)
+        assert gradienter is not None
+        assert core.config.gradienter is not None
+        self._gradienter, self.zero_deg = gradienter, core.config.gradienter.offset_deg
 
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
-        assert self._gradienter is not None
         if now.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
         try:
@@ -147,23 +132,19 @@ class ZeroTask(SpotTask):
         else:
             heading_deg = vehicle_heading_rad(self._compass, now.heading.heading_deg, up) / DEG
             pose = HeldPose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
-        return pose, objection(self._request, state.poses, pose)
+        return pose, objection(self.request, state.poses, pose)
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
-        assert self._gradienter is not None
-        compass = self._core.config.compass
-        magnetic = compass is not None and compass.reference == "magnetic"
-        north_deg = local.declination_deg if magnetic else 0.0
-        self._make_stands(state, readable(state.windows), north_deg)
+        magnetic = self._compass is not None and self._compass.magnetic
+        self._make_stands(state, readable(state.windows), local.declination_deg if magnetic else 0.0)
         law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
-        self._estimated(align(law, mounted, self.stands, ground(local, self._compass)))
+        self._check_fit(align(law, mounted, self.stands, ground(local, self._compass)))
         return []
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:
         windows = state.windows
         result, settings, tilt = self.result, self._kept.settings(), windows[0].tilt
         assert settings is not None
-        assert self._gradienter is not None
         if result.slope_deg > SLOPE_WARNING_DEG:
             log.warnings.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg, so that each degree of heading error counts: a flatter"
@@ -179,7 +160,7 @@ class ZeroTask(SpotTask):
         (xx, xy), (yx, yy) = result.offset_covariance_deg2.tolist()
         degrees = _temperatures(windows[0])
         return AlignmentRecord(
-            kind="tilts" if self._request.action == "tilts" else "zero",
+            kind="tilts" if self.request.action == "tilts" else "zero",
             measured_at=log.started,
             gradienter=settings,
             offset_deg=(x_deg, y_deg),
@@ -191,7 +172,7 @@ class ZeroTask(SpotTask):
             freedom=result.freedom,
             temperature_degc=tilt.temperature_degc if tilt is not None else None,
             stands=self._stand_records(state),
-            imus=tuple(imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
+            imus=tuple(align_record.imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
         )
 
     async def keep(self, record: HandRecord) -> None:
@@ -215,23 +196,23 @@ class TurnTask(SpotTask):
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         up = np.array(now.imus[0].accel_m_s2)
         pose = self._counted(state, now, up / np.linalg.norm(up), 0.01)
-        return pose, objection(self._request, state.poses, pose)
+        return pose, objection(self.request, state.poses, pose)
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         self._make_stands(state, readable(state.windows, among=self._imus))
-        self._estimated(turned(self.stands, ground(local, None)))
+        self._check_fit(turned(self.stands, ground(local, None)))
         return []
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> TurnRecord:
         result, degrees = self.result, _temperatures(state.windows[-1])
-        if self._request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
+        if self.request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
             log.warnings.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg: turn it the same way both times, or --headings 4"
             )
         first, faces = result.imus[0], self._known.record
         sides = self._known.known(first.name, self._imus[first.name].in_force, degrees.get(first.name))
         self.board = None if sides is None else mounting(first, sides, local.gravity_m_s2)
-        if self.board is None and self._request.level:
+        if self.board is None and self.request.level:
             raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
         return TurnRecord(
             measured_at=log.started,
@@ -243,12 +224,12 @@ class TurnTask(SpotTask):
             imus=tuple(self._imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
             board=None
             if self.board is None or faces is None
-            else board_record(self.board, first.name, faces.measured_at),
+            else align_record.board_record(self.board, first.name, faces.measured_at),
         )
 
-    def _imu_record(self, imu: ImuAlignment, temperature_degc: float | None) -> TurnImuRecord:
+    def _imu_record(self, imu: ImuAlignment, temperature_degc: float | None) -> align_record.TurnImuRecord:
         whole = imu.level_bias_m_s2 + self._imus[imu.name].in_force.subtracted(temperature_degc)[3:]
-        return turn_imu_record(imu, temperature_degc, whole)
+        return align_record.turn_imu_record(imu, temperature_degc, whole)
 
     def changes(self) -> dict[str, list[Change]]:
         return {
@@ -257,7 +238,7 @@ class TurnTask(SpotTask):
         }
 
     def summary(self) -> str:
-        result, board, request = self.result, self.board, self._request
+        result, board, request = self.result, self.board, self.request
         words = f"level known to {_level_sigma_m_s2(result) / MG:.2f} mg, the spot slopes by {result.slope_deg:.2f} deg"
         if board is not None:
             words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
@@ -293,18 +274,14 @@ def _temperatures(window: Window) -> dict[str, float | None]:
     return {imu.name: imu.temperature_degc for imu in window.imus}
 
 
-EXPECTED: Final = 12
-"""Usual number of stands."""
-MOST: Final = 24
-_FIRST: Final = Wish("any side down, propped up, hands off")
-
-
 class SidesTask(PoseTask):
-    """Accelerometers held on all sides."""
+    """Bias and scale of accelerometers by stands in any orientation; ends by itself when nothing is unknown."""
+
+    total = EXPECTED
+    fit_from = 1
 
     def __init__(self, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], kept: ActiveSixPosition) -> None:
-        self._request, self._imus, self._kept = request, imus, kept
-        self.total, self.fit_from = EXPECTED, 1
+        self.request, self._imus, self._kept = request, imus, kept
         self._by_imu: dict[str, FacesEstimate] = {}
         self._missing: Wish | None = _FIRST
 
@@ -345,7 +322,7 @@ class SidesTask(PoseTask):
         if self._missing is not None:
             self.shortfall = f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
             log.warnings.append(self.shortfall)
-        elif self._request.write:
+        elif self.request.write:
             log.warnings += self._scales_left()
         first = next(iter(self._by_imu))
         ups = self._by_imu[first].up @ self._imus[first].in_force.orientation.T
@@ -354,11 +331,11 @@ class SidesTask(PoseTask):
             measured_at=log.started,
             gravity_m_s2=local.gravity_m_s2,
             stands=tuple(
-                FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
+                align_record.FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
                 for up, window in zip(ups, state.windows, strict=True)
             ),
             imus=tuple(
-                faces_imu_record(
+                align_record.faces_imu_record(
                     found,
                     name=name,
                     accel_id=calibration.accel_id,
@@ -388,7 +365,7 @@ class SidesTask(PoseTask):
     def summary(self) -> str:
         bias_mg = max(float(found.sigma[BIAS].max()) for found in self._by_imu.values()) / MG
         scale = max(float(found.sigma[SCALE].max()) for found in self._by_imu.values())
-        end = "written" if self._request.write else "not written (--write does)"
+        end = "written" if self.request.write else "not written (--write does)"
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:

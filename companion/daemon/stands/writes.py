@@ -60,7 +60,6 @@ class AlignmentWrites:
     async def write_accelerometers(
         self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], log: WriteLog
     ) -> None:
-        """Write the changes of each IMU; the aircraft stands still as in the last stand."""
         if not await self.path.offsets_still_hold():
             raise CalibrationRefusedError("the offsets were changed in between: align again")
         means = {imu.name: imu for imu in last.imus}
@@ -69,7 +68,7 @@ class AlignmentWrites:
             calibration, read = self._imus[name].in_force, means[name].accel_m_s2
             _, step = output_step(calibration, each, read)
             residual = None, -np.array(step)
-            targets.append(ImuPlan(name, calibration, tuple(each), residual, watched=True, read_m_s2=read))
+            targets.append(ImuPlan(name, calibration, tuple(each), residual, watched=True))
             log.warn(name, *warnings_about(calibration, each))
         plan = await self.path.write(job, Plan(tuple(targets), self._vehicle.boots), last, log)
         for target in targets:
@@ -80,7 +79,6 @@ class AlignmentWrites:
         await self.path.settle(job, plan, last, log)
 
     async def write_level(self, job: Job, board: Mounting, last: Window, log: WriteLog) -> dict[str, WrittenParameter]:
-        """Write the level, watch the attitude follow, and restore the old one if it does not."""
         if math.degrees(max(abs(board.roll_rad), abs(board.pitch_rad))) > MOST_DEG:
             raise CalibrationRefusedError("the board would sit more than 10 deg askew: no level is for that")
         kind = self._vehicle.kind
@@ -136,7 +134,6 @@ class AlignmentWrites:
         raise AutopilotError("the attitude did not follow the new level, or it moved")
 
     async def _imus_turned(self, turn: Matrix, last: Window) -> bool:
-        """Verify that the output of the IMUs has turned; only PX4 turns it."""
         with contextlib.suppress(CalibrationRefusedError):
             for imu in self._imus.values():
                 await imu.refresh()

@@ -12,6 +12,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import EffectVerdict
 from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, judge_vectors, why_look_longer
+from companion.daemon.offsets.plan import ImuPlan
 from companion.estimation.means.windows import ImuWindow
 
 NOISE_RAD_S = 1e-4
@@ -58,10 +59,10 @@ def verdict_of(
     """Judge a write of `step` (3,) after which the output moved by `made`; None: by `step`."""
     before = window(rng.normal(0.0, noise, (spans[0], 3)), 0.0)
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if made is None else made)
-    changes = [
-        Change(name, 0.0, float(each)) for name, each in zip(ArduPilotParameters(1).gyro_offset, step, strict=True)
-    ]
-    (verdict,) = judge_vectors(before, after, (np.asarray(step), None), calibration(), changes, "icm42688p", {})
+    names = ArduPilotParameters(1).gyro_offset
+    changes = tuple(Change(name, 0.0, float(each)) for name, each in zip(names, step, strict=True))
+    target = ImuPlan("fc", calibration(), changes, (np.asarray(step), None), watched=True)
+    (verdict,) = judge_vectors(target, before, after, "icm42688p", {})
     return verdict
 
 

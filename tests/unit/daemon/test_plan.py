@@ -41,11 +41,9 @@ def is_left(residual_deg_h: float, estimated_deg_h: float = ESTIMATED_DEG_H, wri
         warnings=(),
     )
     shared = Shared(np.array([0.0, 0.0, -1.0]), 9.81, np.zeros((6, 6)), None, (0.0, 0.0), 0.0)
-    averaged = (estimated_deg_h * DEG_H,) * 3
     earlier: Any = SimpleNamespace(
         sigma_in_force=lambda triad: (sigma,) * 3,
-        gyro_sigma_stat_rad_s=averaged,
-        accel_sigma_stat_m_s2=averaged,
+        of=lambda triad: SimpleNamespace(sigma_stat=(estimated_deg_h * DEG_H,) * 3),
         written={name: SimpleNamespace(after=written_rad_s) for name in ArduPilotParameters(1).gyro_offset},
     )
     return as_good(CALIBRATION, found, shared, earlier) == {"gyro"}

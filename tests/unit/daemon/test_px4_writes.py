@@ -15,11 +15,12 @@ import pytest
 from companion.autopilot.firmware.base import NO_IMU, SlotMemory
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.parameters.change import Change, WriteFailedError
+from companion.autopilot.parameters.change import WriteFailedError
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.plan import ImuPlan
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.links.mavlink.link import MavlinkLink
 from companion.storage.changes import ChangeLog
@@ -42,16 +43,16 @@ class Stage(NamedTuple):
         return await read_calibration(self.client, instance, self.memory)
 
     async def write(self, *instances: int) -> list[ImuCalibration]:
-        """Write a small change to each of these IMUs at once."""
         found = [await self.read(instance) for instance in instances]
-        targets = [(each, small_changes(each), (0.0, 0.0, 0.0)) for each in found]
-        async with self.writes.standing_by(targets) as probe:
-            await self.writer.apply([change for _, changes, _ in targets for change in changes], probe)
+        targets = [planned(each) for each in found]
+        async with self.writes.standing_by(targets, {}) as probe:
+            await self.writer.apply([change for target in targets for change in target.changes], probe)
         return found
 
 
-def small_changes(found: ImuCalibration) -> list[Change]:
-    return changes_for(found, (0.0005, -0.0003, 0.0008), (0.003, 0.002, -0.004))
+def planned(found: ImuCalibration) -> ImuPlan:
+    changes = changes_for(found, (0.0005, -0.0003, 0.0008), (0.003, 0.002, -0.004))
+    return ImuPlan(f"fc {found.instance}", found, tuple(changes), (None, None), watched=True)
 
 
 @contextlib.asynccontextmanager
@@ -81,7 +82,7 @@ def test_the_right_slot_is_seen_to_act_and_remembered(tmp_path: Path) -> None:
             assert [stage.memory.known("gyro", device) for device in (ICM, BMI)] == [1, 2]
             assert [stage.memory.known("accel", device) for device in (ICM, BMI)] == [1, 2]
             for found in (one, two):
-                far = stage.writes.on_the_way(found.instance)
+                far = stage.writes.on_the_way[found.instance]
                 raw_gyro, raw_accel = stage.px4.raw[found.instance - 1]
                 np.testing.assert_allclose(far["gyro"][0][0], raw_gyro - [0.0, 0.0, 0.022], atol=3e-3)
                 np.testing.assert_allclose(far["accel"][0][0], raw_accel - [0.0, 0.0, 0.09], atol=0.03)
@@ -192,7 +193,7 @@ def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
     async def main() -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
-            async with stage.writes.standing_by([(found, small_changes(found), (0.0, 0.0, 0.0))]) as probe:
+            async with stage.writes.standing_by([planned(found)], {}) as probe:
                 assert probe is not None
                 verify = probe("CAL_GYRO0_ZOFF")
                 stage.client.vehicle.boots += 1
@@ -208,18 +209,18 @@ def test_old_values_that_are_back_are_in_use(tmp_path: Path) -> None:
     async def main() -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
-            changes = small_changes(found)
-            async with stage.writes.standing_by([(found, changes, (0.0, 0.0, 0.0))]) as probe:
-                await stage.writer.apply(changes, probe)
+            target = planned(found)
+            async with stage.writes.standing_by([target], {}) as probe:
+                await stage.writer.apply(target.changes, probe)
             await asyncio.sleep(2.0)
-            await stage.writer.undo(changes)
+            await stage.writer.undo(target.changes)
             assert not np.any(list(px4.used.values()))
 
             async def verify() -> str:
                 return "not as believed"
 
             with pytest.raises(WriteFailedError):
-                await stage.writer.apply(changes, lambda _parameter: verify)
+                await stage.writer.apply(target.changes, lambda _parameter: verify)
             assert not np.any(list(px4.used.values()))
 
     run_virtual(main())
@@ -231,7 +232,7 @@ def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
     async def main() -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
-            changes = small_changes(found)
+            target = planned(found)
 
             def turn(name: str, value: float) -> float:
                 for k, (gyro, accel) in enumerate(px4.raw):  # by hand, further with every write: all IMUs feel it
@@ -239,9 +240,9 @@ def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
                 return value
 
             px4.on_set = turn
-            async with stage.writes.standing_by([(found, changes, (0.0, 0.0, 0.0))]) as probe:
-                await stage.writer.apply(changes, probe)
+            async with stage.writes.standing_by([target], {}) as probe:
+                await stage.writer.apply(target.changes, probe)
             assert stage.memory.known("gyro", ICM) is None
-            assert stage.writes.on_the_way(found.instance) == {}
+            assert stage.writes.on_the_way[found.instance] == {}
 
     run_virtual(main())

@@ -25,8 +25,6 @@ MADE = [*PLANNED, Change("INS_GYR2OFFS_X", 0.0, 0.002)]
 
 
 class Writer:
-    """Restores, or fails to."""
-
     def __init__(self) -> None:
         self.restored: list[Change] = []
         self.fails: Exception | None = None

@@ -9,6 +9,7 @@ import asyncio
 import dataclasses
 import logging
 import math
+import os
 import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import Final
@@ -16,33 +17,24 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.daemon.biases.identity import ImuIdentities, changed
+from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.stands.alignment import ActiveAlignment
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.records.history import Point, by_power_up, kept
+from companion.estimation.records.history import Point, PowerUp, by_power_up, kept
+from companion.estimation.solution import prior
 from companion.estimation.solution.curve import Along, Curve, settling
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import weigh
-from companion.estimation.solution.prior import (
-    Expectation,
-    ExpectedImu,
-    Prediction,
-    curve_of,
-    expect,
-    expect_today,
-    pose_effect,
-)
 from companion.estimation.solution.results import points
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.formats import Object
 from companion.physics.frames import Array, vector
 from companion.samples import TRIADS, Triad, Vector
-from companion.storage.records import BiasStore, KnownImu
+from companion.storage.records import BiasStore, KnownImu, this_boot
 
 logger = logging.getLogger(__name__)
 
@@ -54,73 +46,24 @@ _MUCH_BETTER: Final = 0.7
 """Share of its sigma below which a still window replaces another one of the same temperature."""
 
 
-class Curves:
-    """Bias over temperature of each IMU."""
-
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
-        self._profiles, self._imus = core.profiles, imus
-        self._names = {imu.name for imu in core.config.imu}
-        self._of: dict[tuple[str, Triad], Curve | None] = {}
-        self._settling: dict[str, tuple[float, float] | None] = {}
-
-    def follow(self, known: Mapping[str, KnownImu]) -> None:
-        """Fit the curves; blocking."""
-        of: dict[tuple[str, Triad], Curve | None] = {}
-        settles: dict[str, tuple[float, float] | None] = {}
-        for name in known.keys() & self._names:
-            seen, profile = known[name].points, noise_profile(self._profiles.of(name))
-            of |= {(name, triad): curve_of(seen, triad, profile.of(triad)) for triad in TRIADS}
-            groups = by_power_up([point for point in seen if point.temperature_degc is not None])
-            settles[name] = settling([[(p.temperature_degc or 0.0, p.k_s) for p in group] for group in groups])
-        self._of, self._settling = of, settles
-
-    def forget(self, name: str) -> None:
-        """Forget the curves of an IMU that was replaced."""
-        self._of = {key: curve for key, curve in self._of.items() if key[0] != name}
-        self._settling.pop(name, None)
-
-    def of(self, name: str, triad: Triad) -> Curve | None:
-        """Return the curve of one triad; None: not known."""
-        return self._of.get((name, triad))
-
-    def along(self, name: str, triad: Triad, warming: Warming | None) -> Along | None:
-        """Predict the bias within a window; None without a curve or a known change of temperature."""
-        curve, path = self.of(name, triad), None if warming is None else warming.path
-        if curve is None or path is None:
-            return None
-        profile = noise_profile(self._profiles.of(name))
-        found = curve.along(path, self._settling.get(name), profile.of(triad))
-        (start, _), _, (end, _) = path.states
-        shift, slope = (self.taken_off(name, triad, degc, end) for degc in (path.mean_degc, start))
-        if not shift.any() and not slope.any():
-            return found
-        left = {"shift": vector(found.shift - shift), "slope": vector(found.slope - slope / path.span_s)}
-        return msgspec.structs.replace(found, warm=None, **left)
-
-    def drift(
-        self, name: str, triad: Triad, degc: float | None, now_degc: float | None
-    ) -> tuple[Vector, Vector] | None:
-        """Predict the change of the output since a temperature, and its variance; None: not known."""
-        curve = self.of(name, triad)
-        if curve is None or degc is None or now_degc is None:
-            return None
-        mean, variance = curve.change((degc, 0.0), (now_degc, 0.0))
-        return vector(mean - self.taken_off(name, triad, degc, now_degc)), vector(variance)
-
-    def taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
-        """Return the change that the autopilot compensates by temperature itself, (3,)."""
-        calibration = self._imus[name].calibration if name in self._imus else None
-        return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
+_IN_WORDS: Final = {
+    "system": "vehicle",
+    "gyro": "gyro (device id)",
+    "accel": "accelerometer (device id)",
+    "scale": "accelerometer scale",
+}
 
 
 class BiasMemory:
-    """Predicts biases before a result is used, and remembers the result."""
-
     def __init__(self, core: Core, devices: Devices, used: ActiveAlignment) -> None:
         self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
-        self._imus, self._alignment = devices.imus, used
-        self.identities = ImuIdentities(core, devices, used)
-        self.curves = Curves(core, devices.imus)
+        self._vehicle, self._collector, self._imus, self._alignment = core.vehicle, core.collector, devices.imus, used
+        self._sensors = {role.name: sensor for sensor in devices.sensors for role in sensor.roles if role.kind == "imu"}
+        self._sources = {imu.name: imu for imu in core.config.imu}
+        self._host = this_boot() or os.urandom(8).hex()
+        self._curves: dict[tuple[str, Triad], Curve | None] = {}
+        self._settling: dict[str, tuple[float, float] | None] = {}
+        """Time constant of the warm-up of each IMU's board and one sigma, s."""
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
@@ -129,13 +72,53 @@ class BiasMemory:
         self._written_s = -math.inf
 
     def load(self) -> None:
-        """Load the stored biases; blocking."""
         self._known = self._store.read()
         self.follow()
 
     def follow(self) -> None:
-        """Fit the curves to all known biases; blocking."""
-        self.curves.follow(dict(self._known))
+        """Fit the curves over temperature to all known biases; blocking."""
+        curves: dict[tuple[str, Triad], Curve | None] = {}
+        settles: dict[str, tuple[float, float] | None] = {}
+        known = dict(self._known)
+        for name in known.keys() & self._sources.keys():
+            seen, profile = known[name].points, noise_profile(self._profiles.of(name))
+            curves |= {(name, triad): prior.curve_of(seen, triad, profile.of(triad)) for triad in TRIADS}
+            groups = by_power_up([point for point in seen if point.temperature_degc is not None])
+            settles[name] = settling([[(p.temperature_degc or 0.0, p.k_s) for p in group] for group in groups])
+        self._curves, self._settling = curves, settles
+
+    # --- bias over temperature
+
+    def curve(self, name: str, triad: Triad) -> Curve | None:
+        return self._curves.get((name, triad))
+
+    def drift(
+        self, name: str, triad: Triad, degc: float | None, now_degc: float | None
+    ) -> tuple[Vector, Vector] | None:
+        """Predict the change of the output since a temperature, and its variance; None: not known."""
+        curve = self.curve(name, triad)
+        if curve is None or degc is None or now_degc is None:
+            return None
+        mean, variance = curve.change((degc, 0.0), (now_degc, 0.0))
+        return vector(mean - self._taken_off(name, triad, degc, now_degc)), vector(variance)
+
+    def _along(self, name: str, triad: Triad, warming: Warming | None) -> Along | None:
+        curve, path = self.curve(name, triad), None if warming is None else warming.path
+        if curve is None or path is None:
+            return None
+        profile = noise_profile(self._profiles.of(name))
+        found = curve.along(path, self._settling.get(name), profile.of(triad))
+        (start, _), _, (end, _) = path.states
+        shift, slope = (self._taken_off(name, triad, degc, end) for degc in (path.mean_degc, start))
+        if not shift.any() and not slope.any():
+            return found
+        left = {"shift": vector(found.shift - shift), "slope": vector(found.slope - slope / path.span_s)}
+        return msgspec.structs.replace(found, warm=None, **left)
+
+    def _taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
+        """Return the change that the autopilot compensates by temperature itself, (3,)."""
+        calibration = self._imus[name].calibration if name in self._imus else None
+        return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
     # --- before a result is used
 
@@ -149,20 +132,15 @@ class BiasMemory:
         )
         return dataclasses.replace(solution, imus=imus)
 
-    def device_ids(self) -> dict[str, tuple[int | None, int | None]]:
-        """Return the known device ids of gyro and accelerometer, by IMU of the autopilot."""
-        known = {name: imu.calibration for name, imu in self._imus.items()}
-        return {name: (each.gyro_id, each.accel_id) for name, each in known.items() if each is not None}
-
     def forgotten(self) -> dict[str, str]:
         """Forget the biases of replaced sensors; return the reason by IMU, in one line."""
         found: dict[str, str] = {}
-        for name in (imu.name for imu in self._config.imu):
-            what = self._changed(name)
-            if not what:
+        for name in self._sources:
+            if not (what := self._changed(name)):
                 continue
             known = self._known.pop(name)
-            self.curves.forget(name)
+            self._curves = {key: curve for key, curve in self._curves.items() if key[0] != name}
+            self._settling.pop(name, None)
             self._today = {key: each for key, each in self._today.items() if key[0] != name}
             if known.points:
                 found[name] = f"imu {name}: {what} changed since then: its earlier biases are forgotten"
@@ -170,61 +148,57 @@ class BiasMemory:
         return found
 
     def why_not_now(self, name: str, started_at: str) -> str | None:
-        """Return why the bias of a calibration may have changed since; None without a reason.
-
-        An autopilot may have run on while our board was off.
-        """
+        """Return why the bias of a calibration may have changed since; None without a reason."""
         if (point := self._point(name, started_at)) is None:
             return "its calibration is not known of"
         if what := self._changed(name):
             return f"another IMU than was calibrated ({what})"
-        same = name in self._imus or point.power_up.is_same(self.identities.power_up(name, time.time()))
+        # An autopilot may have run on while our board was off.
+        same = name in self._imus or point.power_up.is_same(self.power_up(name, time.time()))
         return None if same else "the IMU was without power since its calibration"
 
     def on_since(self, name: str, started_at: str) -> bool:
-        """Return whether an IMU is the one of a calibration, and has run ever since."""
         point = None if self._changed(name) else self._point(name, started_at)
-        return point is not None and point.power_up.started_with(self.identities.power_up(name, time.time()))
+        return point is not None and point.power_up.started_with(self.power_up(name, time.time()))
 
-    def expectation(self, solution: Solution, unix_s: float) -> Expectation:
-        """Predict the biases of these IMUs today."""
+    def expectation(self, solution: Solution, unix_s: float) -> prior.Expectation:
         gradienter = self._config.gradienter
-        return Expectation(
+        return prior.Expectation(
             imus=tuple(self._expected(imu, solution.shared, unix_s) for imu in solution.imus),
             zero_is_known=self._alignment.used is not None
             or (gradienter is not None and gradienter.sigma_deg is not None),
         )
 
-    def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float) -> ExpectedImu:
+    def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float) -> prior.ExpectedImu:
         name = imu.name
         record = self._alignment.record if self._alignment.unused is None else None
         aligned = () if record is None else record.imus
-        effect = pose_effect(next((each for each in aligned if each.name == name), None))
+        effect = prior.pose_effect(next((each for each in aligned if each.name == name), None))
         if not self._config.calibration.prior:
-            return ExpectedImu(name=name, effect=effect)
+            return prior.ExpectedImu(name=name, effect=effect)
         now = Point(
             started_at="",
             unix_s=unix_s,
-            power_up=self.identities.power_up(name, unix_s),
+            power_up=self.power_up(name, unix_s),
             temperature_degc=imu.temperature_degc,
             k_s=imu.k_s,
             up=vector(shared.up),
-            zero=self.identities.zero(),
+            zero=self._zero(),
         )
-        earlier, session = self._points(name), self.identities.session(name)
+        earlier, session = self._points(name), self._session(name)
         profile = noise_profile(self._profiles.of(name))
 
-        def today(triad: Triad) -> Prediction | None:
+        def today(triad: Triad) -> prior.Prediction | None:
             then, point, _ = self._today.get((name, triad), (None, now, 0))
             if then != session:
                 return None
-            return expect_today(point, triad, now, effect, profile.of(triad), self.curves.of(name, triad))
+            return prior.expect_today(point, triad, now, effect, profile.of(triad), self.curve(name, triad))
 
-        return ExpectedImu(
+        return prior.ExpectedImu(
             name=name,
-            earlier={triad: expect(earlier, triad, now, effect, profile.of(triad)) for triad in TRIADS},
+            earlier={triad: prior.expect(earlier, triad, now, effect, profile.of(triad)) for triad in TRIADS},
             today={triad: today(triad) for triad in TRIADS},
-            along={triad: self.curves.along(name, triad, imu.warming) for triad in TRIADS},
+            along={triad: self._along(name, triad, imu.warming) for triad in TRIADS},
             effect=effect,
         )
 
@@ -237,8 +211,8 @@ class BiasMemory:
             doubts,
             started_at=started_at,
             unix_s=unix_s,
-            power_ups={imu.name: self.identities.power_up(imu.name, unix_s) for imu in solution.imus},
-            zero=self.identities.zero(),
+            power_ups={imu.name: self.power_up(imu.name, unix_s) for imu in solution.imus},
+            zero=self._zero(),
         )
 
     def _at_mean(self, imu: ImuSolution) -> ImuSolution:
@@ -246,7 +220,7 @@ class BiasMemory:
         degc, end_degc = imu.mean_degc, imu.temperature_degc
         if degc is None or end_degc is None or degc == end_degc:
             return imu
-        return imu.shifted(-np.concatenate([self.curves.taken_off(imu.name, t, degc, end_degc) for t in TRIADS]))
+        return imu.shifted(-np.concatenate([self._taken_off(imu.name, t, degc, end_degc) for t in TRIADS]))
 
     async def keep(self, found: Mapping[str, Point]) -> None:
         """Remember a good calibration; a failure of the disk is only logged."""
@@ -291,7 +265,7 @@ class BiasMemory:
 
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
         """Return whether a window is the first at its temperature in this power-up, or much better."""
-        degc, power_up = imu.mean_degc, self.identities.power_up(imu.name, unix_s)
+        degc, power_up = imu.mean_degc, self.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or degc is None or self._changed(imu.name):
             return False
         near = [each for each in self._points(imu.name) if each.power_up.is_same(power_up) and _is_near(each, degc)]
@@ -321,7 +295,7 @@ class BiasMemory:
         found = point.of(triad)
         if found is None:
             return
-        session = self.identities.session(name)
+        session = self._session(name)
         then, before, contradicted = self._today.get((name, triad), (None, point, 0))
         if found.is_outlier and then == session and before.zero == point.zero and contradicted < 2:
             self._today[name, triad] = session, before, contradicted + 1
@@ -331,19 +305,18 @@ class BiasMemory:
     # --- what is known
 
     def temperature(self) -> list[Object]:
-        """Summarise the biases over temperature; blocking."""
         # Imported here: the start is shorter without.
         from companion.estimation.solution.by_temperature import by_temperature
 
         self.follow()
         unix_s, found = time.time(), []
-        for name in (imu.name for imu in self._config.imu):
+        for name in self._sources:
             what = self._changed(name)
             shown = by_temperature(
                 name,
                 () if what else self._points(name),
-                *(None if what else self.curves.of(name, triad) for triad in TRIADS),
-                power_up=self.identities.power_up(name, unix_s),
+                *(None if what else self.curve(name, triad) for triad in TRIADS),
+                power_up=self.power_up(name, unix_s),
                 now_degc=self._now_degc.get(name),
             )
             if what:
@@ -361,14 +334,68 @@ class BiasMemory:
 
     def _remember(self, name: str, known: Sequence[Point]) -> None:
         """Keep as many points of an IMU as the disk does: predictions must not change with a restart."""
-        imu = self._known.get(name) or KnownImu(identity=self.identities.identity(name, {}))
+        imu = self._known.get(name) or KnownImu(identity=self._identity(name, {}))
         self._known[name] = msgspec.structs.replace(imu, points=kept(known))
+
+    # --- identity of the sensor behind each IMU
 
     def _changed(self, name: str) -> str:
         """Name the differences to the known sensor; empty: none."""
-        known = self._known.get(name)
-        return "" if known is None else changed(known.identity, self.identities.identity(name, known.identity))
+        if name not in self._known:
+            return ""
+        before = self._known[name].identity
+        now = self._identity(name, before)
+        keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+        return ", ".join(_IN_WORDS.get(key, key) for key in keys)
+
+    def power_up(self, name: str, unix_s: float) -> PowerUp:
+        up_s = self._collector.up_s(name)
+        return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
+
+    def _session(self, name: str) -> str:
+        """Return a word that changes as soon as the sensor may have been without power."""
+        if name in self._imus:
+            return f"boot {self._vehicle.boots}"
+        sensor = self._sensors.get(name)
+        if sensor is None:
+            return ""
+        return f"{sensor.link.reconnects} {sensor.decoder.times.clock.breaks} {sorted(sensor.health.counts.items())}"
+
+    def _zero(self) -> str | None:
+        gradienter, used = self._config.gradienter, self._alignment.used
+        if gradienter is None:
+            return None
+        at = used.measured_at if used is not None else "configured"
+        mounting = _plain(gradienter.mounting)
+        return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
+
+    def _identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
+        """Return the properties that define a sensor and its biases; `before` fills gaps."""
+        source = self._sources[name]
+        profile = source.profile.name if isinstance(source.profile, NoiseProfile) else source.profile
+        found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
+        if source.source == "serial":
+            return {**found, "protocol": source.protocol or "", "mounting": _plain(source.mounting)}
+        calibration = self._imus[name].calibration if name in self._imus else None
+        found |= {
+            "instance": str(source.instance or 1),
+            "system": str(self._vehicle.system_id),
+            "firmware": str(self._vehicle.firmware),
+        }
+        if calibration is None:
+            # A property that is not known now has not changed.
+            return {**before, **found}
+        return found | {
+            "gyro": str(calibration.gyro_id),
+            "accel": str(calibration.accel_id),
+            "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
+            "scale": _plain(calibration.accel_scale),
+        }
 
 
 def _is_near(point: Point, degc: float) -> bool:
     return point.temperature_degc is not None and abs(point.temperature_degc - degc) < LOOK_K
+
+
+def _plain(value: object) -> str:
+    return " ".join(f"{each:.6g}" for each in value) if isinstance(value, list | tuple) else str(value)
