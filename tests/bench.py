@@ -27,7 +27,7 @@ from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.machine import What
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
-from companion.lab.replay.engine import replay
+from companion.lab.replay import replay
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind
 from companion.samples import ImuSample

@@ -20,11 +20,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.lab.logs.log_files import read_logs
-from companion.lab.logs.recording import Recording
-from companion.lab.logs.still_log import read_csv
-from companion.lab.replay.engine import replay
-from companion.lab.replay.estimate import Given, estimate
+from companion.lab.estimate import Given, estimate
+from companion.lab.log_files import read_logs
+from companion.lab.recording import Recording
+from companion.lab.replay import replay
+from companion.lab.still_log import read_csv
 from tests.support.long_recordings import write_log, write_recording
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -47,7 +47,7 @@ def best_s(work: Callable[[], object], rounds: int = ROUNDS) -> tuple[float, flo
 
 
 def _read(path: Path) -> int:
-    return sum(1 for _ in Recording(path).items())
+    return sum(1 for _ in Recording(path).read())
 
 
 def _replayed(path: Path) -> None:

@@ -20,11 +20,10 @@ _MOST_BYTES: Final = 4096
 OPEN_WITHIN_S: Final = 5.0
 EVERY_S: Final = 0.5
 SHOWN_S: Final = 1.0
-"""A page that is open shows the last state within this time."""
 
 
 class Asking:
-    """Asks on stdout, or on stderr where stdout is for JSON; takes answers from stdin. `yes`: nobody is asked."""
+    """Asks on stdout, or on stderr where stdout is for JSON; reads answers from stdin. `yes`: nobody is asked."""
 
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
@@ -32,7 +31,6 @@ class Asking:
         self._echoes = not sys.stdin.isatty()
 
     def say(self, *lines: str) -> None:
-        """Print lines."""
         print_lines(*lines, error=self._error)
 
     async def ask(self, question: Question) -> None:
@@ -60,7 +58,6 @@ class Asking:
                 return
 
     async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
-        """Ask for yes or no."""
         found = by_default
 
         def put(words: str) -> None:
@@ -71,7 +68,7 @@ class Asking:
         return found
 
     async def _line(self) -> str:
-        """Read a line. Ctrl-C ends the waiting at once, unlike in `input`."""
+        """Read a line; Ctrl-C ends the wait at once, unlike in `input`."""
         while b"\n" not in self._rest and len(self._rest) < _MOST_BYTES:
             chunk = await _read(sys.stdin.fileno())
             if not chunk:
@@ -97,10 +94,7 @@ async def _read(descriptor: int) -> bytes:
 
 
 class PageAsking(Asking):
-    """Asks on a page, and prints everything in the terminal too; `async with` opens the page.
-
-    `storage` is the daemon's: its page has the same token.
-    """
+    """Asks on a page too; `async with` opens it. `storage` is the daemon's, whose page has the same token."""
 
     def __init__(self, bind: str, storage: Path) -> None:
         from companion.web.server import Page  # the web server is needed here alone
@@ -114,7 +108,6 @@ class PageAsking(Asking):
         self._page = Page(bind, storage, self._answer)
 
     async def __aenter__(self) -> Self:
-        """Open the page; raise CompanionError with the reason if that fails."""
         self._serving = asyncio.create_task(self._page.run(), name="page")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(OPEN_WITHIN_S):
@@ -129,7 +122,6 @@ class PageAsking(Asking):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Show the end, and close the page."""
         if kind is None or issubclass(kind, CompanionError):
             self.say("", f"ended: {error}" if error is not None else "All is done.")
             await asyncio.sleep(SHOWN_S)
@@ -158,7 +150,7 @@ class PageAsking(Asking):
         return await self._answered
 
     async def _answer(self, request: Object) -> AsyncGenerator[Object, None]:
-        """Answer the page as a daemon's control socket would: its status, and the operator's answer to the question."""
+        """Answer the page as a daemon's control socket would: with a status, and to the operator's answer."""
         if request.get("command") == "status":
             yield {"kind": "result", "status": self._status()}
             return

@@ -12,21 +12,51 @@ from typing import Final
 
 from companion import commands
 from companion.cli import show
-from companion.cli.terminal import conclude, load_config, print_lines, request_of
+from companion.cli.monitor import monitor
+from companion.cli.terminal import (
+    AddCommand,
+    DaemonRefusedError,
+    add_fields,
+    conclude,
+    load_config,
+    print_lines,
+    request_of,
+)
 from companion.formats import Object
 from companion.links.system.connection import ask
 
 SILENT_S: Final = 2.0
-"""Silence after which the command says that it waits for an answer."""
+
+
+CANCEL: Final = {"command": "cancel"}
+
+
+def add_commands(add: AddCommand) -> None:
+    for kind, command in (
+        (commands.Status, status),
+        (commands.Calibrate, calibrate),
+        (commands.Align, align),
+        (commands.Cancel, cancel),
+        (commands.Undo, undo),
+        (commands.AutopilotSetup, setup),
+        (commands.History, history),
+        (commands.Temperature, temperature),
+        (commands.Monitor, monitor),
+        (commands.RecordInputs, record),
+    ):
+        add_fields(add(kind.name(), command, kind.help), kind, commands.Interface.COMMAND_LINE)
 
 
 async def request(
     options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None, *, in_place: bool = False
 ) -> Object:
-    """Send a request, show its progress on stderr, return its last reply.
+    """Send a request, show its progress on stderr, return its result.
 
-    At Ctrl-C, where it has begun, `at_interrupt` is asked, and its reply is the last; None: it is only left.
-    `in_place`: progress that only counts, on one line.
+    Ctrl-C, once the daemon has answered, sends `at_interrupt` instead; None: the daemon goes on. `in_place`: progress
+    that only counts, on one line.
+
+    Raises:
+        DaemonRefusedError: the daemon refuses it.
     """
     reply: Object = {}
     shown = ""
@@ -51,78 +81,91 @@ async def request(
         silent.cancel()
         if in_place and shown:
             print_lines("", error=True)
+    if reply.pop("kind") == "error":
+        raise DaemonRefusedError(reply["reason"])
     return reply
 
 
-def finish(options: argparse.Namespace, reply: Object, answer: Object, lines: list[str], *, good: bool) -> int:
-    """Print an answer, as JSON or as lines for people, and give the exit code."""
-    if reply["kind"] == "error":
-        answer, lines, good = {"state": "refused", "reason": reply["reason"]}, [], False
-        print_lines(f"companion: {reply['reason']}", error=True)
-    return conclude(options, answer, lines, good=good)
-
-
 async def status(options: argparse.Namespace) -> int:
-    reply = await request(options, {"command": "status"})
-    answer = reply.get("status", {})
-    return finish(options, reply, answer, show.status_lines(answer) if answer else [], good=True)
+    answer = (await request(options, {"command": "status"}))["status"]
+    return conclude(options, answer, show.status_lines(answer), good=True)
 
 
 async def calibrate(options: argparse.Namespace) -> int:
-    """`companion calibrate`; Ctrl-C cancels what is waited for."""
-    wanted = request_of(options, commands.Calibrate)
-    reply = await request(options, wanted, {"command": "cancel"} if options.wait else None)
-    if "record" in reply:
-        record = reply["record"]
-        return finish(options, reply, record, show.record_lines(record), good=record["state"] == "done")
-    return _finish_briefly(options, reply, good=not options.wait)
+    reply = await request(options, request_of(options, commands.Calibrate), CANCEL if options.wait else None)
+    if "record" not in reply:
+        return _conclude_briefly(options, reply, good=not options.wait)
+    record = reply["record"]
+    return conclude(options, record, show.record_lines(record), good=record["state"] == "done")
 
 
-def _finish_briefly(options: argparse.Namespace, reply: Object, *, good: bool = True) -> int:
+def _conclude_briefly(options: argparse.Namespace, reply: Object, *, good: bool = True) -> int:
     answer = {key: reply.get(key) for key in ("state", "reason")}
-    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
+    return conclude(options, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
 
 
 async def cancel(options: argparse.Namespace) -> int:
-    return _finish_briefly(options, await request(options, {"command": "cancel"}))
+    return _conclude_briefly(options, await request(options, CANCEL))
 
 
-async def undo(options: argparse.Namespace, wanted: Object | None = None) -> int:
-    """`companion undo`, or that of a single kind of write."""
-    reply = await request(options, wanted or request_of(options, commands.Undo))
+async def undo(options: argparse.Namespace, kind: type[commands.Command] = commands.Undo) -> int:
+    reply = await request(options, request_of(options, kind))
     answer = {key: reply.get(key) for key in ("state", "reason", "written", "undone", "undoable")}
     lines = [f"{answer['state']}: {answer['reason']}", show.undo_line(answer["undoable"] or ())]
-    return finish(options, reply, answer, lines, good=answer["state"] == "done")
+    return conclude(options, answer, lines, good=answer["state"] == "done")
 
 
 async def history(options: argparse.Namespace) -> int:
     reply = await request(options, request_of(options, commands.History))
     keys = ("numbers", "records", "armings", "by_hand", "interrupted", "flights")
     answer = {key: reply.get(key, []) for key in keys}
-    return finish(options, reply, answer, show.history_lines(**answer), good=True)
+    return conclude(options, answer, show.history_lines(**answer), good=True)
 
 
 async def temperature(options: argparse.Namespace) -> int:
-    """`companion temperature`; Ctrl-C cancels a write in the daemon too."""
-    wanted = request_of(options, commands.Temperature)
     if options.action == "undo":
-        return await undo(options, wanted)
+        return await undo(options, commands.Temperature)
+    wanted = request_of(options, commands.Temperature)
     if options.action == "write" or options.overwrite:
-        wanted["action"] = "write"
-        reply = await request(options, wanted, {"command": "cancel"})
+        reply = await request(options, {**wanted, "action": "write"}, CANCEL)
         answer: Object = {key: reply.get(key) for key in ("state", "reason", "written")}
-        lines = [f"{str(answer['state']).upper()}: {answer['reason']}", *show.curves_written_lines(answer["written"])]
-        return finish(options, reply, answer, lines, good=answer["state"] == "done")
-    reply = await request(options, wanted)
-    answer = {"imus": reply.get("imus", [])}
-    return finish(options, reply, answer, show.temperature_lines(answer["imus"]), good=True)
+        lines = [_heading(answer), *show.curves_written_lines(answer["written"])]
+        return conclude(options, answer, lines, good=answer["state"] == "done")
+    imus = (await request(options, wanted)).get("imus", [])
+    return conclude(options, {"imus": imus}, show.temperature_lines(imus), good=True)
+
+
+def _heading(answer: Object) -> str:
+    state: str = answer["state"].upper()
+    return f"{state}: {answer['reason']}" if answer["reason"] else state
 
 
 async def setup(options: argparse.Namespace) -> int:
-    reply = await request(options, {"command": "autopilot-setup"})
-    answer = {key: value for key, value in reply.items() if key != "kind"}
-    good = reply["kind"] != "error"
-    return finish(options, reply, answer, setup_lines(answer) if good else [], good=good)
+    answer = await request(options, {"command": "autopilot-setup"})
+    return conclude(options, answer, setup_lines(answer), good=True)
+
+
+async def align(options: argparse.Namespace) -> int:
+    wanted = request_of(options, commands.Align)
+    answer = {"alignment": None, **await request(options, wanted, CANCEL)}
+    alignment, state = answer["alignment"], answer["state"]
+    lines = [_heading(answer), *(stands_lines(alignment) if alignment else [])]
+    lines += sides_lines(answer.get("accelerometers", ()))
+    good = state in ("done", "in force") or (wanted["action"] == "show" and state != "refused")
+    return conclude(options, answer, lines, good=good)
+
+
+async def record(options: argparse.Namespace) -> int:
+    wanted, stop = request_of(options, commands.RecordInputs), {"command": "record", "stop": True}
+    if "file" in wanted:
+        wanted["file"] = str(Path.cwd() / wanted["file"])
+    answer = await request(options, wanted, stop, in_place=True)
+    lines: list[str] = []
+    if "file" in answer:
+        lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
+        size = f"{answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB"
+        lines = [f"{answer['file']}: {size}{lost}; {answer['reason']}"]
+    return conclude(options, answer, lines, good=answer.get("state") == "done")
 
 
 def setup_lines(answer: Object) -> list[str]:
@@ -147,45 +190,12 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
 
 
-async def align(options: argparse.Namespace) -> int:
-    """`companion align`; Ctrl-C cancels it in the daemon too."""
-    wanted = request_of(options, commands.Align)
-    reply = await request(options, wanted, {"command": "cancel"})
-    answer = {"alignment": None, **{key: value for key, value in reply.items() if key != "kind"}}
-    lines: list[str] = []
-    if reply["kind"] != "error":
-        state = answer["state"].upper()
-        lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
-        lines += stands_lines(answer["alignment"]) if answer["alignment"] else []
-        lines += sides_lines(answer.get("accelerometers", ()))
-    good = answer.get("state") in ("done", "in force") or (
-        wanted["action"] == "show" and answer.get("state") != "refused"
-    )
-    return finish(options, reply, answer, lines, good=good)
-
-
-async def record(options: argparse.Namespace) -> int:
-    wanted, stop = request_of(options, commands.RecordInputs), {"command": "record", "stop": True}
-    if "file" in wanted:
-        wanted["file"] = str(Path.cwd() / wanted["file"])
-    reply = await request(options, wanted, stop, in_place=True)
-    answer = {key: item for key, item in reply.items() if key != "kind"}
-    lines: list[str] = []
-    if "file" in answer:
-        lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
-        size = f"{answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB"
-        lines = [f"{answer['file']}: {size}{lost}; {answer['reason']}"]
-    return finish(options, reply, answer, lines, good=answer.get("state") == "done")
-
-
 def sides_lines(imus: Sequence[Object]) -> list[str]:
-    """Show the errors left in accelerometers that were held on all sides."""
     lines = []
     for imu in imus:
         lines.append(f"{imu['name']}: known from all sides, {imu['measured_at'][:19]} UTC; its output has left")
-        bias = show.axes(imu["bias_left_mg"], imu["bias_sigma_mg"], "+.3f")
-        scale = show.axes(imu["scale_left"], imu["scale_sigma"], "+.4f", 0.01)
-        lines += [f"  {'accel bias':16} {'mg':6} {bias}", f"  {'accel scale':16} {'%':6} {scale}"]
+        lines.append(_figure_line("accel bias", "mg", imu["bias_left_mg"], imu["bias_sigma_mg"], "+.3f"))
+        lines.append(_figure_line("accel scale", "%", imu["scale_left"], imu["scale_sigma"], "+.4f", 0.01))
     return lines
 
 
@@ -200,18 +210,20 @@ _SHOWN: Final = {"faces": ("accel_bias_mg", "accel_scale", "accel_shear"), "turn
 """Figures by kind of alignment; other kinds show all that are known but the shear."""
 
 
+def _figure_line(
+    words: str, unit: str, values: Sequence[float], sigma: Sequence[float] | None, form: str, scale: float = 1.0
+) -> str:
+    return f"  {words:16} {unit:6} {show.axes(values, sigma, form, scale)}"
+
+
 def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float], sigma: Sequence[float]) -> list[str]:
-    """Show the whole bias, and the part left in the output, if known: the change by a write."""
+    """Show the whole bias, and its change by a write: the part that was left in the output."""
     if words == "slant when level" or whole is None:
-        return [f"  {words:16} {'mg':6} {show.axes(left, sigma, '+.3f')}"]
-    return [
-        f"  {words:16} {'mg':6} {show.axes(whole, sigma, '+.3f')}",
-        f"  {'  change':16} {'mg':6} {show.axes(left, None, '+.3f')}",
-    ]
+        return [_figure_line(words, "mg", left, sigma, "+.3f")]
+    return [_figure_line(words, "mg", whole, sigma, "+.3f"), _figure_line("  change", "mg", left, None, "+.3f")]
 
 
 def stands_lines(record: Object) -> list[str]:
-    """Show an alignment: spot, zero, each IMU, board, lines for the configuration."""
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands{slope}"]
     zero: list[str] = []
@@ -241,7 +253,7 @@ def stands_lines(record: Object) -> list[str]:
             if key == "accel_bias_mg":
                 lines += _bias_lines(words, whole, imu[key]["value"], imu[key]["sigma"])
                 continue
-            lines.append(f"  {words:16} {unit:6} {show.axes(imu[key]['value'], imu[key]['sigma'], form, scale)}")
+            lines.append(_figure_line(words, unit, imu[key]["value"], imu[key]["sigma"], form, scale))
         lines += show.written_lines(imu.get("written", {}))
     if (board := record.get("board")) is not None:
         roll, pitch = board["sigma_deg"]

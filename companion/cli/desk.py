@@ -6,7 +6,7 @@ import argparse
 import datetime
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -30,10 +30,10 @@ from companion.formats import Object
 from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
-    from companion.lab.flight.flight import Knowledge
-    from companion.lab.logs.still_log import StillLog
-    from companion.lab.replay.engine import Replay
-    from companion.lab.replay.estimate import Given
+    from companion.lab.estimate import Given
+    from companion.lab.flight import Knowledge
+    from companion.lab.replay import Replay
+    from companion.lab.still_log import StillLog
     from companion.storage.records import FlightStore
 
 # --json has them all.
@@ -53,48 +53,39 @@ def add_commands(add: AddCommand) -> None:
 
 
 async def replay(options: argparse.Namespace) -> int:
-    from companion.lab.logs.autopilot_logs import reader_of
-    from companion.lab.logs.recording import is_text
+    from companion.lab.log_files import format_of
 
-    logs = []
-    for file in options.files:
-        try:
-            logs += [file] if reader_of(file) is not None or is_text(file) else []
-        except OSError as error:
-            raise ConfigError(f"companion replay: {file}: {error.strerror or error}") from None
-    if not logs:
+    try:
+        formats = [format_of(file) for file in options.files]
+    except StorageError as error:
+        raise ConfigError(f"companion replay: {error}") from None
+    if set(formats) == {"recording"}:
         return _replay_recording(options)
-    if len(options.files) > 1:
-        raise ConfigError(f"companion replay: found {len(options.files)} files; allowed with a log: one")
-    return _replay_log(options, logs[0])
+    if len(formats) > 1:
+        raise ConfigError(f"companion replay: found {len(formats)} files; allowed with a log: one")
+    return _replay_log(options, options.files[0])
 
 
 def _replay_recording(options: argparse.Namespace) -> int:
-    from companion.lab.replay import engine
+    from companion.lab.replay import replay as replay_recordings
 
     began_s = time.monotonic()
-    result = engine.replay(options.files)
+    result = replay_recordings(options.files)
     took_s = time.monotonic() - began_s
-    different = [difference for each in result.calibrations for difference in each.differences]
+    different = any(each.differences for each in result.calibrations)
     lines = _lines(result)
-    reason = lines[-1]
-    good = bool(result.calibrations) and not different
-    state = "different" if different else "done" if good else "failed"
-    print_lines(
-        f"replayed {result.seconds:.0f} s in {took_s:.1f} s"
-        + (f"; the recording ends early: {result.cut_short}" if result.cut_short else ""),
-        error=True,
-    )
-    for note in result.notes:
-        print_lines(f"note: {note}", error=True)
+    state = "different" if different else "done" if result.calibrations else "failed"
+    cut = f"; the recording ends early: {result.cut_short}" if result.cut_short else ""
+    print_lines(f"replayed {result.seconds:.0f} s in {took_s:.1f} s{cut}", error=True)
+    print_lines(*(f"note: {note}" for note in result.notes), error=True)
     keys = ("calibrations", "seconds", "cut_short", "notes")
     found = {key: msgspec.to_builtins(getattr(result, key)) for key in keys}
-    return conclude(options, {"state": state, "reason": reason, **found}, lines, good=good)
+    return conclude(options, {"state": state, "reason": lines[-1], **found}, lines, good=state == "done")
 
 
 def _lines(result: Replay) -> list[str]:
     """Describe the result; the last line is the verdict."""
-    from companion.lab.replay.engine import TOLERANCE_SIGMAS
+    from companion.lab.replay import TOLERANCE_SIGMAS
 
     lines: list[str] = []
     different = 0
@@ -130,22 +121,8 @@ def _add_log_options(parser: argparse.ArgumentParser) -> None:
         ("height-m", -500.0, 9000.0, None, "M", "above mean sea level"),
         ("sigma-deg", 1e-4, 45.0, 0.05, "DEG", "of pitch and roll (default 0.05)"),
         ("heading-sigma-deg", 1e-3, 180.0, 3.0, "DEG", "default 3"),
-        (
-            "powered",
-            0.0,
-            1e6,
-            0.0,
-            "S",
-            "time since switch-on when the log began (default 0): what it may still warm up",
-        ),
-        (
-            "windows",
-            10.0,
-            3600.0,
-            None,
-            "S",
-            "calibrate in every window of so many seconds, and check sigma by the next",
-        ),
+        ("powered", 0.0, 1e6, 0.0, "S", "time since switch-on when the log began (default 0), for the warm-up"),
+        ("windows", 10.0, 3600.0, None, "S", "calibrate in every window of this length; check sigma by the next"),
     ):
         log.add_argument(f"--{name}", type=within(least, most), default=default, metavar=unit, help=words)
     log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
@@ -167,7 +144,7 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
 
 
 def _replay_log(options: argparse.Namespace, file: Path) -> int:
-    from companion.lab.replay.estimate import estimate
+    from companion.lab.estimate import estimate
 
     given = _given(options)
     log = _log(options, file)
@@ -181,7 +158,7 @@ def _replay_log(options: argparse.Namespace, file: Path) -> int:
 
 
 def _log(options: argparse.Namespace, file: Path) -> StillLog:
-    from companion.lab.logs.log_files import read_logs
+    from companion.lab.log_files import read_logs
 
     logs = read_logs([file], options.columns, options.rate)
     named = [log for log in logs if options.imu in (None, log.imu)]
@@ -194,7 +171,7 @@ def _log(options: argparse.Namespace, file: Path) -> StillLog:
 
 
 def _given(options: argparse.Namespace) -> Given:
-    from companion.lab.replay.estimate import Given
+    from companion.lab.estimate import Given
     from companion.rotations import ROTATIONS_DEG
     from companion.storage.profiles import given_profile
 
@@ -209,7 +186,7 @@ def _given(options: argparse.Namespace) -> Given:
 
 
 def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
-    from companion.lab.replay.estimate import windows
+    from companion.lab.estimate import windows
 
     count, refused, axes = windows(log, given, options.windows)
     done = count - sum(refused.values())
@@ -225,7 +202,7 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
     }
     lines = [f"windows of {options.windows:g} s: {count}, calibrated: {done}"]
     lines += [f"not calibrated: {number}: {why}" for why, number in [*refused.items()][:MOST_REASONS]]
-    lines += [*_axis_lines(axes), *(f"note: {note}" for note in log.notes)]
+    lines += [*_axis_lines(axes), *log_lines(log.left_out, log.notes)]
     return conclude(options, answer, lines, good=not reason)
 
 
@@ -248,15 +225,19 @@ def _used_lines(used: Object) -> list[str]:
     if used["from_s"] is not None:
         still = f"{used['still_s']} s of it at rest"
         lines.append(f"used: {used['from_s']:.0f} to {used['to_s']:.0f} s of {used['seconds']:.1f} s; {still}")
-    lines += [f"left out: {count} lines {why}" for why, count in used["left_out"].items()]
-    return [*lines, *(f"note: {note}" for note in used["notes"])]
+    return lines + log_lines(used["left_out"], used["notes"])
+
+
+def log_lines(left_out: Mapping[str, int], notes: Sequence[str]) -> list[str]:
+    lines = [f"left out: {count} lines {why}" for why, count in left_out.items()]
+    return lines + [f"note: {note}" for note in notes]
 
 
 # --- flights
 
 
 async def flight(options: argparse.Namespace) -> int:
-    from companion.lab.flight.flight import flights, read
+    from companion.lab.flight import flights, read
 
     path = options.file
     known, store = _knowledge(options)
@@ -274,13 +255,13 @@ async def flight(options: argparse.Namespace) -> int:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
     numbers = [] if store is None else _keep(store, path.name, found)
     lines += [f"kept as flight {number}: companion history lists it" for number in numbers]
-    answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
-    answer["flights"] = msgspec.to_builtins(found)
+    told = msgspec.to_builtins(found)
+    answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers, "flights": told}
     return conclude(options, answer, lines, good=True)
 
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
-    """Read what the companion has on disk, and give its store of flights; None: this user may not."""
+    """Read the records and learned biases on this computer, and its store of flights; None: no permission."""
     from companion.storage.records import BiasStore, FlightStore, RecordStore
 
     directory = storage_path(options)
@@ -294,7 +275,6 @@ def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | No
 
 
 def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
-    """Keep the flights that flew, for the history; return their numbers."""
     read_at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds")
     flown = [each for each in found if any(imu.drift for imu in each.imus)]
     if flown and not store.folder.parent.is_dir():
@@ -332,11 +312,7 @@ def _flight_lines(number: int, found: Flight) -> list[str]:
 
 
 def _imu_lines(imu: ImuFlight) -> list[str]:
-    whose = (
-        f"offsets of the calibration of {imu.calibration}"
-        if imu.calibration
-        else "offsets of no calibration known here"
-    )
+    whose = f"offsets of {f'the calibration of {imu.calibration}' if imu.calibration else 'no calibration known here'}"
     lines = [f"IMU {imu.imu}, {imu.rate_hz:.0f} Hz: {whose}"]
     lines += [f"  note: {note}" for note in imu.notes]
     lines += [f"  {words}" for words in drift_lines(imu)]
@@ -346,7 +322,6 @@ def _imu_lines(imu: ImuFlight) -> list[str]:
 
 
 def _table(imu: ImuFlight) -> list[str]:
-    """Make the table of axes; name once what is known of none."""
     shown = [term for term in HEADS if any(getattr(axis, term) for axis in imu.axes)]
     lines = [f"{'left over':13}" + "".join(f"{HEADS[term]:>13}" for term in shown)]
     for axis in imu.axes:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import importlib.util
 import signal
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
@@ -29,7 +30,6 @@ from companion.errors import ConfigError, LinkError, NobodyHeardError
 from companion.links.system.process import set_up_logs
 
 if TYPE_CHECKING:
-    from companion.fleet.server import Server
     from companion.ground.station import RequestOutcome, Station
 
 URLS: Final = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
@@ -44,15 +44,13 @@ _NEEDS_MORE: Final = (
 def add_ground(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
     words = "from the laptop on the ground, over the telemetry link (no ground station program needed)"
     ground = commands.add_parser("ground", help=words, description=words)
-    link = Parser(add_help=False, argument_default=argparse.SUPPRESS)
-    link.add_argument("--url", type=_url, help=f"{URLS} (default {DEFAULT_URL})")
-    of_byte = within(1, 255, int)
-    link.add_argument("--system", type=of_byte, metavar="N", help="the vehicle's system id, where several are heard")
-    link.add_argument("--component", type=of_byte, metavar="N", help="the companion's component id (default 191)")
-    words = "how long to look for the companion on the link (default 5)"
-    link.add_argument("--within", type=seconds, metavar="S", help=words)
-    words = "sign with this key and believe nobody else (docs/security.md)"
-    link.add_argument("--signing-key-file", type=Path, metavar="FILE", help=words)
+    link = Parser(add_help=False)
+    link.add_argument("--url", type=_url, default=DEFAULT_URL, help=f"{URLS} (default {DEFAULT_URL})")
+    option, of_byte = link.add_argument, within(1, 255, int)
+    option("--system", type=of_byte, metavar="N", help="the vehicle's system id, where several are heard")
+    option("--component", type=of_byte, default=191, metavar="N", help="the companion's component id (default 191)")
+    option("--within", type=seconds, default=5.0, metavar="S", help="how long to look for the companion (default 5)")
+    option("--signing-key-file", type=Path, metavar="FILE", help="sign, and believe nobody else (docs/security.md)")
     add = adder(ground.add_subparsers(title="commands", metavar="COMMAND", required=True), common, link)
     calibrate = add("calibrate", _calibrate, "calibrate now and show how it goes; Ctrl-C cancels")
     add_fields(calibrate, Calibrate, Interface.GROUND)
@@ -74,15 +72,14 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
     from companion.ground.link import open_link
     from companion.ground.station import Display, Station
 
-    url, key_file = getattr(options, "url", DEFAULT_URL), getattr(options, "signing_key_file", None)
-    key = None if key_file is None else _key(key_file)
-    heard = GroundListener(getattr(options, "component", 191))
+    key = None if options.signing_key_file is None else _key(options.signing_key_file)
+    heard = GroundListener(options.component)
     # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
     with contextlib.redirect_stdout(sys.stderr):
-        async with open_link(url, heard, key) as link:
-            station = Station(link, url, Display())
+        async with open_link(options.url, heard, key) as link:
+            station = Station(link, options.url, Display())
             try:
-                await station.find(getattr(options, "system", None), getattr(options, "within", 5.0))
+                await station.find(options.system, options.within)
             except NobodyHeardError as error:
                 raise NobodyHeardError("; ".join(filter(None, (str(error), link.unbelieved())))) from None
             async with _interruptible(station):
@@ -92,7 +89,7 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
 
 @contextlib.asynccontextmanager
 async def _interruptible(station: Station) -> AsyncIterator[None]:
-    """Ctrl-C and SIGTERM cancel what the station has asked for, instead of leaving it alone with its request."""
+    """Let Ctrl-C and SIGTERM cancel the station's request at the companion, not only the wait for it."""
     loop = asyncio.get_running_loop()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
@@ -146,16 +143,21 @@ def add_fleet(commands: argparse._SubParsersAction[Parser], common: Parser) -> N
 
 
 async def _run(options: argparse.Namespace) -> int:
-    _check_installed()
+    if missing := [name for name in ("aiomqtt", "psycopg", "sqlalchemy") if importlib.util.find_spec(name) is None]:
+        raise ConfigError(f"{_NEEDS_MORE} (no module {', '.join(missing)})")
     from companion.config.sections import Mqtt
     from companion.fleet.collector import Collector, load_broker
     from companion.fleet.store import Store
 
     mqtt = load_broker(options.config) if hasattr(options, "config") else Mqtt(host="127.0.0.1")
     set_up_logs("info")
-    collector = Collector(mqtt, Store(options.database))
-    pages = [] if options.page == "off" else [_server(options).run()]
-    await _until_stopped(collector.run(), *pages)
+    collector, pages = Collector(mqtt, Store(options.database)), []
+    if options.page != "off":
+        from companion.fleet.server import Server, read_password
+
+        password = None if options.password_file is None else read_password(options.password_file)
+        pages.append(Server(options.page, options.database, password).run())
+    await _until_stopped([collector.run(), *pages])
     return DONE
 
 
@@ -166,15 +168,8 @@ async def _acl(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _server(options: argparse.Namespace) -> Server:
-    from companion.fleet.server import Server, read_password
-
-    password = None if options.password_file is None else read_password(options.password_file)
-    return Server(options.page, options.database, password)
-
-
-async def _until_stopped(*runs: Coroutine[Any, Any, None]) -> None:
-    """Run until Ctrl-C or SIGTERM, or until one fails, and raise what that raised; all have ended then."""
+async def _until_stopped(runs: Sequence[Coroutine[Any, Any, None]]) -> None:
+    """Run until Ctrl-C, SIGTERM or a failure, which is raised once all have ended."""
     from companion.fleet.collector import stop
 
     tasks = [asyncio.ensure_future(run) for run in runs]
@@ -186,12 +181,3 @@ async def _until_stopped(*runs: Coroutine[Any, Any, None]) -> None:
             await together
     finally:
         await stop(tasks)
-
-
-def _check_installed() -> None:
-    try:
-        import aiomqtt  # noqa: F401
-        import psycopg  # noqa: F401
-        import sqlalchemy  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(f"{_NEEDS_MORE} ({error})") from None

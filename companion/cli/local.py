@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 from companion.cli import show
 from companion.cli.terminal import (
     DONE,
-    FAILED,
     USAGE,
     AddCommand,
     Parser,
@@ -24,6 +23,7 @@ from companion.cli.terminal import (
     print_address,
     print_json,
     print_lines,
+    seconds,
     storage_path,
     within,
 )
@@ -35,15 +35,14 @@ if TYPE_CHECKING:
     from companion.links.serial.ports import SerialPort
 
 
-def add_command(add: AddCommand) -> None:
+def add_setup(add: AddCommand) -> None:
     parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
     option = parser.add_argument
     option("ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)")
-    words = "ask on a page there, for a phone (0.0.0.0:8191) or the board itself"
-    option("--page", metavar="ADDRESS:PORT", help=words)
+    option("--page", metavar="ADDRESS:PORT", help="ask on a page there, such as 0.0.0.0:8191 for a phone")
     option("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
     option("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
-    words = "a UDP port to listen to, instead of the usual ones; may be given again"
+    words = "a UDP port to listen to, in place of the usual ones; may be given again"
     option("--udp", type=within(1, 65535, int), action="append", metavar="PORT", help=words)
     option("--platform", metavar="WHERE", help="ground or deck")
     option("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
@@ -62,25 +61,31 @@ async def setup(options: argparse.Namespace) -> int:
 
 
 def add_commands(add: AddCommand) -> None:
-    for name, words in (
-        ("install-service", "start the companion at every boot: unit, udev rules, configuration"),
-        ("uninstall-service", "take that away again; configuration and records stay"),
-    ):
-        service = add(name, install, words)
-        service.set_defaults(installs=name == "install-service")
-        words = "below this folder, for packages (default /)"
-        service.add_argument("--root", type=_absolute, default=Path("/"), metavar="DIR", help=words)
-        words = "whose lib takes the unit (default /usr/local)"
-        service.add_argument("--prefix", type=Path, default=Path("/usr/local"), help=words)
-        if name == "install-service":
-            words = "the companion (default: the one that runs this)"
-            service.add_argument("--executable", metavar="PATH", help=words)
-    sub = add("report", report, "make a page (one HTML file) of a calibration: needs no daemon, no network")
-    sub.add_argument("record", nargs="?", type=within(1, 1e9, int), metavar="NUMBER", help="default: the latest")
-    sub.add_argument("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
-    sub.add_argument(
-        "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
-    )
+    add_setup(add)
+    option = add("run", run, "run the daemon in the foreground").add_argument
+    option("-v", "--verbose", action="store_true", help="log what happens in detail")
+    option = add("check", check, "check configuration, ports, sensors and autopilot; say what is wrong").add_argument
+    option("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
+    option = add("ports", ports, "list serial ports with their stable names").add_argument
+    words = "tell who speaks on these ports (default: all that nobody holds and no console uses) by listening at the"
+    words += " usual speeds, up to half a minute; not a byte is sent, but opening a port raises DTR, which starts an"
+    option("--listen", nargs="*", metavar="PORT", help=f"{words} Arduino anew")
+    words = "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it"
+    add("lua", lua, words)
+    installer = add("install-service", install, "start the companion at every boot: unit, udev rules, configuration")
+    installer.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
+    words = "take that away again; configuration and records stay"
+    for service in (installer, add("uninstall-service", install, words)):
+        service.set_defaults(installs=service is installer)
+        option = service.add_argument
+        option("--root", type=_absolute, default=Path("/"), metavar="DIR", help="for packages (default /)")
+        option("--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)")
+    words = "make a page (one HTML file) of a calibration: needs no daemon, no network"
+    option = add("report", report, words).add_argument
+    option("record", nargs="?", type=within(1, 1e9, int), metavar="NUMBER", help="default: the latest")
+    option("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
+    option("--storage", type=Path, metavar="DIR", help="folder with records/ (default: as in the configuration)")
+    add("web-token", web_token, "where the page is, and the token that its buttons need")
 
 
 def _absolute(text: str) -> Path:
@@ -88,11 +93,10 @@ def _absolute(text: str) -> Path:
 
 
 FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
-"""Options of the `setup` that `run` starts without a configuration; its output has the token of the page."""
 
 
 async def run(options: argparse.Namespace) -> int:
-    """`companion run`; without a configuration a page asks for it first."""
+    """Run the daemon; without a configuration a page asks for it first."""
     if not hasattr(options, "config") and not config_path(options).exists():
         await _first_run(config_path(options))
     load_config(options, profiles=True, forgiving=True)
@@ -102,13 +106,13 @@ async def run(options: argparse.Namespace) -> int:
 
 
 async def _first_run(path: Path) -> None:
-    """Ask for the configuration on a page, if this user may write it; else the daemon names the missing file."""
+    """Ask for the configuration on a page; without the right to write it, the daemon names the missing file."""
     from companion.cli import setup as session
     from companion.setup.draft import is_writable
 
     if is_writable(path):
         asks = Parser()
-        add_command(lambda *_: asks)
+        add_setup(lambda *_: asks)
         await session.setup(asks.parse_args(FIRST_RUN, argparse.Namespace(json=False)), goes_on=True)
 
 
@@ -117,24 +121,18 @@ async def ports(options: argparse.Namespace) -> int:
 
     found = list_ports()
     listened = None if options.listen is None else await _listen(options.listen, found)
-    if options.json:
-        answer: dict[str, object] = {"ports": [dataclasses.asdict(port) for port in found]}
-        if listened is not None:
-            answer["heard"] = {port: _heard(heard) for port, heard in listened.items()}
-        print_json(answer)
-        return DONE
-    if not options.listen:
-        print_lines(*show.port_lines(found))
+    answer: dict[str, object] = {"ports": [dataclasses.asdict(port) for port in found]}
+    lines = [] if options.listen else show.port_lines(found)
     if listened is not None:
         from companion.setup.survey import in_words
 
-        print_lines(*(f"{port}: {in_words(port, heard)}" for port, heard in listened.items()))
+        answer["heard"] = {port: _heard(heard) for port, heard in listened.items()}
+        lines += [f"{port}: {in_words(port, heard)}" for port, heard in listened.items()]
         print_lines("companion setup takes them into the configuration", error=True)
-    return DONE
+    return conclude(options, answer, lines, good=True)
 
 
 async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[str, Heard | str]:
-    """Find out who speaks on each port, or why that is not known."""
     from companion.links.serial.listening import listen_to_all, ports_to_try
 
     names = list(wanted) or ports_to_try(found)
@@ -193,11 +191,10 @@ async def check(options: argparse.Namespace) -> int:
 
     config = load_config(options, profiles=True)
     findings = await run_check(config, options.seconds, lambda words: print_lines(words, error=True))
-    good = all(finding.good for finding in findings)
-    reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)
-    state, found = "good" if good else "failed", [dataclasses.asdict(finding) for finding in findings]
-    answer = {"state": state, "reason": reason, "findings": found}
-    return conclude(options, answer, show.finding_lines(findings), good=good)
+    reason = show.problems(findings)
+    found = [dataclasses.asdict(finding) for finding in findings]
+    answer = {"state": "failed" if reason else "good", "reason": reason, "findings": found}
+    return conclude(options, answer, show.finding_lines(findings), good=not reason)
 
 
 async def install(options: argparse.Namespace) -> int:
@@ -209,12 +206,10 @@ async def install(options: argparse.Namespace) -> int:
     for step in (installing.install if options.installs else installing.uninstall)(target):
         done.append(step)
         print_lines(step.line(), error=options.json)
-    failed = [step for step in done if step.outcome == "failed"]
-    if options.json:
-        reason = "; ".join(f"{step.what}: {step.words}" for step in failed)
-        state = "failed" if failed else "done"
-        print_json({"state": state, "reason": reason, "steps": [dataclasses.asdict(step) for step in done]})
-    return FAILED if failed else DONE
+    reason = show.failures(done)
+    steps = [dataclasses.asdict(step) for step in done]
+    answer = {"state": "failed" if reason else "done", "reason": reason, "steps": steps}
+    return conclude(options, answer, (), good=not reason)
 
 
 async def report(options: argparse.Namespace) -> int:
@@ -227,19 +222,17 @@ async def report(options: argparse.Namespace) -> int:
     made = calibration_page(records, armings, damaged, datetime.datetime.now(tz=datetime.UTC))
     content = made.encode("utf-8", "replace")
     skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
+    path: Path | None = None
     if options.output == "-":
-        # As the file says of itself, whatever the terminal speaks.
+        # In the encoding that the file names, whatever the terminal's is.
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
     else:
         path = _save(options.output or "", f"companion-report-{records[-1][0]:06d}.html", content)
     if skipped:
         print_lines(f"companion: {skipped}", error=True)
-    if options.json:
-        print_json({"state": "done", "reason": skipped, "file": str(path)})
-    elif options.output != "-":
-        print_lines(path)
-    return DONE
+    answer = {"state": "done", "reason": skipped, "file": str(path)}
+    return conclude(options, answer, [path] if path is not None else (), good=True)
 
 
 def _save(output: str, name: str, content: bytes) -> Path:

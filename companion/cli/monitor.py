@@ -1,8 +1,7 @@
-"""`companion monitor`: the big word, its reason, the devices and the last result, until Ctrl-C.
+"""`companion monitor`: the state, its reason, the devices and the last result, until Ctrl-C.
 
-A terminal is redrawn in place with a handful of escape sequences that every terminal since the VT100 knows: neither
-curses nor a library is needed for that. Where there is no such terminal (TERM=dumb, a pipe) a line is printed
-whenever the state, a device, a warning or the last result changes.
+A terminal is redrawn in place with escape sequences that every terminal since the VT100 knows. Elsewhere (TERM=dumb, a
+pipe) a line is printed whenever the state, a device, a warning or the last result changes.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from companion.formats import Object, printable
 from companion.links.system.connection import ask
 
 SILENT_S: Final = 5.0
-"""A daemon that says nothing for so long stands still."""
+"""A daemon that is silent for longer hangs."""
 AGAIN_S: Final = 1.0
 
 _FIGURES: Final = re.compile(r"\d+([.,:]\d+)*")
@@ -34,7 +33,6 @@ _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 
 
 async def monitor(options: argparse.Namespace) -> int:
-    """Watch until Ctrl-C; a daemon that goes away is waited for."""
     path = load_config(options).control.path
     view: _Json | _Screen | _Lines
     if options.json:
@@ -64,24 +62,20 @@ async def monitor(options: argparse.Namespace) -> int:
     except asyncio.CancelledError:
         return DONE  # Ctrl-C is how one leaves
     finally:
-        view.close()
+        if isinstance(view, _Screen):
+            view.close()
 
 
 class _Json:
-    """One JSON object a line."""
-
     def show(self, status: Object) -> None:
         print_json(status)
 
     def gone(self, why: str) -> None:
         print_json({"state": "unreachable", "reason": why})
 
-    def close(self) -> None:
-        pass
-
 
 class _Lines:
-    """A line whenever its words change, with the time of day; other figures in it are no news."""
+    """Prints a line with the time of day whenever its words change; a change of figures alone is ignored."""
 
     def __init__(self) -> None:
         self._before: set[tuple[object, ...]] = set()
@@ -104,13 +98,8 @@ class _Lines:
                 print_lines(f"{time.strftime('%H:%M:%S')} {line}")
         self._before = set(lines)
 
-    def close(self) -> None:
-        pass
-
 
 class _Screen:
-    """The whole terminal, redrawn in place."""
-
     def __init__(self) -> None:
         self._colours = "NO_COLOR" not in os.environ
         self._last: Object | None = None
@@ -143,5 +132,5 @@ class _Screen:
 
 
 def _wrapped(line: str, width: int) -> list[str]:
-    """A line as the terminal holds it; what a wire may have slipped into it moves no cursor."""
+    """Wrap a line; control characters from outside are escaped."""
     return textwrap.wrap(printable(line), max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]

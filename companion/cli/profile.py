@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from companion.cli.desk import add_table_options
+from companion.cli.desk import add_table_options, log_lines
 from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.formats import Object, utc_now
@@ -20,14 +20,14 @@ from companion.samples import TRIADS, Triad
 if TYPE_CHECKING:
     from companion.config.sections import NoiseProfile
     from companion.estimation.noise.allan import AxisFit
-    from companion.lab.logs.still_log import StillLog
+    from companion.lab.still_log import StillLog
     from companion.storage.profiles import SavedProfile
 
 SHORT_S: Final = 1200
 _UNITS: Final[dict[Triad, tuple[float, str, int]]] = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
-def add_command(add: AddCommand) -> None:
+def add_commands(add: AddCommand) -> None:
     sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
@@ -41,8 +41,8 @@ def add_command(add: AddCommand) -> None:
 
 async def profile(options: argparse.Namespace) -> int:
     from companion.estimation.noise.allan import noise_profile
-    from companion.lab.logs.log_files import read_logs
-    from companion.lab.logs.still_log import NAME
+    from companion.lab.log_files import read_logs
+    from companion.lab.still_log import NAME
     from companion.storage.profiles import ProfileStore, check_name, given_profile
 
     store = compared = None
@@ -95,7 +95,7 @@ def _learn(
     from companion.lab.profile import fit_profile, rests, seconds_at_rest
     from companion.storage.profiles import FORMAT_VERSION, ProfileSource, SavedProfile
 
-    logs = [log for log in logs if not log.truncated]
+    logs = [log for log in logs if len(log.t_s)]
     if not logs:
         raise CalibrationRefusedError(
             "it was recorded in whole mrad/s and mg, cut toward zero: their steps hide the sensor's noise"
@@ -141,8 +141,7 @@ def _learn(
     used = []
     for file, log, still, whole in zip(files, logs, still_s, seconds, strict=True):
         lines.append(f"used of {file}: {still} of {whole} s")
-        lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
-        lines += [f"note: {note}" for note in log.notes]
+        lines += log_lines(log.left_out, log.notes)
         used.append({"seconds": whole, "still_s": still, "left_out": log.left_out, "notes": log.notes})
     answer = {
         "name": imu,
@@ -162,7 +161,6 @@ def _learn(
 
 
 def _table(fits: Sequence[AxisFit], learned: NoiseProfile, compared: NoiseProfile) -> list[str]:
-    """Show the fit of each axis, and both profiles."""
     table = [("", ["N, x sqrt(s)", "floor A", "K, / sqrt(s)"])]
     for column, fit in enumerate(fits):
         triad = TRIADS[column // 3]
@@ -178,7 +176,7 @@ def _table(fits: Sequence[AxisFit], learned: NoiseProfile, compared: NoiseProfil
 
 
 def _cell(fit: AxisFit, which: int, unit: float, digits: int) -> str:
-    """Write a figure with its standard error, or its upper limit where the recordings do not show it."""
+    """Format a figure with its standard error, or its upper limit where the recordings do not show it."""
     from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit

@@ -16,7 +16,7 @@ import msgspec
 
 from companion import config
 from companion.cli.asking import Asking, PageAsking
-from companion.cli.show import finding_lines
+from companion.cli.show import failures, finding_lines, problems
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
 from companion.config.sections import Config, Imu, Storage
@@ -38,18 +38,17 @@ WITHOUT: Final = {
 }
 CHECK_S: Final = 10.0
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
-"""1 mrad/s and 1 mg: the steps of SCALED_IMU2 and SCALED_IMU3."""
+"""1 mrad/s and 1 mg are the steps of SCALED_IMU2 and SCALED_IMU3."""
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
-    """`companion setup`; `goes_on`: the daemon starts after it, in this process."""
     if options.page is None:
         session = _Session(options, Asking(yes=options.yes, error=options.json))
-        await _to_the_end(session)
+        await session.run()
     else:
         async with PageAsking(_bind(options), _storage(options)) as asking:
             session = _Session(options, asking, goes_on=goes_on)
-            await _to_the_end(session)
+            await session.run()
             then = "the companion starts, and its own page follows" if goes_on else "this page closes"
             await asking.agrees(f"Read all of it? Then {then}.")
     if options.json:
@@ -73,23 +72,10 @@ def _storage(options: argparse.Namespace) -> Path:
         return Storage().path if path == config.DEFAULT_PATH else storage_beside(path)
 
 
-async def _to_the_end(session: _Session) -> None:
-    try:
-        await session.run()
-    except asyncio.CancelledError:
-        session.asking.say("", f"ended: {session.so_far}")
-        raise
-    except CompanionError as error:
-        kind = ConfigError if isinstance(error, ConfigError) else CompanionError
-        raise kind(f"{error}; {session.so_far}") from None
-
-
 class _Session:
-    """One run of `companion setup`."""
-
     def __init__(self, options: argparse.Namespace, asking: Asking, *, goes_on: bool = False) -> None:
         self.asking, self._goes_on = asking, goes_on
-        self.so_far = "nothing was written"
+        self._so_far = "nothing was written"
         self._options = options
         self._path = config_path(options)
         self.answer: dict[str, Any] = {
@@ -98,6 +84,17 @@ class _Session:
         }  # fmt: skip
 
     async def run(self) -> None:
+        """Ask, write and check; whatever ends it, say what was written so far."""
+        try:
+            await self._run()
+        except asyncio.CancelledError:
+            self.asking.say("", f"ended: {self._so_far}")
+            raise
+        except CompanionError as error:
+            kind = ConfigError if isinstance(error, ConfigError) else CompanionError
+            raise kind(f"{error}; {self._so_far}") from None
+
+    async def _run(self) -> None:
         say = self.asking.say
         if not drafting.is_writable(self._path):
             raise CompanionError(
@@ -110,7 +107,14 @@ class _Session:
             draft.keep_beside(self._path)
         if self._options.page is not None:
             draft.show_page(self._options.page)
-        given, parts = self._given(), _parts_given(self._options.part)
+        mountings = _named_values("--mounting", self._options.mounting, "gradienter=..., compass=... or imu=...", KINDS)
+        parts = _named_values("--part", self._options.part, "IMU=PART, such as fc=icm42688p")
+        asked = {
+            "vehicle.platform": self._options.platform,
+            "gradienter.law": self._options.law,
+            **{f"{device}.mounting": how for device, how in mountings.items()},
+        }
+        given = {key: words for key, words in asked.items() if words is not None}
         found = await self._listen(draft)
         await self._take_autopilot(draft, found)
         for kind in KINDS:
@@ -123,8 +127,9 @@ class _Session:
         elif not self._options.no_check:
             told = await _ask_autopilot(self.asking, draft, by_default=is_new)
         names = [imu["name"] for imu in draft.wanted["imu"]]
-        to_ask = [name for name in names if told.get(name) is None or part_key(name) in parts]
-        await self._ask(draft, list(draft.part_questions(to_ask)), parts)
+        to_ask = [name for name in names if told.get(name) is None or name in parts]
+        given = {part_key(name): part for name, part in parts.items()}
+        await self._ask(draft, list(draft.part_questions(to_ask)), given)
         draft.parsed()
         text = draft.result()
         self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
@@ -137,7 +142,7 @@ class _Session:
         else:
             say("", f"{self._path} says all this already.")
             self.answer["state"] = "unchanged"
-            self.so_far = f"{self._path} is as it was"
+            self._so_far = f"{self._path} is as it was"
         await self._finish(runs=daemon is not None)
 
     async def _begin(self) -> Draft:
@@ -153,16 +158,6 @@ class _Session:
         if not draft.is_new:
             self.asking.say(f"{self._path} is there: what it says holds where you answer nothing else.")
         return draft
-
-    def _given(self) -> dict[str, str]:
-        options = self._options
-        given = {"vehicle.platform": options.platform, "gradienter.law": options.law}
-        for words in options.mounting:
-            device, _, how = words.partition("=")
-            if device not in KINDS or not how:
-                raise ConfigError(f"--mounting: found {shown(words)}; allowed: gradienter=..., compass=... or imu=...")
-            given[f"{device}.mounting"] = how
-        return {key: words for key, words in given.items() if words is not None}
 
     async def _listen(self, draft: Draft) -> Survey:
         """Listen to all serial ports and UDP; send nothing."""
@@ -210,7 +205,7 @@ class _Session:
             await self.asking.ask(Question("Autopilot", "", draft.take_url))
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
-        """Choose a device that is heard; keep a configured one whose port somebody holds."""
+        """Choose a heard device; keep a configured one whose port somebody holds."""
         section, heard = draft.section(kind), found.devices(kind)
         if section is not None:
             port = section["port"]
@@ -232,7 +227,6 @@ class _Session:
             draft.take(kind, *named[chosen])
 
     async def _choose(self, what: str, names: Sequence[str]) -> str:
-        """Ask for one of several names; a single one is taken."""
         if len(names) == 1:
             self.asking.say(f"{what}: {names[0]}")
             return names[0]
@@ -268,7 +262,7 @@ class _Session:
 
     def _write(self, text: str) -> None:
         kept = drafting.put(self._path, text)
-        self.so_far = f"{self._path} is written"
+        self._so_far = f"{self._path} is written"
         self.asking.say(f"Written: {self._path}" + (f" (the old one: {kept.name})" if kept is not None else ""))
         if kept is not None:
             self.answer["kept"] = str(kept)
@@ -282,27 +276,21 @@ class _Session:
             self.asking.say("", "Not checked: a companion runs, and has the ports.")
         started = self._goes_on or await self._service(runs=runs)
         is_old = runs and not started and self.answer["state"] != "unchanged"
-        steps = list(
-            _next_steps(parsed, own_name(self._options), is_old=is_old, runs=runs or started, good=good, checks=checks)
-        )
+        command, runs = own_name(self._options), runs or started
+        steps = [*_next_steps(parsed, command, is_old=is_old, runs=runs, good=good, checks=checks)]
         self.answer["next"] = steps
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
 
     async def _check(self, parsed: Config) -> bool:
-        """Check as `companion check` does; write nothing."""
         from companion.daemon.process.check import run_check
 
         self.asking.say("", "Checking (it speaks with all of them now, and changes nothing):")
         findings = await run_check(parsed, CHECK_S)
         self.asking.say(*finding_lines(findings))
-        bad = [f"{finding.name}: {finding.words}" for finding in findings if not finding.good]
         self.answer["findings"] = [dataclasses.asdict(finding) for finding in findings]
-        if bad:
-            self.answer |= {"state": "failed", "reason": "; ".join(bad)}
-        return not bad
+        return self._note_failure(problems(findings))
 
     async def _service(self, *, runs: bool) -> bool:
-        """Offer the service; return whether it now runs with this file."""
         if self._path != config.DEFAULT_PATH or self._options.no_service or not installing.systemd_runs():
             return False
         what = "Restart the companion with it?" if runs else "Start the companion now, and at every boot?"
@@ -317,14 +305,16 @@ class _Session:
             steps.append(installing.InstallStep("service", "failed", str(error)))
             self.asking.say(str(error))
         self.answer["steps"] = [dataclasses.asdict(step) for step in steps]
-        failed = [f"{step.what}: {step.words}" for step in steps if step.outcome == "failed"]
-        if failed:
-            self.answer |= {"state": "failed", "reason": "; ".join(failed)}
-        return not failed
+        return self._note_failure(failures(steps))
+
+    def _note_failure(self, reason: str) -> bool:
+        if reason:
+            self.answer |= {"state": "failed", "reason": reason}
+        return not reason
 
 
 def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
-    """List the next steps; `is_old`: the running daemon has another configuration; `checks`: `good` was checked."""
+    """List the next steps; `is_old`: the running daemon has another configuration."""
     is_service = command == "companion"
     if not good:
         yield f"mend what is wrong above, then: {command} check"
@@ -352,19 +342,18 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
 # --- the IMUs of the autopilot
 
 
-def _parts_given(options: Sequence[str]) -> dict[str, str]:
-    """Read the --part options: answers by the keys of their questions."""
-    given = {}
-    for words in options:
-        name, _, part = words.partition("=")
-        if not part:
-            raise ConfigError(f"--part: found {shown(words)}; allowed: IMU=PART, such as fc=icm42688p")
-        given[part_key(name)] = part
-    return given
+def _named_values(option: str, given: Sequence[str], allowed: str, names: Sequence[str] = ()) -> dict[str, str]:
+    found = {}
+    for words in given:
+        name, _, value = words.partition("=")
+        if not value or (names and name not in names):
+            raise ConfigError(f"{option}: found {shown(words)}; allowed: {allowed}")
+        found[name] = value
+    return found
 
 
 async def _daemon_status(config: Config) -> Object | None:
-    """Ask the running daemon for its status; None: none runs; empty: one runs and refuses to answer."""
+    """Ask the running daemon for its status; None: none runs; empty: one refuses to answer."""
     from companion.links.system.connection import ask
 
     found: Object = {}
@@ -377,7 +366,7 @@ async def _daemon_status(config: Config) -> Object | None:
 
 
 async def _ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
-    """Offer the IMUs that the autopilot has besides the configured ones; return the parts of all that answer, by name.
+    """Offer the autopilot's IMUs that are not configured; return the parts of all that answer, by name.
 
     Nothing is written to the autopilot. `by_default`: the answer to the offer where nobody gives one.
     """

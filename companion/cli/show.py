@@ -15,6 +15,7 @@ from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.daemon.process.check import CheckLine
+    from companion.installation.install import InstallStep
     from companion.links.serial.ports import SerialPort
 
 
@@ -23,7 +24,6 @@ _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
 
 def record_lines(record: Object) -> list[str]:
-    """Show a record: outcome, pose, one block for each IMU."""
     lines = [f"{record['state'].upper()} after {record['duration_s']:.0f} s: {record['reason']}"]
     pose = record.get("pose")
     if pose is not None:
@@ -49,10 +49,8 @@ def _magnetic_lines(magnetic: Object | None) -> list[str]:
 
 
 def _imu_lines(imu: Object) -> list[str]:
-    temperature = imu["temperature_degc"]
-    lines = [
-        f"{imu['name']}: {imu['samples']} samples" + (f", {temperature:.1f} degC" if temperature is not None else "")
-    ]
+    degc = imu["temperature_degc"]
+    lines = [f"{imu['name']}: {imu['samples']} samples" + (f", {degc:.1f} degC" if degc is not None else "")]
     for triad, unit, scale, form, bias, sigma, left in (
         ("gyro", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s", "residual_gyro_rad_s"),
         ("accel", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2", "residual_accel_m_s2"),
@@ -116,16 +114,14 @@ def status_lines(status: Object) -> list[str]:
 
 
 def undo_line(steps: Sequence[Object]) -> str:
-    """Name the step that the next undo restores, and the number of steps after it."""
     if not steps:
         return "undo: nothing is left to take back"
     step, more = steps[0], len(steps) - 1
     when = f" of {_minute(step['at'])} UTC" if step["at"] else ""
     several = f" and all since {_minute(step['since'])}" if step["since"] != step["at"] else ""
-    words = (
-        f"the next undo takes back: {step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters"
-    )
-    return words + (f"; {more} more after it" if more else "")
+    further = f"; {more} more after it" if more else ""
+    words = f"{step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters{further}"
+    return f"the next undo takes back: {words}"
 
 
 def _minute(iso: str) -> str:
@@ -135,24 +131,19 @@ def _minute(iso: str) -> str:
 def _reading_lines(status: Object) -> list[str]:
     lines, readings, alignment = [], status["readings"], status["alignment"]
     if readings["gradienter_x_deg"] is not None:
-        lines.append(
-            f"gradienter reads: x {readings['gradienter_x_deg']:+.3f} y {readings['gradienter_y_deg']:+.3f} deg"
-        )
+        x, y = readings["gradienter_x_deg"], readings["gradienter_y_deg"]
+        lines.append(f"gradienter reads: x {x:+.3f} y {y:+.3f} deg")
     if readings["compass_deg"] is not None:
         lines.append(f"compass reads: {readings['compass_deg']:.1f} deg")
     if alignment is not None and alignment["in_force"]:
-        x, y = alignment["offset_deg"]
-        lines.append(
-            f"gradienter zero: x {x:+.3f} y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, measured"
-            f" {alignment['measured_at'][:10]}"
-        )
+        (x, y), measured = alignment["offset_deg"], f"measured {alignment['measured_at'][:10]}"
+        lines.append(f"gradienter zero: x {x:+.3f} y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, {measured}")
     elif alignment is not None:
         lines.append(f"alignment not used: {alignment['unused_because']}")
     return lines
 
 
 def end_lines(status: Object) -> list[str]:
-    """Show the address of the page, and the end of the last calibration."""
     page, last = status["page"], status["last"]
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
     found = "none yet"
@@ -162,7 +153,6 @@ def end_lines(status: Object) -> list[str]:
 
 
 def monitor_lines(status: Object) -> list[str]:
-    """Show what stands below the headline on the monitor's screen."""
     lines = []
     if (percent := status["progress"]) is not None:
         lines += [f"[{'#' * (percent * _BAR // 100):.<{_BAR}}] {percent} %", ""]
@@ -199,8 +189,15 @@ def finding_lines(findings: Sequence[CheckLine]) -> list[str]:
     return _judged([(finding.verdict, finding.name, finding.words) for finding in findings])
 
 
+def problems(findings: Sequence[CheckLine]) -> str:
+    return "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)
+
+
+def failures(steps: Sequence[InstallStep]) -> str:
+    return "; ".join(f"{step.what}: {step.words}" for step in steps if step.outcome == "failed")
+
+
 def _judged(rows: Sequence[tuple[str, str, str]]) -> list[str]:
-    """Align rows of verdict, name and words."""
     width = max(len(name) for _, name, _ in rows)
     return [f"{verdict:7}  {name if name != verdict else '':{width}}  {words}" for verdict, name, words in rows]
 
@@ -213,7 +210,7 @@ def history_lines(
     flights: Sequence[Object] = (),
     interrupted: Sequence[Object] = (),
 ) -> list[str]:
-    """Show the history, newest first in each section; `numbers` of the records, for `companion report`."""
+    """Show the history, newest first in each section; `companion report` takes the `numbers` of the records."""
     lines = ["no calibrations yet"]
     if records:
         lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
@@ -242,7 +239,6 @@ def history_lines(
 
 
 def _interrupted(one: Object) -> str:
-    """Show an interrupted write, with the minute of the restore."""
     ended = f", {_minute(one['ended_at'])}" if one["ended_at"] else ""
     what, number = one["what"] or "write", len(one["parameters"])
     began_at = (one["began_at"] or one["ended_at"] or "time unknown")[:19]
@@ -254,7 +250,6 @@ def _flown(flight: Flight) -> str:
 
 
 def by_hand_words(done: Object) -> str:
-    """Give the result of an alignment, and whether its parameters are in force."""
     words = f"{done['what']}{' failed' if done['state'] == 'failed' else ''}: {done['reason']}"
     if not (number := len(done["written"])):
         return words
@@ -273,7 +268,6 @@ def _what_became(record: Object) -> str:
 
 
 def temperature_lines(imus: Sequence[Object]) -> list[str]:
-    """Show by IMU the known biases over temperature, and the gyros' now and at a power-up."""
     lines: list[str] = []
     for imu in imus:
         lines.append(f"{imu['imu']}: {imu['summary']}")

@@ -10,7 +10,7 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
 from typing import Any, Final, NoReturn
 from urllib.parse import quote
@@ -18,7 +18,7 @@ from urllib.parse import quote
 from companion import commands, config
 from companion.config.sections import Config, NoiseProfile, Storage
 from companion.config.words import COMMAND_LINE, refusal_of_words
-from companion.errors import ConfigError
+from companion.errors import CompanionError, ConfigError
 from companion.formats import Object, printable
 
 DONE: Final = 0
@@ -26,13 +26,16 @@ FAILED: Final = 1
 USAGE: Final = 2
 NO_DAEMON: Final = 3
 
-Command = Callable[[argparse.Namespace], Awaitable[int]]
+Command = Callable[[argparse.Namespace], Coroutine[Any, Any, int]]
 AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
-"""Adds a command to a parser: its name, function and line of help."""
+
+
+class DaemonRefusedError(CompanionError):
+    """The daemon has refused a request."""
 
 
 def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
-    """Print lines without characters that a terminal obeys; everything on the terminal is printed here."""
+    """Print lines without control characters; all output to the terminal goes through here."""
     stream = sys.stderr if error else sys.stdout
     for line in lines:
         stream.write(printable(str(line)) + end)
@@ -40,7 +43,6 @@ def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
 
 
 def print_address(url: str, token: str | None) -> None:
-    """Print the address of a page with the token of its buttons, in words and as a QR code."""
     if token is None:
         print_lines(f"{url} needs no token: only this board can reach it")
         return
@@ -61,7 +63,6 @@ def print_address(url: str, token: str | None) -> None:
 
 
 def _code(text: str) -> list[str]:
-    """A QR code of a text: lines for a terminal, of blocks that are light."""
     import segno
 
     drawn = io.StringIO()
@@ -70,9 +71,9 @@ def _code(text: str) -> list[str]:
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:
-    """Load the configuration of -c, or the default one, with or without the saved noise profiles that it names.
+    """Load the configuration, with or without the saved noise profiles that it names.
 
-    A client of the daemon may not be allowed to read those. `forgiving`: a damaged one is no reason to refuse.
+    A client of the daemon may not be allowed to read those. `forgiving`: load without a damaged one.
     """
 
     def saved(directory: Path, name: str) -> NoiseProfile | str:
@@ -84,7 +85,7 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False, forgivin
 
 
 def storage_path(options: argparse.Namespace) -> Path:
-    """Give the storage directory of the configuration; without -c and a default configuration, the usual one."""
+    """Return the storage directory of the configuration; without any configuration, the default one."""
     try:
         return load_config(options).storage.path
     except ConfigError:
@@ -106,21 +107,16 @@ def own_name(options: argparse.Namespace) -> str:
 def how_to_start(options: argparse.Namespace) -> str:
     from companion.installation.install import is_service
 
-    serves = is_service() and config_path(options) == config.DEFAULT_PATH
-    return f"; start it with: {'sudo systemctl start companion' if serves else f'{own_name(options)} run'}"
+    is_served = is_service() and config_path(options) == config.DEFAULT_PATH
+    return f"; start it with: {'sudo systemctl start companion' if is_served else f'{own_name(options)} run'}"
 
 
 class _Removed(argparse.Action):
-    """Refuses an option that former versions had."""
-
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        """Refuse the option with its version and its remedy."""
         parser.error(str(refusal_of_words(parser.prog, self.option_strings[0])))
 
 
 class Parser(argparse.ArgumentParser):
-    """Says a usage error in one line, and what was probably meant."""
-
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         for command, _, option in (words.partition(" --") for words in COMMAND_LINE):
@@ -128,12 +124,10 @@ class Parser(argparse.ArgumentParser):
                 self.add_argument(f"--{option}", action=_Removed, nargs="?", help=argparse.SUPPRESS)
 
     def error(self, message: str) -> NoReturn:
-        """Say a usage error in one line."""
         print_lines(f"{self.prog}: {message} (see {self.prog} --help)", error=True)
         self.exit(USAGE)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Name the nearest command or choice, as the configuration does for its keys."""
         if action.choices is None or value in action.choices or value is argparse.SUPPRESS:
             return
         if (refusal := refusal_of_words(self.prog, str(value))) is not None:
@@ -145,8 +139,6 @@ class Parser(argparse.ArgumentParser):
 
 
 def adder(to: argparse._SubParsersAction[Parser], *parents: Parser) -> AddCommand:
-    """Return a function that adds commands with the options of `parents`."""
-
     def add(name: str, command: Command, words: str) -> Parser:
         sub = to.add_parser(name, parents=parents, help=words, description=words)
         sub.set_defaults(command=command)
@@ -156,7 +148,7 @@ def adder(to: argparse._SubParsersAction[Parser], *parents: Parser) -> AddComman
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
-    """Make the type of an argument that is a number within limits; with int a whole one."""
+    """Make the type of an argument: a number within limits; with int a whole one."""
 
     def parsed(text: str) -> float:
         try:
@@ -171,12 +163,10 @@ def within(least: float, most: float, kind: type[float] = float, unit: str = "")
 
 
 seconds: Final = within(1e-3, 1e6, unit=" s")
-"""The type of an argument that is a time in seconds."""
 _ARGUMENTS: Final = {float: seconds, int: within(1, 1e6, int)}
 
 
 def add_fields(parser: argparse.ArgumentParser, kind: type[commands.Command], by: commands.Interface) -> None:
-    """Add the options of a command, as far as an interface may set its fields."""
     groups: dict[str, argparse._ActionsContainer] = {}
     for name, field in kind.fields(by).items():
         to: argparse._ActionsContainer = parser
@@ -201,13 +191,11 @@ def add_fields(parser: argparse.ArgumentParser, kind: type[commands.Command], by
 
 
 def request_of(options: argparse.Namespace, kind: type[commands.Command]) -> Object:
-    """Return the request that the options of a command make; it says nothing of what was not given."""
     given = {name: getattr(options, name, None) for name in kind.fields()}
     return {"command": kind.name(), **{name: value for name, value in given.items() if value is not None}}
 
 
 def conclude(options: argparse.Namespace, answer: Any, lines: Iterable[object], *, good: bool) -> int:
-    """Print a command's result, as JSON or as lines for people; gives the exit code."""
     if options.json:
         print_json(answer)
     else:

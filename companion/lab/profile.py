@@ -1,6 +1,6 @@
 """A noise profile from recordings of an IMU at rest: still stretches, a fit of each axis, one model for each triad.
 
-A figure that the recordings are too short for is borrowed from another profile, as far as the recordings allow it.
+A figure that the recordings are too short for is borrowed from another profile, within the bounds that they show.
 """
 
 from __future__ import annotations
@@ -24,20 +24,18 @@ from companion.physics.frames import Floats
 from companion.samples import TRIADS, rows_of
 
 MIN_SECONDS: Final = 16
-"""Least seconds of a stretch: a shorter one shows nothing of what averaging leaves."""
 LEAST_STILL_S: Final = 60
-"""Least seconds at rest: a calibration measures as much itself."""
+"""Least time at rest in all; a calibration measures as long itself."""
 _MIN_GOOD: Final = 10
 _NAMES: Final = ("N", "B", "K")
 
 
 Rest = tuple[NDArray[np.int64], Floats]
-"""One stretch at rest: seconds (m,) of the recording's clock, ascending, without those that the gate rejected; means
-(m, 6), gyro in rad/s and accelerometer in m/s^2, in the IMU's own axes."""
+"""One stretch at rest: seconds (m,) that the gate accepted, ascending; means (m, 6) in rad/s and m/s^2, IMU axes."""
 
 
 def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
-    """Sum up every whole second of a recording, without the first and the last; arguments as for `rests`."""
+    """Average every whole second of a recording, without the first and the last; arguments as for `rests`."""
     finite = np.isfinite(t_s) & np.isfinite(readings).all(axis=1)
     t_s, readings = t_s[finite], readings[finite]
     slot_of = np.floor(t_s).astype(np.int64)
@@ -51,12 +49,11 @@ def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
 def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> tuple[list[Rest], int, str]:
     """Find the stretches of a recording in which the IMU lay still, by the daemon's gate.
 
-    Times (n,) ascend; readings are (n, 6), gyro in rad/s and accelerometer in m/s^2; rows that are not finite are left
-    out. `profile` is the noise that the gate allows before it has learned.
+    Times (n,) ascend; readings are (n, 6) in rad/s and m/s^2; rows that are not finite are left out. `profile` is the
+    noise that the gate allows before it has learned.
 
     Returns:
-        The stretches, the number of whole seconds in the recording, and the most frequent reason of the rejected ones,
-        in the words of the first; empty: none was rejected.
+        The stretches, the number of whole seconds, and the commonest reason of a rejection; empty: none was rejected.
     """
     batches = seconds_of(t_s, readings)
     own = OwnNoise(at_rest=True)
@@ -98,7 +95,6 @@ def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> tu
 
 
 def seconds_at_rest(stretches: Iterable[Rest]) -> int:
-    """Count the seconds of stretches."""
     return sum(len(slots) for slots, _ in stretches)
 
 
@@ -109,7 +105,7 @@ def fit_profile(
 
     Returns:
         The profile; the fits of gyro x y z and accelerometer x y z, in rad/s or m/s^2; the figures borrowed from
-        `fallback`, because the recordings do not show them, such as "gyro K".
+        `fallback`, such as "gyro K".
 
     Raises:
         CalibrationRefusedError: too little at rest, or an axis that never changes.
@@ -131,7 +127,7 @@ def fit_profile(
 
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:
-    """Choose one model that promises too much for none of three axes; return it and the figures that no axis shows."""
+    """Choose the model that promises too much for none of three axes, and list the figures that no axis shows."""
     other = fallback.white, fallback.flicker, fallback.walk
     chosen, unknown = [0.0, 0.0, 0.0], []
     for which in range(3):

@@ -42,15 +42,14 @@ _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
 
 
 Numbered = Sequence[tuple[int, Record]]
-"""Calibrations of one aircraft with their numbers, oldest first; the page is of the last."""
+"""Calibrations of one aircraft with their numbers, oldest first; the page shows the last."""
 
 
 def read_material(directory: Path, wanted: int | None) -> tuple[Numbered, list[ArmingRecord], list[str]]:
-    """Read the content of a page by a calibration's number; None: the latest.
+    """Read a calibration by its number; None: the latest.
 
     Returns:
-        That calibration, last, with the earlier ones; the armings while it was in force, oldest first; problems with
-        damaged files.
+        The calibration, last, with the earlier ones; the armings while it was active, oldest first; damaged files.
     """
     store, records = RecordStore(directory), directory / "records"
     try:
@@ -91,19 +90,16 @@ def read_material(directory: Path, wanted: int | None) -> tuple[Numbered, list[A
 def calibration_page(
     records: Numbered, armings: Sequence[ArmingRecord], problems: Sequence[str], now: datetime.datetime
 ) -> str:
-    """Make the page of the last of the records."""
     number, record = records[-1]
-    imus = record.imus[:MAX_IMUS]
+    more = len(record.imus) - MAX_IMUS
     return page(
         f"Calibration {number}, {moment(record.started_at)}",
         now,
         _headline(number, record),
         damaged(problems),
         _warnings(record),
-        *(_imu(imu) for imu in imus),
-        card("caution", f"{len(record.imus) - MAX_IMUS} more IMUs are not shown.")
-        if len(record.imus) > MAX_IMUS
-        else None,
+        *(_imu(imu) for imu in record.imus[:MAX_IMUS]),
+        card("caution", f"{more} more IMUs are not shown.") if more > 0 else None,
         _written(record),
         join(tag("h2", "Armed with it"), arming_items(map(_ARMED, armings))) if armings else None,
         _pose(record),
@@ -153,17 +149,12 @@ def _warnings(record: Record) -> Markup | None:
 
 def _imu(imu: ImuRecord) -> Markup:
     temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
+    is_corrected = imu.residual_gyro_rad_s or imu.residual_accel_m_s2
+    residual = " residual: error of its output before this write." if is_corrected else None
     return join(
         tag("h2", f"IMU {imu.name}"),
         tag("p", f"{imu.samples} samples, {temperature}", class_="soft"),
-        tag(
-            "p",
-            "σ use: one sigma for the next minutes. σ stat: what averaging left.",
-            " residual: error of its output before this write."
-            if imu.residual_gyro_rad_s or imu.residual_accel_m_s2
-            else None,
-            class_="soft",
-        ),
+        tag("p", "σ use: one sigma for the next minutes. σ stat: what averaging left.", residual, class_="soft"),
         tag("div", *(_triad(imu, triad) for triad in TRIADS), class_="pairs"),
     )
 
@@ -177,15 +168,8 @@ def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     rows = []
     for k in range(3):
         value, sigma = with_sigma(bias[k], use[k], unit)
-        rows.append(
-            row(
-                AXES[k],
-                value,
-                f"±{sigma}",
-                with_sigma(0.0, stat[k], unit)[1],
-                with_sigma(left[k], use[k], unit)[0] if left else None,
-            )
-        )
+        residual = with_sigma(left[k], use[k], unit)[0] if left else None
+        rows.append(row(AXES[k], value, f"±{sigma}", with_sigma(0.0, stat[k], unit)[1], residual))
     heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]
     held = card("caution", "Held back: measured, not written. What was in force before still is.")
     return tag(
@@ -210,13 +194,8 @@ def _written(record: Record) -> Markup | None:
             class_, _ = _OUTCOMES[one.outcome]
             head = tag("td", name, ": ", tag("strong", outcome_word(one.outcome), class_=class_), colspan="3")
             values = (("before", one.before), ("after", one.after), ("read back", one.read_back))
-            rows += [
-                row(head, class_="name"),
-                row(
-                    *(tag("td", tag("small", words), _setting(value)) for words, value in values),
-                    class_="values",
-                ),
-            ]
+            cells = [tag("td", tag("small", words), _setting(value)) for words, value in values]
+            rows += [row(head, class_="name"), row(*cells, class_="values")]
         parts += [tag("h3", f"IMU {imu.name}"), tag("table", *rows, class_="setting")]
     parts += [tag("p", f"{outcome_word(outcome)}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in sorted(seen)]
     return tag("section", *parts)
@@ -251,18 +230,16 @@ def _angle(value: float | None, sigma: float | None, sign: str) -> str:
 
 def _drift(records: Numbered) -> Markup:
     number, record = records[-1]
-    names = [imu.name for imu in record.imus[:MAX_IMUS]] or list(
-        dict.fromkeys(imu.name for _, one in records for imu in one.imus)
-    )[:MAX_IMUS]
+    names = [imu.name for imu in record.imus] or [imu.name for _, one in records for imu in one.imus]
     parts: list[Child] = [tag("h2", "Biases up to now")]
-    for name in names:
+    for name in [*dict.fromkeys(names)][:MAX_IMUS]:
         figures: list[Child] = []
         for triad in TRIADS:
             points = history(records, name, triad)
             if len(points) < 2:
                 continue
             plots = drift(points, triad, name=f"{name} {NAMES[triad].lower()}", this=number)
-            figures.append(tag("div", tag("h3", NAMES[triad]), plots or card("", "No time is known of them.")))
+            figures.append(tag("div", tag("h3", NAMES[triad]), plots))
         if figures:
             parts += [tag("h3", f"IMU {name}"), tag("div", *figures, class_="pairs")]
     if len(parts) == 1:

@@ -1,8 +1,8 @@
 """HTML and plots in SVG, built from parts that are escaped unless they are markup already.
 
-Names, reasons and warnings come from files and from the autopilot: nothing of them may become a tag, and no invisible
-character may turn the reading direction of what stands beside it. Plots are drawn in classes (`sx`, `sy`, `sz`, ...):
-colours, dark and print are the style sheet's, and series differ by the shape of their markers as well.
+Names, reasons and warnings come from files and from the autopilot: none of them may become a tag, and no invisible
+character may turn the reading direction of the text beside it. Plots are drawn in classes (`sx`, `sy`, `sz`, ...): the
+style sheet has the colours; series differ by the shape of their markers as well.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 
 MAX_TEXT: Final = 600
-"""The most characters of one piece of text: a page stays bounded whatever a file holds."""
+"""Most characters of one piece of text: a page stays bounded whatever a file holds."""
 
 # Controls (but line breaks and tabs), direction marks and overrides, zero-width characters, lone surrogates.
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
@@ -30,20 +30,19 @@ _MARK: Final = 3.6
 _MOST: Final = 1e12
 
 Pair = tuple[float, float]
+Dot = tuple[float, float, float]
+"""Place on both axes, and half the length of the bar."""
 
 
 class Markup(str):
-    """Text that is HTML already."""
-
     __slots__ = ()
 
 
 Child = str | None
-"""A plain `str` is text and is escaped; None is nothing."""
+"""A plain `str` is escaped, `Markup` is HTML already, None adds nothing."""
 
 
 def text(words: str) -> Markup:
-    """Text as it may stand between tags and in quoted attributes; None of it becomes a tag."""
     if isinstance(words, Markup):
         return words
     if len(words) > MAX_TEXT:
@@ -52,12 +51,11 @@ def text(words: str) -> Markup:
 
 
 def join(*children: Child) -> Markup:
-    """Parts one after the other."""
     return Markup("".join(text(child) for child in children if child is not None))
 
 
 def tag(element: str, /, *children: Child, **attributes: str | float | None) -> Markup:
-    """An element; `class_` is class, other underscores in attribute names become dashes, None leaves one out."""
+    """Make an element; `class_` is class, other underscores in attribute names become dashes, None leaves one out."""
     given = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{text(value if isinstance(value, str) else str(value))}"'
         for key, value in attributes.items()
@@ -69,7 +67,6 @@ def tag(element: str, /, *children: Child, **attributes: str | float | None) -> 
 
 
 def row(*cells: Child, class_: str | None = None) -> Markup:
-    """A row of a table, of cells, and of words to be put into one; None is no cell."""
     return tag("tr", *(one if isinstance(one, Markup | None) else tag("td", one) for one in cells), class_=class_)
 
 
@@ -77,19 +74,16 @@ def row(*cells: Child, class_: str | None = None) -> Markup:
 
 
 class Axis(msgspec.Struct, frozen=True):
-    """A range of values, with the places that are written at it."""
-
     low: float
     high: float
     ticks: tuple[tuple[float, str], ...]
 
     def share(self, value: float) -> float:
-        """0 at the low end, 1 at the high end; what lies outside is moved to the end."""
         return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
 
 
 def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Axis:
-    """A linear axis around the values, `least` wide at least: a scatter of nothing is not blown up to fill the plot."""
+    """Make a linear axis around the values, at least `least` wide: tiny scatter must not fill the plot."""
     known = [value for value in values if abs(value) < _MOST] or [0.0]
     low, high = min(known), max(known)
     width = max(high - low, least, 1e-4 * max(abs(low), abs(high)), 1e-9)
@@ -105,14 +99,13 @@ def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Ax
 
 
 def in_order(labels: Sequence[str]) -> Axis:
-    """Make an axis on which each label has the place of its number, counted from 0; at most four are written."""
     every = math.ceil(len(labels) / 4)
     ticks = tuple((float(k), labels[k]) for k in range(0, len(labels), every))
     return Axis(-0.5, len(labels) - 0.5, ticks)
 
 
 def dates(values: Sequence[float]) -> Axis:
-    """Make an axis of UTC times, in seconds since 1970, in their order; within one day the labels are times of day."""
+    """Make an axis of UTC times (s since 1970) in their order; within one day the labels are times of day."""
     moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
     form = "%H:%M" if len({each.date() for each in moments}) == 1 else "%-d %b %y"
     return in_order([each.strftime(form) for each in moments])
@@ -124,10 +117,10 @@ def _nice(step: float) -> float:
 
 
 class Plot:
-    """One frame with axes, of that height, the whole 360 wide; what is drawn first lies below.
+    """One frame with axes; what is drawn first lies below.
 
-    Without an `x_label` no ticks are written either, for a plot with another one below it; empty: only these. `name`
-    is what a screen reader says, `told` what it shows, in words.
+    Without an `x_label` there are no ticks either, for a plot with another one below it; empty: ticks only. `name` and
+    `told` are for a screen reader.
     """
 
     def __init__(
@@ -137,7 +130,7 @@ class Plot:
         *,
         name: str,
         told: str = "",
-        height: float = 96.0,
+        height: float,
         x_label: str | None = None,
         y_label: str = "",
     ) -> None:
@@ -148,46 +141,42 @@ class Plot:
         self._parts: list[Markup] = []
 
     def at(self, x: float, y: float) -> Pair:
-        """Return the place of a point in the picture."""
         across = _LEFT + self._x.share(x) * (WIDTH - _LEFT - _RIGHT)
         return across, self._top + (1.0 - self._y.share(y)) * self._height
 
     def line(self, points: Sequence[Pair], class_: str) -> None:
-        """Join points."""
         if len(points) > 1:
-            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
+            self._below.append(_path(self._course(points), class_))
 
-    def area(self, ends: Sequence[tuple[float, float, float]], class_: str) -> None:
-        """Fill what lies between two lines, of (x, low, high)."""
-        if len(ends) > 1:
-            around = [*((x, low) for x, low, _ in ends), *((x, high) for x, _, high in reversed(ends))]
-            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in around) + "z", class_))
+    def area(self, dots: Sequence[Dot], class_: str) -> None:
+        if len(dots) > 1:
+            around = [*((x, y - by) for x, y, by in dots), *((x, y + by) for x, y, by in reversed(dots))]
+            self._below.append(_path(f"{self._course(around)}z", class_))
+
+    def _course(self, points: Sequence[Pair]) -> str:
+        return "M" + "L".join(_xy(*self.at(*point)) for point in points)
 
     def upright(self, x: float, class_: str) -> None:
-        """A line from below to above."""
         self._below.append(_path(f"M{_xy(*self.at(x, self._y.low))}V{_n(self._top)}", class_))
 
-    def points(self, points: Sequence[Pair], class_: str, spans: Sequence[Pair]) -> None:
-        """Markers: `sy` (squares), `sz` (triangles) or others (circles), each with an upright bar over its span."""
-        bars: list[str] = []
-        for (x, _), (low, high) in zip(points, spans, strict=True):
-            across, bottom = self.at(x, low)
-            bars.append(f"M{_n(across)} {_n(bottom)}V{_n(self.at(x, high)[1])}")
+    def points(self, dots: Sequence[Dot], class_: str) -> None:
+        """Draw markers: `sy` (squares), `sz` (triangles) or others (circles), each with a bar."""
+        ends = [(self.at(x, y - by), self.at(x, y + by)) for x, y, by in dots]
+        bars = [f"M{_xy(*bottom)}V{_n(top)}" for bottom, (_, top) in ends]
         self._parts.append(_path("".join(bars), f"bar {class_}"))
+        places = [self.at(x, y) for x, y, _ in dots]
         if class_ not in {"sy", "sz"}:
             # A round end of a line without length: a quarter of the characters that a circle takes.
-            self._parts.append(_path("".join(f"M{_xy(*self.at(*point))}h.01" for point in points), f"dot {class_}"))
+            self._parts.append(_path("".join(f"M{_xy(*place)}h.01" for place in places), f"dot {class_}"))
             return
         marker = _square if class_ == "sy" else _triangle
-        self._parts.append(_path("".join(marker(*self.at(*point)) for point in points), f"mark {class_}"))
+        self._parts.append(_path("".join(marker(*place) for place in places), f"mark {class_}"))
 
     def ring(self, x: float, y: float) -> None:
-        """Draw a ring around a point."""
         across, height = self.at(x, y)
         self._parts.append(tag("circle", cx=_n(across), cy=_n(height), r=8, class_="ring"))
 
     def svg(self) -> Markup:
-        """The element."""
         bottom = self._top + self._height
         below = 6.0 if self._x_label is None else _TICKS_HEIGHT + _LABEL_HEIGHT * bool(self._x_label)
         grid: list[Markup] = []
@@ -226,7 +215,6 @@ class Plot:
 
 
 def _path(course: str, class_: str) -> Markup:
-    """A path; its course is numbers of our own, of any length."""
     return tag("path", d=Markup(course), class_=class_)
 
 
@@ -244,6 +232,6 @@ def _xy(x: float, y: float) -> str:
 
 
 def _n(value: float) -> str:
-    """A tenth of a unit is a tenth of a pixel."""
+    """Format to a tenth of a unit, a tenth of a pixel."""
     found = f"{value:.1f}"
     return found.removesuffix(".0") if found != "-0.0" else "0"

@@ -14,7 +14,7 @@ import msgspec
 from companion import __version__
 from companion.estimation.records.record import Record
 from companion.physics.units import UNITS
-from companion.report.markup import Child, Markup, Plot, dates, in_order, join, linear, tag
+from companion.report.markup import Child, Dot, Markup, Plot, dates, in_order, join, linear, tag
 from companion.samples import TRIADS, Triad, Vector
 
 if TYPE_CHECKING:
@@ -24,25 +24,23 @@ NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
 AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
-"""The largest value in a plot (SI units): what is beyond comes from a damaged file and must not squash the rest."""
+"""Largest value in a plot (SI): a larger one comes from a damaged file, and must not squash the rest."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
-"""The most IMUs shown: three of an autopilot and our own. More are mentioned: a page stays below half a megabyte."""
+"""Three of an autopilot and our own; others are mentioned only: a page stays below half a megabyte."""
 
 # No script, nothing fetched, nothing sent: what is not inline does not exist.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 _STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
 _LEAST_K: Final = 4.0
-"""Least width of an axis, so that a tenth of a kelvin does not fill it."""
+"""Least width of an axis: a tenth of a kelvin must not fill it."""
 
-_Dot = tuple[float, Vector, Vector]
-"""Temperature, bias and sigma of one triad."""
+_Window = tuple[float, Vector, Vector]
 
 
 def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
-    """Make a whole file."""
     foot = tag(
         "p",
         f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} {source}. All axes:"
@@ -61,17 +59,15 @@ def page(title: str, now: datetime.datetime, *body: Child, source: str = "from t
 
 
 def card(kind: str, *children: Child) -> Markup:
-    """A box; kind "alarm", "caution", "fine" or ""."""
+    """Make a box; kind "alarm", "caution", "fine" or ""."""
     return tag("div", *children, class_=f"card {kind}".strip())
 
 
 def moment(iso: str) -> str:
-    """A time as people read it."""
     return f"{iso[:10]} {iso[11:16]} UTC" if len(iso) >= 16 else iso
 
 
 def damaged(problems: Sequence[str]) -> Markup | None:
-    """List files that could not be read, the first ten."""
     more = [f"and {len(problems) - 10} more"] if len(problems) > 10 else []
     lines = [tag("li", problem) for problem in (*problems[:10], *more)]
     head = tag("p", "These files cannot be read and were skipped. They can be removed; nothing else depends on them.")
@@ -79,7 +75,7 @@ def damaged(problems: Sequence[str]) -> Markup | None:
 
 
 def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tuple[str, str]:
-    """Write a figure and its sigma in a unit, to the second digit of sigma."""
+    """Format a figure and its sigma in a unit, to the second digit of sigma."""
     shown = abs(sigma / unit)
     digits = min(max(1 - math.floor(math.log10(shown)), 0), 5) if 0 < shown < 1e9 else 1
     return f"{value / unit:{sign}.{digits}f}", f"{sigma / unit:.{digits}f}"
@@ -95,7 +91,6 @@ class PlotPoint(msgspec.Struct, frozen=True):
 
 
 def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> list[PlotPoint]:
-    """Biases of one triad over finished calibrations, in the order given; those that found none are left out."""
     found: list[PlotPoint] = []
     for which, record in records:
         for one in record.imus:
@@ -108,7 +103,7 @@ def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> li
 
 
 def unix_s(moment: str) -> float | None:
-    """Seconds since 1970 of an ISO 8601 time, which is UTC if it does not say; None: it is none of this age."""
+    """Convert an ISO 8601 time, UTC unless it says otherwise, to s since 1970; None: not of this age."""
     try:
         parsed = datetime.datetime.fromisoformat(moment)
         return seconds_of(parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC))
@@ -117,19 +112,18 @@ def unix_s(moment: str) -> float | None:
 
 
 def seconds_of(moment: datetime.datetime) -> float | None:
-    """Convert a time with a zone to seconds since 1970; None: no clock of this age shows it, and no axis has it."""
+    """Convert a time with a zone to s since 1970; None: outside the range of an axis."""
     seconds = moment.timestamp()
     return seconds if 0.0 <= seconds < _LATEST_S else None
 
 
 def clock_is_sound(points: Sequence[PlotPoint]) -> bool:
-    """Return whether times ascend: a computer without a clock battery begins in the past at every boot."""
+    """Return whether times ascend: a computer without a clock battery starts in the past at every boot."""
     known = [point.unix_s for point in points]
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
 def drift(points: Sequence[PlotPoint], triad: Triad, *, name: str, this: int | None = None) -> Markup:
-    """Draw three plots, one an axis, of a bias over calibrations in their order."""
     unit, unit_name, _ = UNITS[triad]
     times = [point.unix_s for point in points]
     dated = [each for each in times if each is not None] if clock_is_sound(points) else []
@@ -140,29 +134,29 @@ def drift(points: Sequence[PlotPoint], triad: Triad, *, name: str, this: int | N
         label = "number of the calibration (clock not sound)"
     plots: list[Markup] = []
     for axis in range(3):
-        ends = [
-            ((point.bias[axis] - point.sigma_use[axis]) / unit, (point.bias[axis] + point.sigma_use[axis]) / unit)
-            for point in points
-        ]
+        dots = [(float(k), each.bias[axis] / unit, each.sigma_use[axis] / unit) for k, each in enumerate(points)]
         plot = Plot(
             across,
-            linear([end for pair in ends for end in pair], ticks=3),
+            linear(_ends(dots), ticks=3),
             name=f"{name} {AXES[axis]}: bias against time",
             height=84.0,
             x_label=label if axis == 2 else None,
             y_label=f"{AXES[axis]}, {unit_name}",
         )
-        plot.points([(float(k), point.bias[axis] / unit) for k, point in enumerate(points)], CLASSES[axis], ends)
-        for k, point in enumerate(points):
+        plot.points(dots, CLASSES[axis])
+        for point, (x, y, _) in zip(points, dots, strict=True):
             if point.number == this:
-                plot.ring(k, point.bias[axis] / unit)
+                plot.ring(x, y)
         plots.append(plot.svg())
     back = None if dated else "The companion's clock went back in between, so these stand in their order, not by time. "
     return tag("figure", *plots, tag("figcaption", back, "Bars: one sigma for the next minutes."))
 
 
+def _ends(dots: Iterable[Dot]) -> list[float]:
+    return [value + sign * by for _, value, by in dots for sign in (-1.0, 1.0)]
+
+
 def arming_items(armings: Iterable[tuple[str, str, str]]) -> Markup:
-    """Armings as a list, in the order given: when, in which state, and why."""
     states = {"uncalibrated": tag("strong", "UNCALIBRATED: ", class_="bad"), "checked": "checked: "}
     return tag(
         "ul",
@@ -171,7 +165,6 @@ def arming_items(armings: Iterable[tuple[str, str, str]]) -> Markup:
 
 
 def biases_by_temperature(imus: Sequence[ByTemperature]) -> Markup:
-    """Draw each IMU's plots, or say what they need."""
     return tag("div", *(part for imu in imus for part in _curves(imu)))
 
 
@@ -186,7 +179,7 @@ def _curves(imu: ByTemperature) -> list[Child]:
 
 def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
     gyro = triad == "gyro"
-    power_ups: dict[int, list[_Dot]] = {}
+    power_ups: dict[int, list[_Window]] = {}
     for one in imu.points:
         bias, sigma = (one.gyro_deg_h, one.sigma_deg_h) if gyro else (one.accel_mg, one.accel_sigma_mg)
         if bias is not None and sigma is not None:
@@ -194,7 +187,7 @@ def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
     if not power_ups:
         return None
     seen = [dot for dots in power_ups.values() for dot in dots]
-    rows: list[_Dot] = [msgspec.structs.astuple(row) for row in (imu.curve if gyro else imu.accel_curve)]
+    rows: list[_Window] = [msgspec.structs.astuple(row) for row in (imu.curve if gyro else imu.accel_curve)]
     now = imu.now if gyro else None
     across = linear([*(degc for degc, _, _ in seen), *([now.degc] if now else [])], least=_LEAST_K)
     plots = []
@@ -202,24 +195,22 @@ def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
         class_ = CLASSES[axis]
         curve = [(degc, bias[axis], 2.0 * sigma[axis]) for degc, bias, sigma in rows]
         dots = [(degc, bias[axis], sigma[axis]) for degc, bias, sigma in seen]
-        ends = [value + sign * by for _, value, by in (*dots, *curve) for sign in (-1.0, 1.0)]
         plot = Plot(
             across,
-            linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
+            linear([*_ends((*dots, *curve)), *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
             name=f"IMU {imu.imu}, {NAMES[triad].lower()} {AXES[axis]}: bias by temperature",
             told=f"{len(dots)} points, {min(b for _, b, _ in dots):+.1f} to {max(b for _, b, _ in dots):+.1f}.",
             height=110.0,
             x_label="temperature of the IMU, degC" if axis == 2 else "",
             y_label=_label(imu, triad, axis),
         )
-        plot.area([(degc, value - by, value + by) for degc, value, by in curve], f"area {class_}")
+        plot.area(curve, f"area {class_}")
         plot.line([(degc, value) for degc, value, _ in curve], f"curve {class_}")
         for number, each in power_ups.items():
-            points = [(degc, bias[axis]) for degc, bias, _ in each]
-            spans = [(bias[axis] - sigma[axis], bias[axis] + sigma[axis]) for _, bias, sigma in each]
+            run = [(degc, bias[axis], sigma[axis]) for degc, bias, sigma in each]
             colour = class_ if number == imu.today else "past"
-            plot.line(points, f"run {colour}")
-            plot.points(points, colour, spans)
+            plot.line([(degc, value) for degc, value, _ in run], f"run {colour}")
+            plot.points(run, colour)
         if now is not None:
             plot.upright(now.degc, "now")
             plot.ring(now.degc, now.gyro_deg_h[axis])

@@ -13,7 +13,7 @@ import pytest
 
 from companion.estimation.records.history import PowerUp
 from companion.estimation.records.record import ImuRecord, Record
-from companion.lab.replay.engine import replay
+from companion.lab.replay import replay
 from companion.storage.records import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG

@@ -13,7 +13,7 @@ from companion.commands import Align
 from companion.component.service import Refusal
 from companion.estimation.machine import What
 from companion.estimation.records.record import Record
-from companion.lab.replay.engine import replay
+from companion.lab.replay import replay
 from sim.imu_model import DEG_H, MG
 from sim.motions import DAY_S, Sea, SlowTurn, Wave
 from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm

@@ -23,8 +23,8 @@ from companion.config.sections import AllanModel, Config, NoiseProfile
 from companion.errors import StorageError
 from companion.estimation.records.record import Record, to_json
 from companion.formats import Object
-from companion.lab.logs.recording import MAGIC
-from companion.lab.replay.engine import TOLERANCE_SIGMAS, Replay, replay
+from companion.lab.recording import MAGIC
+from companion.lab.replay import TOLERANCE_SIGMAS, Replay, replay
 from companion.recording import messages
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_script_floats import px4, three_imus

@@ -60,7 +60,7 @@ ELSEWHERE = {
 }
 """Rooms whose words need no row of their own, and why."""
 
-HELP = {"_parser", "add_command", "add_commands", "_add_log_options", "add_table_options", "error"}
+HELP = {"_parser", "add_setup", "add_commands", "_add_log_options", "add_table_options", "error"}
 """Functions that build the command line: their words are its help."""
 
 _WORD = re.compile(r"[A-Za-z]{2,}")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pymavlink.DFReader import DFReader_binary
 
-from companion.lab.logs.autopilot_logs import dataflash
+from companion.lab.autopilot_logs import dataflash
 from tests.support import flown
 
 

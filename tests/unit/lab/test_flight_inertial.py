@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from companion.lab.flight.inertial import NO_WINDOWS, Increments, Navigation, drift, increments, lag_s, windows
-from companion.lab.flight.split import LENGTH_S, SHORT_S, split
+from companion.lab import inertial
+from companion.lab.inertial import Increments, Navigation
 from companion.physics.frames import rotations, running_products
 from companion.physics.units import DEG, DEG_H, MG
 from tests.support.flown import Flown, earth_rate, fly, gravity
@@ -42,7 +42,7 @@ def navigation(flown: Flown, seed: int | None = None) -> Navigation:
 
 
 def of(flown: Flown) -> Increments:
-    return increments(flown.t_s, flown.readings, means=True)
+    return inertial.increments(flown.t_s, flown.readings, means=True)
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +51,13 @@ def perfect() -> Flown:
 
 
 def test_perfect_sensors_on_a_turning_earth_come_back_to_where_they_are(perfect: Flown) -> None:
-    rows = drift(of(perfect), navigation(perfect), AIR, (10.0, 30.0, 60.0), {"flown": NOTHING})["flown"]
+    rows = inertial.drift(of(perfect), navigation(perfect), AIR, (10.0, 30.0, 60.0), {"flown": NOTHING})["flown"]
     assert [row.seconds for row in rows] == [10.0, 30.0, 60.0]
     assert [row.starts for row in rows] == [156, 136, 106]
     assert all(row.worst_m < limit for row, limit in zip(rows, (0.006, 0.024, 0.05), strict=True)), rows
     # An Earth that is taken to stand still: W g t^3 / 6 or so.
     resting = navigation(perfect)._replace(earth_rate_ned_rad_s=np.zeros(3))
-    still = drift(of(perfect), resting, AIR, (60.0,), {"flown": NOTHING})
+    still = inertial.drift(of(perfect), resting, AIR, (60.0,), {"flown": NOTHING})
     assert 10.0 < still["flown"][0].median_m < 40.0
 
 
@@ -67,7 +67,7 @@ def test_a_cone_within_a_step_is_kept() -> None:
     phase = 2.0 * np.pi * 12.0 * t
     body = Rotation.from_rotvec(1.0 * DEG * np.column_stack([np.cos(phase), np.sin(phase), 0.0 * t]))
     rates = (body[:-1].inv() * body[1:]).as_rotvec() * 800.0
-    found = increments(t[1:], np.hstack([rates, np.zeros((len(rates), 3))]), means=True)
+    found = inertial.increments(t[1:], np.hstack([rates, np.zeros((len(rates), 3))]), means=True)
     turned = Rotation.from_matrix(running_products(rotations(found.angle))[-1])
     off_rad = (turned.inv() * body[1].inv() * body[-1]).magnitude()
     # By half a^2 w t it would be 6.6 deg.
@@ -78,7 +78,7 @@ def test_a_bias_drifts_as_by_hand_and_another_offset_takes_it_away(perfect: Flow
     biased = fly(gyro_rad_s=GYRO, accel_m_s2=ACCEL)
     ground = (5.0, 62.0)
     offsets = {"flown": NOTHING, "right": (-GYRO, -ACCEL)}
-    found = drift(of(biased), navigation(biased), ground, (30.0,), offsets)
+    found = inertial.drift(of(biased), navigation(biased), ground, (30.0,), offsets)
     # Standing: half b t^2, and g w t^3 / 6 of what tilts, in the axes of the body, which lies within a degree.
     t = 30.0
     x = 0.5 * ACCEL[0] * t**2 - gravity() * GYRO[1] * t**3 / 6.0
@@ -86,20 +86,20 @@ def test_a_bias_drifts_as_by_hand_and_another_offset_takes_it_away(perfect: Flow
     z = 0.5 * ACCEL[2] * t**2
     assert found["flown"][0].median_m == pytest.approx(float(np.linalg.norm([x, y, z])), rel=0.02)
     assert found["right"][0].median_m < 0.02
-    in_air = drift(of(biased), navigation(biased), AIR, (30.0,), offsets)
-    own = drift(of(perfect), navigation(perfect), AIR, (30.0,), {"flown": NOTHING})
+    in_air = inertial.drift(of(biased), navigation(biased), AIR, (30.0,), offsets)
+    own = inertial.drift(of(perfect), navigation(perfect), AIR, (30.0,), {"flown": NOTHING})
     assert in_air["right"][0].median_m == pytest.approx(own["flown"][0].median_m, abs=0.02)
     assert in_air["flown"][0].median_m > 40.0
 
 
 def test_the_delay_of_filters_is_found(perfect: Flown) -> None:
     late = of(perfect)._replace(t_s=of(perfect).t_s + 0.012)
-    assert lag_s(late, navigation(perfect)) == pytest.approx(0.012, abs=0.0002)
+    assert inertial.lag_s(late, navigation(perfect)) == pytest.approx(0.012, abs=0.0002)
     # A heading that is found anew, by 30 degrees, is no delay.
     anew = navigation(perfect)
     turned = Rotation.from_euler("z", np.where(anew.t_s > 150.0, 30.0, 0.0)[:, None], degrees=True)
     q = (turned * Rotation.from_quat(anew.attitude[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
-    assert lag_s(late, anew._replace(attitude=q)) == pytest.approx(0.012, abs=0.0002)
+    assert inertial.lag_s(late, anew._replace(attitude=q)) == pytest.approx(0.012, abs=0.0002)
 
 
 def levels(count: int) -> Floats:
@@ -117,10 +117,10 @@ def test_what_motors_add_is_found_with_an_honest_sigma() -> None:
     still = navigation(flown)._replace(
         attitude=np.tile(flown.quaternions[0], (len(flown.at_s), 1)), velocity=zeros, position=zeros
     )
-    before = windows(found, still, (35.0, 64.0), SHORT_S)
+    before = inertial.windows(found, still, (35.0, 64.0), inertial.SHORT_S)
     for seed in range(12):
-        air = windows(found, navigation(flown, seed), AIR, LENGTH_S)
-        for k, axis in enumerate(split(before, air, levels(len(air)), NOTHING_KNOWN, NOTHING_KNOWN)):
+        air = inertial.windows(found, navigation(flown, seed), AIR, inertial.LENGTH_S)
+        for k, axis in enumerate(inertial.split(before, air, levels(len(air)), NOTHING_KNOWN, NOTHING_KNOWN)):
             assert axis.in_flight is not None
             assert axis.turn_on is not None
             assert axis.motors is not None
@@ -141,10 +141,10 @@ def test_what_motors_add_is_found_with_an_honest_sigma() -> None:
 def test_what_the_data_do_not_carry_is_not_known(perfect: Flown) -> None:
     assert all(
         axis.in_flight is None and axis.motors is None
-        for axis in split(NO_WINDOWS, NO_WINDOWS, None, NOTHING_KNOWN, NOTHING_KNOWN)
+        for axis in inertial.split(inertial.NO_WINDOWS, inertial.NO_WINDOWS, None, NOTHING_KNOWN, NOTHING_KNOWN)
     )
-    air = windows(of(perfect), navigation(perfect), (70.0, 115.0), LENGTH_S)
-    for axis in split(NO_WINDOWS, air, None, NOTHING_KNOWN, NOTHING_KNOWN):
+    air = inertial.windows(of(perfect), navigation(perfect), (70.0, 115.0), inertial.LENGTH_S)
+    for axis in inertial.split(inertial.NO_WINDOWS, air, None, NOTHING_KNOWN, NOTHING_KNOWN):
         assert axis.in_flight is not None
         assert axis.turn_on is None
         assert axis.motors is None

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from companion.cli import main as companion
 from companion.config import parse
-from companion.lab.logs.recording import MAGIC, Head, Recording
+from companion.lab.recording import MAGIC, Recording
 from companion.recording import messages
 
 MB = 1 << 20
@@ -126,7 +126,7 @@ def head() -> bytes:
 
 def found(path: Path) -> tuple[list[bytes], str | None]:
     recording = Recording(path)
-    return [item[2] for item in recording.items() if not isinstance(item, Head)], recording.cut_short
+    return [data for _, _, data in recording.read()], recording.cut_short
 
 
 @settings(max_examples=200)

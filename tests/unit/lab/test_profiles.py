@@ -20,7 +20,7 @@ from companion.configured import models
 from companion.configured.models import Profiles
 from companion.errors import ConfigError, StorageError
 from companion.estimation.noise.allan import noise_profile
-from companion.lab.logs.log_files import read_logs
+from companion.lab.log_files import read_logs
 from companion.recording.files import Beginning, RecordingFile
 from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
 from companion.storage.profiles import FORMAT_VERSION, ProfileSource, ProfileStore, SavedProfile, saved_profile

@@ -14,7 +14,7 @@ import pytest
 from pyulog import ULog
 
 from companion.cli import main as companion
-from companion.lab.logs.log_files import read_logs
+from companion.lab.log_files import read_logs
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at

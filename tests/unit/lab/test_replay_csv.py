@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.cli import main as companion
-from companion.lab.logs.still_log import read_csv
+from companion.lab.still_log import read_csv
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at

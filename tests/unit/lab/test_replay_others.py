@@ -12,7 +12,7 @@ import pytest
 
 from companion.cli import main as companion
 from companion.errors import StorageError
-from companion.lab.logs.still_log import HEADER, read_csv
+from companion.lab.still_log import HEADER, read_csv
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at

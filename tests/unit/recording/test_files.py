@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from companion.errors import StorageError
 from companion.estimation.solution.site import Whereabouts
-from companion.lab.logs.recording import Head, Recording
+from companion.lab.recording import Recording
 from companion.recording import files, messages
 from companion.recording.files import RESERVE_BYTES, Beginning, RecordingFile, Ring
 from companion.recording.messages import PLACE, START, Message, Tape, decode, encode
@@ -33,7 +33,7 @@ def raw(count: int, size: int, seed: int = 0) -> list[Message]:
 
 
 def on_topic(path: Path, topic: str) -> list[Message]:
-    return [item for item in Recording(path).items() if not isinstance(item, Head) and item[0] == topic]
+    return [item for item in Recording(path).read() if item[0] == topic]
 
 
 def numbers(folder: Path) -> list[int]:

@@ -1,4 +1,4 @@
-"""PX4's ULog of flights (its message definitions; autopilots 4)."""
+"""PX4's ULog of flights (its message definitions; autopilots 4), which has one start of the autopilot."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.px4 import PX4
-from companion.lab.flight.inertial import Boot, FlownImu, Navigation, changes, joined
-from companion.lab.logs.autopilot_logs import US, BootMessages, ascending, ulog
+from companion.lab.autopilot_logs import US, Boot, BootMessages, FlownImu, ascending, changes, in_use, ulog
+from companion.lab.inertial import Navigation, joined
 from companion.physics.frames import Floats
 
 
@@ -40,7 +40,6 @@ _TURNING: Final = 0.02
 
 
 def read(path: Path) -> Iterator[Boot]:
-    """Give the one start of the autopilot in a log."""
     start = ulog(path, _TOPICS)
     armed, landed = start.rows("actuator_armed"), start.rows("vehicle_land_detected")
     yield Boot(
@@ -77,13 +76,11 @@ def _navigation(start: BootMessages, suffix: str) -> Navigation | None:
 
 
 def _imus(start: BootMessages) -> tuple[FlownImu, ...]:
-    """List the IMUs that PX4 has flown by: sensor_combined is of the one in use."""
     found: dict[int, FlownImu] = {}
     status = {k: start.rows("vehicle_imu_status", k) for k in start.instances("vehicle_imu_status")}
     ids = {rows[-1, 1]: k for k, rows in status.items() if len(rows)}
-    combined, selection = _whole(start.rows("sensor_combined")), _selection(start)
-    now = np.searchsorted(selection[:, 0], combined[:, 0], side="right") - 1
-    selected = selection[np.maximum(now, 0), 1]
+    combined = _whole(start.rows("sensor_combined"))
+    selected = in_use(_selection(start), combined[:, 0])
     for gyro_id in np.unique(selected):
         number = ids.get(gyro_id, 0)
         found[number] = _imu(start, number, combined[selected == gyro_id])
@@ -91,7 +88,6 @@ def _imus(start: BootMessages) -> tuple[FlownImu, ...]:
 
 
 def _selection(start: BootMessages) -> Floats:
-    """Give the device id of the gyro in use over time, (n, 2)."""
     told = _whole(start.rows("sensor_selection"))
     return told if len(told) else np.zeros((1, 2))
 
@@ -118,14 +114,13 @@ def _estimated(start: BootMessages, gyro_id: int | None) -> Floats | None:
 
 def _motors(start: BootMessages) -> tuple[tuple[float, bool], ...]:
     outputs = start.rows("actuator_motors")
-    turning = np.any(outputs[:, 1:] > _TURNING, axis=1)
-    return changes(outputs[:, 0], turning)
+    return changes(outputs[:, 0], np.any(outputs[:, 1:] > _TURNING, axis=1))
 
 
 def _unix_offset(start: BootMessages) -> float | None:
     rows = start.rows("vehicle_gps_position")
-    known = np.sort((rows[:, 1] * US - rows[:, 0])[rows[:, 1] > 1e15])
-    return float(known[len(known) // 2]) if len(known) else None
+    known = (rows[:, 1] * US - rows[:, 0])[rows[:, 1] > 1e15]
+    return float(np.median(known)) if len(known) else None
 
 
 def _place(start: BootMessages) -> tuple[float, float] | None:

@@ -1,7 +1,7 @@
-"""Readings of one IMU at rest, and a reader of CSV logs: names of columns with quantity and unit, then lines.
+"""Readings of one IMU at rest, and a reader of CSV logs.
 
-There is one vocabulary of names (`COLUMNS`), for the header of the file and for --columns alike. Nothing is guessed: a
-column of another name is passed over, and said.
+One vocabulary of column names (`COLUMNS`) serves the header of the file and --columns. Nothing is guessed: a column of
+another name is left out, and noted.
 """
 
 from __future__ import annotations
@@ -40,14 +40,13 @@ COLUMNS: Final[dict[str, tuple[str, float]]] = {
     for what in quantities
     for unit, factor in units.items()
 }
-"""Quantity by name of a column, and its factor to seconds, rad/s, m/s^2 and degrees Celsius."""
+"""Quantity by column name, and its factor to s, rad/s, m/s^2 or degrees Celsius."""
 HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
-"""Median specific force of a log at rest or nearly so: beyond, the unit or the column is another one than named."""
+"""Allowed median specific force of a log at rest: outside it, a unit or a column is named wrongly."""
 
 _SEPARATORS: Final = (";", "\t", ",", " ")
 _LONGEST: Final = 1 << 14
-"""The most characters of a line: a hundred columns have a tenth of that."""
 _NUMBERS: Final = 1e20
 """Limit of a number in any unit: nanoseconds since 1970 are 2e18."""
 _WRAPS: Final = 2.0**32
@@ -56,53 +55,53 @@ _MOST_NAMED: Final = 12
 
 
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one session: a file, or several of which each goes on where the one before ends."""
+    """One IMU in one session: a file, or several that continue one another.
+
+    Times (n,) ascend; readings (n, 6) are in rad/s and m/s^2, axes as recorded; none: it came as integers only, which
+    are left out. Temperatures are NaN where unknown. `profile`: of the configuration in force then. `clock_offset_s`:
+    UTC minus the recording's clock. `breaks_s`: times of changes by other reasons than noise, such as a write of
+    offsets or a restart. `left_out`: ignored lines by reason. `clock_from_start`: times count from the switch-on of the
+    autopilot.
+    """
 
     imu: str
     files: tuple[str, ...]
-    began_unix_s: float | None
     t_s: Floats
-    """(n,) ascending."""
     readings: Floats
-    """(n, 6): gyro in rad/s, accelerometer in m/s^2; axes as recorded."""
     temperature_degc: Floats
-    """(n,); NaN where unknown."""
     profile: str | NoiseProfile | None = None
-    """Noise profile in the configuration in force then."""
-    truncated: bool = False
-    """It came as integers only, which are left out."""
     clock_offset_s: float | None = None
-    """UTC minus the recording's clock."""
     breaks_s: tuple[float, ...] = ()
-    """When the readings became others by no noise: offsets were written, the device restarted."""
 
     notes: tuple[str, ...] = ()
-    """Assumptions and oddities, in words."""
     left_out: dict[str, int] = {}
-    """Lines that do not count, by reason."""
     clock_from_start: bool = False
-    """True: times count from the switch-on of the autopilot."""
+
+    @property
+    def began_unix_s(self) -> float | None:
+        return float(self.t_s[0]) + self.clock_offset_s if self.clock_offset_s is not None and len(self.t_s) else None
 
     @property
     def began_at(self) -> str | None:
-        """UTC."""
         if self.began_unix_s is None:
             return None
         return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
 
     def pieces(self, skip_s: float = 0.0) -> list[slice]:
-        """The samples between the breaks, in order; without the first `skip_s` of the session."""
-        if not len(self.t_s):
-            return []
-        first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s)) if skip_s else 0
+        """Return the samples between the breaks, in order, without the first `skip_s` of the session."""
+        first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s))
         cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
         return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
 
 
-def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
-    """Read a CSV file: semicolons, tabs, commas or blanks; "#" begins a remark.
+def unreadable(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{path}: cannot be read: {error.strerror or error}")
 
-    `columns`, separated by commas, take the place of the file's header, and a rate that of its times.
+
+def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
+    """Read a CSV file: semicolons, tabs, commas or blanks; "#" begins a comment.
+
+    `columns`, separated by commas, replace the file's header, and a rate its times.
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -110,9 +109,9 @@ def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = Non
             used = columns_of(names, where, timed=rate_hz is None)
             table, numbers = _numbers(path, lines, names, used)
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read as text: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
     if rate_hz is not None:
-        numbers = np.arange(float(len(table)))
+        table[:, 0] = np.arange(len(table)) / rate_hz
     passed = [each for each in names if each not in COLUMNS and each != "-"]
     left_out: dict[str, int] = {}
 
@@ -123,22 +122,17 @@ def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = Non
             table, numbers = table[good], numbers[good]
 
     keep(np.all(np.isfinite(table[:, 1:7]), axis=1), "without a number in each of " + ", ".join(IMU))
-    if rate_hz is None:
-        keep(np.isfinite(table[:, 0]), "without a time")
+    keep(np.isfinite(table[:, 0]), "without a time")
     if not len(table):
         raise StorageError(f"{path}: no line in it has a number for all of {', '.join(IMU)}")
-    if rate_hz is None:
-        changed = np.any(np.diff(table[:, :7], axis=0) != 0.0, axis=1)
-        keep(np.append([True], changed), "repeated: time and readings of the line before")
-        t_s = _times(path, table[:, 0], COLUMNS[used["t"]][1], numbers)
-    else:
-        t_s = numbers / rate_hz
+    changed = np.any(np.diff(table[:, :7], axis=0) != 0.0, axis=1)
+    keep(np.append([True], changed), "repeated: time and readings of the line before")
+    t_s = table[:, 0] if rate_hz is not None else _times(path, table[:, 0], COLUMNS[used["t"]][1], numbers)
     readings = table[:, 1:7] * [COLUMNS[used[what]][1] for what in IMU]
     _check_gravity(path, readings[:, 3:], [used[what] for what in IMU[3:]])
     return StillLog(
         imu=name,
         files=(path.name,),
-        began_unix_s=None,
         t_s=t_s,
         readings=readings,
         temperature_degc=table[:, 7],
@@ -148,11 +142,10 @@ def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = Non
 
 
 def columns_of(names: Sequence[str], where: str, *, timed: bool) -> dict[str, str]:
-    """Map quantities to names of columns; one is time, if `timed`."""
     used: dict[str, str] = {}
     for name in names:
-        if (known := COLUMNS.get(name)) is not None:
-            what, _ = known
+        if name in COLUMNS:
+            what, _ = COLUMNS[name]
             if what in used:
                 raise StorageError(f"{where}: two columns for {what}: {used[what]} and {name}")
             used[what] = name
@@ -174,7 +167,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _header(path: Path, file: TextIO, columns: str | None) -> tuple[list[str], str, Iterator[tuple[int, list[str]]]]:
-    """Give the names of the columns, where they stand, and the lines of numbers as fields."""
+    """Return the column names, their place for messages, and the numbered lines as fields."""
     lines = _lines(file, path)
     number, first = next(lines, (0, ""))
     if not number:
@@ -195,7 +188,7 @@ def _header(path: Path, file: TextIO, columns: str | None) -> tuple[list[str], s
 
 
 def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
-    """Give the lines of a file with their numbers; leave out blank ones, remarks, and a last one that is cut."""
+    """Yield the numbered lines of a file, without blank ones, comments, and a last one that is cut."""
     for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
         if len(line) == _LONGEST:
             raise StorageError(f"{path}, line {number}: found no line end within {_LONGEST} characters")
@@ -234,7 +227,7 @@ def _is_number(text: str) -> bool:
 def _numbers(
     path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, str]
 ) -> tuple[Floats, Floats]:
-    """Read time, readings and temperature (n, 8), NaN where one is missing; and the number of each line."""
+    """Read time, readings and temperature (n, 8), NaN where one is missing, and the number of each line."""
     places, width = [names.index(name) for name in used.values()], len(names)
     flat, numbers = array("d"), array("d")
     for number, fields in lines:
@@ -259,7 +252,6 @@ def _numbers(
 
 
 def _times(path: Path, stamps: Floats, factor: float, numbers: Floats) -> Floats:
-    """Convert the times of the lines to seconds, and check that they grow."""
     falls = np.diff(stamps) < -_WRAPS / 2.0
     if falls.any() and (np.abs(stamps) < _WRAPS).all():  # a counter of 32 bits
         stamps = stamps + _WRAPS * np.concatenate(([0], np.cumsum(falls)))
@@ -277,7 +269,7 @@ def _times(path: Path, stamps: Floats, factor: float, numbers: Floats) -> Floats
 
 
 def _check_gravity(path: Path, forces: Floats, names: Sequence[str]) -> None:
-    """Refuse units that make gravity another one: they would make another bias, too."""
+    """Refuse wrong units of force: they would change the bias, too."""
     with np.errstate(over="ignore"):
         found_m_s2 = float(np.median(np.sqrt(np.square(forces).sum(axis=1))))
     low, high = GRAVITY_M_S2

@@ -1,29 +1,28 @@
-"""The parts of a log that a flight is judged by, whichever firmware wrote it; and free inertial navigation.
+"""Free inertial navigation over a flight, and the biases that the flight shows.
 
-Navigation goes by the firmware's corrected readings alone, over pieces of a flight.
-
-Between any two times the readings are integrated once, from the log's beginning; a start somewhere in the flight is
-then one turn and one shift of that, so that many starts cost no more than one (method 3.7).
+Navigation uses the readings as the firmware corrected them and no aid. They are integrated once, from the log's
+beginning; a start somewhere in the flight is then one turn and one shift of that, so that many starts cost no more than
+one (method 3.7).
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from companion.autopilot.parameters.change import FirmwareName
-from companion.estimation.records.flight_record import Drift
+from companion.estimation.records.flight_record import AXES, Drift, Split, Term
 from companion.physics.frames import Floats, rotations, running_products
+from companion.physics.statistics import student_quantile
+from companion.physics.units import DEG, MG
 
 STEP_S: Final = 0.02
-"""Increments are put together to this; coning and sculling within are kept."""
+"""Length of an increment; coning and sculling within it are kept."""
 GAP_S: Final = 0.25
-"""A longer hole in the readings is flown over by no start."""
+"""A longer hole in the readings ends a stretch of free navigation."""
 _LARGEST: Final = 1e6
 _LAG_SPAN_S: Final = 0.3
 _MOST_LAG_S: Final = 0.1
@@ -31,18 +30,18 @@ _OUTLIER: Final = 50.0
 
 
 class Navigation(NamedTuple):
-    """An estimator's solution, or the truth of a simulator, and the Earth that it is on."""
+    """An estimator's solution, or the truth of a simulator, and the Earth that it is on.
+
+    Quaternions (n, 4) turn body FRD to NED; velocity (n, 3) and position (n, 3) are NED in m/s and m. A rate of the
+    Earth of zero: a simulator without, or an unknown place.
+    """
 
     t_s: Floats
     attitude: Floats
-    """(n, 4) quaternions, body FRD to NED."""
     velocity: Floats
-    """(n, 3) m/s, NED."""
     position: Floats
-    """(n, 3) m, NED."""
     gravity_m_s2: float = 9.80665
     earth_rate_ned_rad_s: Floats = np.zeros(3)
-    """(3,); zero: a simulator without, or a place that is not known."""
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
         """Interpolate rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3)."""
@@ -51,7 +50,6 @@ class Navigation(NamedTuple):
 
 
 def whole(rows: Floats) -> Floats:
-    """Leave out rows with values beyond any aircraft."""
     return np.asarray(rows[(np.abs(rows) < _LARGEST).all(axis=1)])
 
 
@@ -66,99 +64,38 @@ def joined(attitude: Floats, moving: Floats) -> Navigation | None:
     return Navigation(q[:, 0], q[:, 1:5], states[:, :3], states[:, 3:]) if len(q) > 1 else None
 
 
-class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one log."""
-
-    number: int
-    """Number from 1, as in the configuration."""
-    t_s: Floats
-    readings: Floats
-    """(n, 6) rad/s and m/s^2, corrected by the firmware, vehicle FRD."""
-    means: bool
-    """Each is the mean since the one before, not an instant."""
-    gyro_id: int | None = None
-    accel_id: int | None = None
-    degc: Floats = np.zeros((0, 2))
-    """Time and temperature."""
-    vibration: Floats = np.zeros((0, 2))
-    """Time and level, m/s^2."""
-    estimated: Floats | None = None
-    """Biases of an EKF, (n, 9): time in s, of the gyro's axes (rad/s) and the accelerometer's z (m/s^2), sigma of each.
-
-    NaN where it says nothing.
-    """
-    failed_s: Floats = np.zeros(0)
-    """Times at which the autopilot took it for failed; its readings then are left out."""
-
-    @property
-    def rate_hz(self) -> float:
-        """Mean rate of the readings."""
-        return (len(self.t_s) - 1) / float(self.t_s[-1] - self.t_s[0]) if len(self.t_s) > 1 else 0.0
-
-
-class Boot(msgspec.Struct, frozen=True, kw_only=True):
-    """Log of one start of the autopilot, whichever firmware wrote it; times in s on its clock."""
-
-    firmware: FirmwareName
-    imus: tuple[FlownImu, ...]
-    solution: Navigation | None
-    truth: Navigation | None = None
-    """Truth of a simulator."""
-    armed: tuple[tuple[float, bool], ...] = ()
-    motors: tuple[tuple[float, bool], ...] = ()
-    airborne: tuple[tuple[float, bool], ...] = ()
-    parameters: tuple[tuple[float, str, float], ...] = ()
-    unix_offset_s: float | None = None
-    """UTC less its clock."""
-    place: tuple[float, float] | None = None
-    """Latitude in degrees, and height in m."""
-    earth_turns: bool = True
-    standard_gravity: bool = False
-    notes: tuple[str, ...] = ()
-
-    def parameters_at(self, t_s: float) -> dict[str, float]:
-        """Return the parameters at a time; one that was logged only later has its first value."""
-        found: dict[str, float] = {}
-        for told_s, name, value in self.parameters:
-            if told_s <= t_s or name not in found:
-                found[name] = value
-        return found
-
-
-def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]) -> tuple[tuple[float, bool], ...]:
-    """List the first state and each change after it."""
-    found: list[tuple[float, bool]] = []
-    for at_s, state in zip(t_s, states, strict=True):
-        if not found or found[-1][1] != bool(state):
-            found.append((float(at_s), bool(state)))
-    return tuple(found)
-
-
 # --- free inertial navigation
 
 
 class Increments(NamedTuple):
-    """Angles and velocities that the sensors have integrated, sample by sample."""
+    """Integrated readings: angles (n, 3) in rad, velocities (n, 3) in m/s, in body axes at the beginning of each.
+
+    Times are the ends of the increments.
+    """
 
     t_s: Floats
-    """(n,) the ends."""
     dt_s: Floats
     angle: Floats
-    """(n, 3) rad, body axes at the beginning of each."""
     velocity: Floats
-    """(n, 3) m/s, likewise."""
 
     def shifted(self, rate_rad_s: Floats, force_m_s2: Floats) -> Increments:
-        """With so much more in the output, (3,) or (n, 3)."""
+        """Add a rate and a force, (3,) or (n, 3), to the output."""
         dt = self.dt_s[:, None]
         turned = rate_rad_s * dt
         # What turns more has its force summed up in other axes.
         velocity = self.velocity + force_m_s2 * dt + 0.5 * np.cross(turned, self.velocity)
         return self._replace(angle=self.angle + turned, velocity=velocity)
 
+    def nodes(self) -> Floats:
+        """Return the times at which the increments begin, and the end of the last one, (n + 1,)."""
+        return np.concatenate([self.t_s - self.dt_s, self.t_s[-1:]])
+
+    def holes_before(self) -> Floats:
+        return _cumulative(np.where(self.dt_s > GAP_S, 1.0, 0.0))
+
 
 def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
-    """Integrate readings (n, 6), rad/s and m/s^2: means since the one before, or instants joined by lines."""
+    """Integrate readings (n, 6) in rad/s and m/s^2; `means`: since the one before, else instants joined by lines."""
     dt = np.diff(t_s)
     rates = readings[1:] if means else 0.5 * (readings[1:] + readings[:-1])
     grown = rates * dt[:, None]
@@ -167,7 +104,6 @@ def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
     counts = np.diff(np.append(starts, len(bins)))
 
     def before(values: Floats) -> Floats:
-        """Sum what a bin has before each of its samples."""
         sums = np.cumsum(values, axis=0) - values
         return np.asarray(sums - np.repeat(sums[starts], counts, axis=0))
 
@@ -185,7 +121,6 @@ def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
 
 
 def without_earth(found: Increments, solution: Navigation) -> Increments:
-    """Without what the Earth's turning adds: seen from the ground."""
     rate = solution.earth_rate_ned_rad_s
     if not rate.any():
         return found
@@ -195,10 +130,9 @@ def without_earth(found: Increments, solution: Navigation) -> Increments:
 
 
 def lag_s(found: Increments, solution: Navigation) -> float:
-    """Estimate by how much filters delay the readings against the solution's attitude.
+    """Estimate the delay of the readings by filters, against the solution's attitude.
 
-    Over a short while readings that are late have turned by less than the solution has, by the rate at its end less
-    that at its beginning, times the delay.
+    Over a short while late readings have turned less than the solution, by the change of rate times the delay.
     """
     span = max(round(_LAG_SPAN_S / float(np.median(found.dt_s))), 1)
     rate = found.angle / found.dt_s[:, None]
@@ -223,15 +157,11 @@ def lag_s(found: Increments, solution: Navigation) -> float:
 
 
 def _carry(found: Increments) -> tuple[Floats, Floats, Floats]:
-    """Integrate turn, velocity and position in the axes of the body at the log's beginning.
-
-    Each is (n + 1, ...), before the first increment and after each.
-    """
+    """Integrate turn, velocity and position (n + 1, ...) in the axes of the body at the log's beginning."""
     turn = np.concatenate([np.eye(3)[None], running_products(rotations(found.angle))])
     added = np.einsum("nij,nj->ni", turn[:-1], found.velocity)
-    velocity = np.concatenate([np.zeros((1, 3)), np.cumsum(added, axis=0)])
-    moved = (velocity[:-1] + 0.5 * added) * found.dt_s[:, None]
-    return turn, velocity, np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
+    velocity = _cumulative(added)
+    return turn, velocity, _cumulative((velocity[:-1] + 0.5 * added) * found.dt_s[:, None])
 
 
 def drift(
@@ -241,23 +171,22 @@ def drift(
     spans_s: Sequence[float],
     offsets: Mapping[str, tuple[Floats, Floats]],
 ) -> dict[str, list[Drift]]:
-    """Navigate freely from a start each second within a time, by each set of offsets.
+    """Navigate freely from each second within a time, by each set of offsets, and compare the end with the solution.
 
     Args:
         found: readings, corrected by the firmware, on the solution's clock.
-        solution: where each start begins, and what its end is compared with.
+        solution: attitude, velocity and position at each start and end.
         within_s: first start and last end.
-        spans_s: how long each is without aid.
-        offsets: by name, what the output has more with those offsets, rad/s and m/s^2.
+        spans_s: lengths of free navigation.
+        offsets: change of the output (rad/s, m/s^2) by each set of offsets.
 
     Returns:
-        By name, one of each span that fits in without a gap in the readings.
+        The drift of each span that fits in without a gap in the readings, by set of offsets.
     """
     clean = without_earth(found, solution)
-    # A node is the beginning of an increment; the last one ends the last of them.
-    nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
+    nodes = found.nodes()
     turn, velocity, position = solution.at(nodes)
-    holes = np.concatenate([[0], np.cumsum(found.dt_s > GAP_S)])
+    holes = found.holes_before()
     known = np.searchsorted(solution.t_s, nodes)
     stale = np.diff(solution.t_s, prepend=-np.inf, append=np.inf)[known] > 2.0
     first, last = max(within_s[0], float(nodes[0])), min(within_s[1], float(nodes[-1]))
@@ -277,8 +206,8 @@ def drift(
             inertial = moved[j] - moved[k] - gained[k] * t
             there = position[k] + velocity[k] * t + np.einsum("nij,nj->ni", back, inertial)
             there += [0.0, 0.0, 0.5 * solution.gravity_m_s2] * t**2
-            off = np.sort(np.linalg.norm(there - position[j], axis=1))
-            rows.append(Drift(span_s, len(off), float(_at(off, 0.5)), float(_at(off, 0.95))))
+            off = np.linalg.norm(there - position[j], axis=1)
+            rows.append(Drift(span_s, len(off), *np.quantile(off, (0.5, 0.95)).tolist()))
         results[name] = rows
     return results
 
@@ -291,19 +220,19 @@ def windows(found: Increments, solution: Navigation, within_s: tuple[float, floa
 
     Returns:
         (n, 7): middle of the window in s; excess of the readings over the solution, by gyro (3, rad/s, axes of the
-        body) and by accelerometer along the vertical, counted along body z (m/s^2); share of x and of y that lies along
-        the vertical, for one of z.
+        body) and by accelerometer along the vertical, as if it were all of body z (m/s^2); share of x and of y that
+        lies along the vertical, relative to z.
     """
     clean = without_earth(found, solution)
-    nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
+    nodes = found.nodes()
     turn, velocity, _ = solution.at(nodes)
     carried, _, _ = _carry(clean)
-    # The solution's attitude turns specific force, so that what the gyros have wrong does not tilt it.
+    # Specific force is turned by the solution's attitude, so that errors of the gyros do not tilt it.
     added = np.einsum("nj,nj->n", (0.5 * (turn[:-1] + turn[1:]))[:, 2], clean.velocity)
-    down = np.concatenate([[0.0], np.cumsum(added)])
-    along = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(carried[:-1] * found.dt_s[:, None, None], axis=0)])
-    vertical = np.concatenate([np.zeros((1, 3)), np.cumsum(turn[:-1, 2] * found.dt_s[:, None], axis=0)])
-    holes = np.concatenate([[0], np.cumsum(found.dt_s > GAP_S)])
+    down = _cumulative(added)
+    along = _cumulative(carried[:-1] * found.dt_s[:, None, None])
+    vertical = _cumulative(turn[:-1, 2] * found.dt_s[:, None])
+    holes = found.holes_before()
     edges = np.arange(max(within_s[0], float(nodes[0])), min(within_s[1], float(nodes[-1])) + 1e-9, length_s)
     at = np.searchsorted(nodes, edges)
     at = at[at < len(nodes)]
@@ -322,8 +251,110 @@ def windows(found: Increments, solution: Navigation, within_s: tuple[float, floa
     return np.array(rows).reshape(-1, 7)
 
 
+# --- biases of a flight
+#
+# Least squares over windows side by side. The error of a window comes from the solution's errors at its two ends, which
+# the next window has with the other sign: treated as independent they make sigma rather too large than too small. The
+# solution's errors that last a whole flight, and that no window shows, are these constants; every sigma has them.
+
+LENGTH_S: Final = 10.0
+SHORT_S: Final = 2.0
+"""Windows before the motors, where there is little time and little noise."""
+_LEAST: Final = 3
+_ATTITUDE_RAD: Final = (0.3 * DEG, 0.3 * DEG, 2.0 * DEG)
+"""Error of tilt and heading at one end of a stretch, for a solution with GNSS and a compass."""
+_VELOCITY_M_S: Final = 0.1
+_GRAVITY_M_S2: Final = 0.003
+"""Gravity where it flies against the normal one, and the accelerometer's scale at one g."""
+_AT_REST: Final = 0.02
+"""Share of both errors while it stands."""
+_LEVEL_M_S2: Final = 5.0 * MG
+"""Error of the other two accelerometers, which a tilt turns into the vertical."""
+_LEAST_SPREAD: Final = 0.15
+"""Share of its mean by which vibration has to vary for a slope."""
+_LEAST_TREND_S: Final = 60.0
+
+
+def split(
+    before: Floats,
+    flight: Floats,
+    levels: Floats | None,
+    warmth: Sequence[Term | None],
+    ekf: Sequence[Term | None],
+) -> list[Split]:
+    """Split the biases of the gyro's three axes and the accelerometer's vertical one.
+
+    `before` are windows before the motors, `flight` those in the air, `levels` the vibration in
+    each of these, (n,) in m/s^2. `warmth` is the part of the step at the motors' start that temperature explains.
+    """
+    found = []
+    for k, axis in enumerate(AXES):
+        ground, air = before[:, 1 + k], flight[:, 1 + k]
+        end = _ATTITUDE_RAD[k] if k < 3 else _VELOCITY_M_S
+        constant = 0.0 if k < 3 else _GRAVITY_M_S2
+        aside = 0.0 if k < 3 else _LEVEL_M_S2
+        turn_on = _mean(ground, len(before) * SHORT_S, _AT_REST * end, math.hypot(constant, aside * _tilt(before)))
+        in_flight = _mean(air, len(flight) * LENGTH_S, end, math.hypot(constant, aside * _tilt(flight)))
+        motors = None
+        if turn_on is not None and in_flight is not None:
+            by_degc = warmth[k] or Term(0.0, 0.0)
+            # Gravity and scale are the same before and after.
+            sigma = np.sqrt(max(turn_on.sigma**2 + in_flight.sigma**2 - 2.0 * constant**2, 0.0) + by_degc.sigma**2)
+            motors = Term(in_flight.value - turn_on.value - by_degc.value, float(sigma))
+        slope, trend = _slopes(air, flight, levels, end, aside)
+        found.append(
+            Split(
+                axis=axis, in_flight=in_flight, ekf=ekf[k], turn_on=turn_on, temperature=warmth[k] if motors else None,
+                motors=motors, vibration=slope, trend=trend,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _tilt(windows: Floats) -> float:
+    return math.sqrt(float(np.square(windows[:, 5:]).sum(axis=1).mean())) if len(windows) else 0.0
+
+
+def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
+    """Average windows; the solution is off by `end` at either end of them all, and by `constant` throughout."""
+    if len(values) < _LEAST:
+        return None
+    freedom = len(values) - 1
+    scatter = float(values.std(ddof=1)) / np.sqrt(len(values)) * student_quantile(2.0, freedom) / 2.0
+    sigma = np.sqrt(scatter**2 + 2.0 * (end / span_s) ** 2 + constant**2)
+    return Term(float(values.mean()), float(sigma))
+
+
+def _slopes(
+    values: Floats, windows: Floats, levels: Floats | None, end: float, aside: float
+) -> tuple[Term | None, Term | None]:
+    times = windows[:, 0]
+    columns = {}
+    if len(times) > _LEAST and np.ptp(times) >= _LEAST_TREND_S:
+        columns["trend"] = (times - times.mean()) / 60.0
+    if levels is not None and len(levels) and levels.std() > _LEAST_SPREAD * abs(np.median(levels)):
+        columns["vibration"] = levels - levels.mean()
+    freedom = len(values) - 1 - len(columns)
+    if not columns or freedom < _LEAST:
+        return None, None
+    design = np.column_stack([np.ones(len(values)), *columns.values()])
+    fit, _, rank, _ = np.linalg.lstsq(design, values, rcond=None)
+    if rank < design.shape[1]:
+        return None, None
+    left = values - design @ fit
+    variance = float(left @ left) / freedom * (student_quantile(2.0, freedom) / 2.0) ** 2
+    # The solution's own wandering over minutes, by the same columns.
+    wander = math.hypot(end / LENGTH_S / math.sqrt(len(values)), aside * _tilt(windows))
+    sigmas = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * (variance + wander**2))
+    terms = {name: Term(float(fit[1 + k]), float(sigmas[1 + k])) for k, name in enumerate(columns)}
+    return terms.get("vibration"), terms.get("trend")
+
+
+# --- rotations and sums
+
+
 def matrices(q: Floats) -> Floats:
-    """(n, 3, 3) of quaternions (n, 4) of any length."""
+    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4) of any length."""
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -334,7 +365,7 @@ def matrices(q: Floats) -> Floats:
 
 
 def vectors(turns: Floats) -> Floats:
-    """(n, 3) rotation vectors of matrices (n, 3, 3) that turn by less than half a circle."""
+    """Return the rotation vectors (n, 3) of matrices (n, 3, 3) that turn by less than half a circle."""
     skew = 0.5 * (turns - _transposed(turns))
     sine = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
     size = np.linalg.norm(sine, axis=1)
@@ -347,16 +378,17 @@ def _transposed(turns: Floats) -> Floats:
 
 
 def _one_sign(q: Floats) -> Floats:
-    """Choose of q and -q, which are the same, the one next to the one before."""
+    """Choose of q and -q, which are one rotation, the one nearer to the row before."""
     if not len(q):
         return q
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
     return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
 
 
+def _cumulative(values: Floats) -> Floats:
+    """Return the sum of the values before each, and of all: one row more than they have."""
+    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
+
+
 def _between(t_s: Floats, known_s: Floats, values: Floats) -> Floats:
     return np.column_stack([np.interp(t_s, known_s, column) for column in values.T])
-
-
-def _at(ascending: Floats, share: float) -> float:
-    return float(ascending[min(int(share * len(ascending)), len(ascending) - 1)])

@@ -21,10 +21,10 @@ from companion.estimation.noise.allan import PROFILES, noise_profile
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Stages, Term
 from companion.estimation.records.record import Record
 from companion.estimation.solution.prior import curve_of
-from companion.lab.flight import ardupilot_log, inertial, px4_log
-from companion.lab.flight.inertial import NO_WINDOWS, Boot, FlownImu, Increments, Navigation
-from companion.lab.flight.split import LENGTH_S, SHORT_S, split
-from companion.lab.logs.autopilot_logs import read_ulog, reader_of
+from companion.lab import ardupilot_log, inertial, px4_log
+from companion.lab.autopilot_logs import Boot, FlownImu
+from companion.lab.inertial import LENGTH_S, NO_WINDOWS, SHORT_S, Increments, Navigation
+from companion.lab.log_files import format_of
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
@@ -34,9 +34,9 @@ from companion.storage.records import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
 _SETTLED_S: Final = 3.0
-"""After the take-off, and before the landing."""
+"""Left out after the take-off, and before the landing."""
 _STOOD_S: Final = 30.0
-"""Before the motors, at most."""
+"""Longest time before the motors' start that is analysed."""
 _STILL_RAD_S: Final = 0.005
 _OUTLIER: Final = 6.0
 _USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
@@ -44,36 +44,29 @@ _USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
-_ENCRYPTED: Final = b"ULogEnc"
 _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-"""ArduPilot's up to 4.6, from 4.7 on; PX4's."""
-
+"""ArduPilot up to 4.6, ArduPilot from 4.7, PX4."""
+_UNKNOWN: Final[Sequence[Term | None]] = (None,) * 4
 
 Knowledge = tuple[Sequence[Record], Mapping[str, KnownImu]]
-"""Records, the newest first, and learned biases on the companion's disk."""
 
 
 def read(path: Path) -> Iterator[Boot]:
-    """Read each start of the autopilot in a log."""
-    try:
-        reader = reader_of(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if reader is None:
-        with path.open("rb") as file:
-            if file.read(len(_ENCRYPTED)) == _ENCRYPTED:
-                raise StorageError(f"{path}: encrypted by PX4: decrypt it first (Tools/log_encryption of PX4)")
-        raise StorageError(f"{path}: no log of ArduPilot (.bin) or PX4 (.ulg)")
-    return px4_log.read(path) if reader is read_ulog else ardupilot_log.read(path)
+    match format_of(path):
+        case "ulog":
+            return px4_log.read(path)
+        case "dataflash":
+            return ardupilot_log.read(path)
+        case _:
+            raise StorageError(f"{path}: no log of ArduPilot (.bin) or PX4 (.ulg)")
 
 
 async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
-    """Analyse all flights of one start of the autopilot, in order."""
     reference = boot.truth or boot.solution
     if reference is None:
         return []
     reference = _on_earth(boot, reference)
-    # Filters delay the readings; what is compared with the solution must be of the same moment.
+    # Filters delay the readings, and the solution must be compared with those of the same moment.
     late: dict[int, Increments] = {}
     for imu in boot.imus:
         rows = inertial.whole(np.column_stack([imu.t_s, imu.readings]))
@@ -104,7 +97,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
 
 
 def _key(boot: Boot, stages: Stages) -> str:
-    """Hash what tells flights apart: both firmwares count in parameters how often and how long they ran."""
+    """Identify a flight: both firmwares count in parameters how often and how long they ran."""
     sensors = [(imu.number, imu.gyro_id, imu.accel_id) for imu in boot.imus]
     told = [boot.firmware, stages.armed_s, sensors, sorted(boot.parameters_at(stages.armed_s).items())]
     return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
@@ -121,7 +114,6 @@ def _during(found: Increments, stages: Stages) -> Increments:
 
 
 def _on_earth(boot: Boot, reference: Navigation) -> Navigation:
-    """Add gravity and the Earth's rate of the place, where it is known and a simulator has them."""
     if boot.place is None:
         return reference
     gravity = reference.gravity_m_s2 if boot.standard_gravity else gravity_m_s2(*boot.place)
@@ -148,11 +140,10 @@ def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
 
 
 def _lifted(reference: Navigation, armed_s: float, end_s: float) -> tuple[float | None, float | None]:
-    """Find take-off and landing by height, for aircraft that log none."""
     inside = (reference.t_s >= armed_s) & (reference.t_s <= end_s)
     t_s, down = reference.t_s[inside], reference.position[inside, 2]
-    high = np.flatnonzero(down < down[0] - _LIFTED_M) if len(down) else np.zeros(0, dtype=np.int64)
-    return (float(t_s[high[0]]), float(t_s[high[-1]])) if len(high) else (None, None)
+    high_s = t_s[down < down[:1] - _LIFTED_M]
+    return (float(high_s[0]), float(high_s[-1])) if len(high_s) else (None, None)
 
 
 async def _imu(
@@ -193,12 +184,13 @@ async def _imu(
         of = f"{aside} of {len(stretches)} stretches of {LENGTH_S:.0f} s"
         notes.append(f"{of} left aside, far off the others: the EKF has jumped, or the IMU")
     drift: dict[str, list[Drift]] = {}
+    ekf = warmth = _UNKNOWN
     if in_air is not None:
         offsets = _offset_sets(calibration, match and match[1], found, in_air)
         drift = inertial.drift(found, reference, in_air, SPANS_S, offsets)
-    warmth: Sequence[Term | None] = [None] * 4
-    if calibration is not None and in_air is not None:
-        warmth = _warmth(imu, calibration, biases, stages, in_air)
+        ekf = _ekf(imu, in_air)
+        if calibration is not None:
+            warmth = _warmth(imu, calibration, biases, stages, in_air)
     return ImuFlight(
         imu=imu.number,
         rate_hz=imu.rate_hz,
@@ -207,14 +199,14 @@ async def _imu(
         accel_id=imu.accel_id if calibration is None else calibration.accel_id,
         set_gyro_rad_s=None if calibration is None else calibration.gyro_offset_rad_s,
         set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
-        axes=tuple(split(ground, flown, _means(imu.vibration, flown[:, 0]), warmth, _ekf(imu, in_air))),
+        axes=tuple(inertial.split(ground, flown, _means(imu.vibration, flown[:, 0]), warmth, ekf)),
         drift=drift,
         notes=tuple(notes),
     )
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
-    """List windows before the motors, if it stood still: that is known better than any solution."""
+    """List windows before the motors, compared with standing still, which is surer than any solution."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:
@@ -228,7 +220,7 @@ def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
 
 
 def _kept(rows: Floats) -> Floats:
-    """Leave out windows in which the solution has jumped, as when it found its heading anew."""
+    """Leave out windows in which the solution has jumped, such as at a reset of its heading."""
     if len(rows) < 4:
         return rows
     off = np.abs(rows[:, 1:5] - np.median(rows[:, 1:5], axis=0))
@@ -237,24 +229,26 @@ def _kept(rows: Floats) -> Floats:
 
 
 def _means(table: Floats, times_s: Floats) -> Floats | None:
-    """Average a value, from rows of time and value, about each of these times."""
     if len(table) < 2:
         return None
     edges = [table[:-1, 0].searchsorted([at_s - LENGTH_S / 2, at_s + LENGTH_S / 2]) for at_s in times_s]
     return np.array([table[a : max(b, a + 1), 1].mean() for a, b in edges])
 
 
-def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]:
+def _ekf(imu: FlownImu, in_air: tuple[float, float]) -> Sequence[Term | None]:
     """Average the EKF's biases over the latter half; sigma is its own, and the rounding in the log."""
-    found, nothing = imu.estimated, [None] * 4
-    if found is None or in_air is None:
-        return [*nothing]
+    found = imu.estimated
+    if found is None:
+        return _UNKNOWN
     late = (found[:, 0] >= 0.5 * (in_air[0] + in_air[1])) & (found[:, 0] <= in_air[1])
     values, sigmas = found[late, 1:5], found[late, 5:]
     if not late.any() or not np.isfinite(sigmas).all():
-        return [*nothing]
-    sigma = np.hypot(values.std(axis=0), sigmas.mean(axis=0))
-    return [Term(*each) for each in zip(values.mean(axis=0).tolist(), sigma.tolist(), strict=True)]
+        return _UNKNOWN
+    return _terms(values.mean(axis=0), np.hypot(values.std(axis=0), sigmas.mean(axis=0)))
+
+
+def _terms(values: Floats, sigmas: Floats) -> list[Term]:
+    return [Term(*each) for each in zip(values.tolist(), sigmas.tolist(), strict=True)]
 
 
 def _offset_sets(
@@ -263,7 +257,7 @@ def _offset_sets(
     found: Increments,
     in_air: tuple[float, float],
 ) -> dict[str, tuple[Floats, Floats]]:
-    """Return the changes of the output (SI) by the offsets before the calibration, and by those flown (none)."""
+    """Return the change of the output (SI) by the offsets from before the calibration, and by those flown: none."""
     sets: dict[str, tuple[Floats, Floats]] = {}
     if calibration is not None and before:
         inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
@@ -281,24 +275,21 @@ def _warmth(
     biases: Mapping[str, KnownImu],
     stages: Stages,
     in_air: tuple[float, float],
-) -> list[Term | None]:
-    """Predict by the learnt curve the step of the gyros from before the motors to the air."""
-    nothing: list[Term | None] = [None] * 4
+) -> Sequence[Term | None]:
     own = next((one for one in biases.values() if _is_same(one.identity, imu, calibration)), None)
     start_s = stages.motors_s or stages.armed_s
     seen = [
         imu.degc[(imu.degc[:, 0] >= a) & (imu.degc[:, 0] <= b), 1] for a, b in ((start_s - _STOOD_S, start_s), in_air)
     ]
     if own is None or not all(map(len, seen)):
-        return nothing
+        return _UNKNOWN
     part = own.identity.get("profile", "")
     curve = curve_of(own.points, "gyro", noise_profile(part if part in PROFILES else None).gyro)
     then, now = (float(degc.mean()) for degc in seen)
     if curve is None or max(curve.beyond_k(then), curve.beyond_k(now)) > 0.0:
-        return nothing
+        return _UNKNOWN
     step, variance = curve.change((then, 0.0), (now, 0.0))
-    step = step - calibration.thermal_change("gyro", then, now)
-    return [*(Term(*each) for each in zip(step.tolist(), np.sqrt(variance).tolist(), strict=True)), None]
+    return [*_terms(step - calibration.thermal_change("gyro", then, now), np.sqrt(variance)), None]
 
 
 def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibration) -> bool:
@@ -311,8 +302,6 @@ def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibra
 
 
 class _LoggedParameters(Parameters):
-    """Parameters of a log, which is of one start."""
-
     firmware: FirmwareName | None = None
     boots = 1
 
@@ -335,7 +324,6 @@ class _LoggedParameters(Parameters):
 
 
 async def _calibration_in(firmware: FirmwareName, values: Mapping[str, float], imu: FlownImu) -> ImuCalibration:
-    """Read what the autopilot corrected an IMU with from the parameters in the log."""
     memory = SlotMemory()
     ids: dict[Triad, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
     for sensor, device_id in ids.items():
@@ -360,7 +348,6 @@ def _written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple
 
 
 def _iso(unix_s: float | None) -> str | None:
-    """Format a time in UTC, ISO 8601; None: it is not believable."""
     if unix_s is None or not 0.0 < unix_s < 1e11:
         return None
     return datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).isoformat(timespec="seconds")

@@ -11,19 +11,22 @@ import io
 import itertools
 import mmap
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from companion.autopilot.parameters.change import FirmwareName
 from companion.errors import StorageError
-from companion.lab.logs.still_log import LAST_S, StillLog
+from companion.lab.inertial import Navigation
+from companion.lab.still_log import LAST_S, StillLog, unreadable
 from companion.physics.frames import Floats
 
 US: Final = 1e-6
 DATAFLASH_MAGIC: Final = b"\xa3\x95\x80"
-"""Beginning of a dataflash log: the head of a format message that describes format messages."""
 ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
 _HEAD: Final = DATAFLASH_MAGIC[:2]
 _FMT: Final = np.dtype([("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")])
@@ -31,12 +34,11 @@ _CLOCK: Final = "TimeUS"
 _PARAMETER: Final = "PARM"
 _MOST_PARAMETERS: Final = 1 << 16
 _INSTANCES: Final = 16
-"""Most instances: a larger number is damage."""
 
 Fields = Mapping[str, tuple[str, tuple[str, ...]]]
-"""Field with the instance, or nothing, and fields to read, by message."""
+"""Field with the instance (or ""), and fields to read, by message."""
 _MOST_TIMES: Final = 4
-"""Most times that a file is read: damage can lead pyulog back to where it was, again and again."""
+"""Damage can lead pyulog back to an earlier message, again and again."""
 _NEEDS_MORE: Final = (
     "a log of PX4 needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
@@ -45,7 +47,6 @@ Topics = Mapping[str, tuple[str, ...]]
 """Fields to read by topic; arrays element by element: `gyro_rad[0]`."""
 
 _LARGEST: Final = 1e6
-"""Largest reading, in SI units."""
 _CORRECTED: Final = (
     "the autopilot's offsets are taken off in it: what is found is what they leave, in the vehicle's axes"
 )
@@ -59,23 +60,20 @@ _TOPICS: Final = {
 
 
 class BootMessages:
-    """Messages of one start of the autopilot."""
+    """Messages of one start of the autopilot; parameters as time in s, name and value."""
 
     def __init__(self, fields: Mapping[str, int]) -> None:
         self._fields = fields
         self._chunks: dict[tuple[str, int], list[Floats]] = defaultdict(list)
         self.parameters: list[tuple[float, str, float]] = []
-        """Time in s, name and value."""
         self.gaps = 0
-        """Gaps in which the autopilot could not write."""
 
     def add(self, name: str, instance: int, rows: Floats) -> None:
-        """Add rows of a message in the order of the file: the autopilot's clock in s, and the fields; NaN: no field."""
+        """Add rows in the order of the file: the autopilot's clock in s, then the fields; NaN: no such field."""
         if 0 <= instance < _INSTANCES:
             self._chunks[name, instance].append(rows)
 
     def add_parameters(self, found: Iterator[tuple[float, str, float]]) -> None:
-        """Add parameters, up to a bound."""
         self.parameters += itertools.islice(found, _MOST_PARAMETERS - len(self.parameters))
 
     def unsorted(self, name: str, instance: int = 0) -> Floats:
@@ -83,16 +81,14 @@ class BootMessages:
         return np.concatenate([np.zeros((0, 1 + self._fields[name])), *self._chunks.get((name, instance), ())])
 
     def rows(self, name: str, instance: int = 0) -> Floats:
-        """Return the rows of a message in the order of their times."""
         return ascending(self.unsorted(name, instance))
 
     def instances(self, name: str) -> list[int]:
-        """List the instances that have logged a message."""
         return sorted(instance for each, instance in self._chunks if each == name)
 
 
 def ascending(rows: Floats) -> Floats:
-    """Select rows in order of their time, the first column; a single one that is ahead of all others is damage."""
+    """Select rows in order of their time, the first column; a single one ahead of all others is damage."""
     rows = rows[np.isfinite(rows[:, 0])]
     if not len(rows):
         return rows
@@ -103,24 +99,18 @@ def ascending(rows: Floats) -> Floats:
 
 
 class _Kind:
-    """Layout of one kind of dataflash message, and the messages of it since the start."""
-
-    def __init__(self, length: int, name: str = "", layout: np.dtype[np.void] | None = None) -> None:
-        self.length = length
-        """Length with the head."""
-        self.name = name
-        self.layout = layout
-        """None: not to be read."""
+    def __init__(self, length: int, name: str = "") -> None:
+        self.length, self.name = length, name
+        self.layout: np.dtype[np.void] | None = None
         self.factors: dict[str, float] = {}
         self.data = bytearray()
 
     def move(self, to: BootMessages, fields: Fields) -> None:
-        """Move the messages to those of a start."""
         if self.layout is None or not self.data:
             return
         messages = np.frombuffer(bytes(self.data), self.layout)
         self.data.clear()
-        key, wanted = fields.get(self.name, ("Name", ("Value",)))
+        key, wanted = fields[self.name]
         there = messages.dtype.names or ()
         rows = np.full((len(messages), 1 + len(wanted)), np.nan)
         rows[:, 0] = messages[_CLOCK] * US
@@ -139,8 +129,9 @@ class _Kind:
 
 
 def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
-    """Give these messages and the parameters of each start in a file, one after another: memory is that of one."""
+    """Read these messages and the parameters, start by start: memory is that of one."""
     kinds: dict[bytes, _Kind] = {DATAFLASH_MAGIC: _Kind(_FMT.itemsize + 3)}
+    fields = {**fields, _PARAMETER: ("Name", ("Value",))}
     widths = {name: len(columns) for name, (_, columns) in fields.items()}
     start = BootMessages(widths)
     try:
@@ -167,14 +158,13 @@ def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
                         kinds[head] = described
                 at = after
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
     for each in kinds.values():
         each.move(start, fields)
     yield start
 
 
 def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
-    """Give the head and the kind of the messages that a format message describes; None: it cannot be one."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT
 
     number, length, *said = np.frombuffer(data, _FMT)[0].tolist()
@@ -183,7 +173,7 @@ def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
     if length <= len(head):
         return head, None
     kind = _Kind(length, name)
-    if name not in fields and name != _PARAMETER:
+    if name not in fields:
         return head, kind
     parts = []
     for letter, label in zip(letters, labels.split(","), strict=False):
@@ -194,7 +184,7 @@ def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
         layout = np.dtype(parts)
     except (TypeError, ValueError):
         return head, kind
-    key, wanted = fields.get(name, ("Name", ("Value",)))
+    key, wanted = fields[name]
     types = {label: layout[label].kind for label in layout.names or ()}
     good = layout.itemsize + len(head) == length and _CLOCK in types
     good = good and "S" not in {types.get(label) for label in (_CLOCK, *wanted)}
@@ -204,14 +194,11 @@ def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
 
 
 class _Counted(io.BufferedReader):
-    """A file of which only so much can be read."""
-
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
         self._left = _MOST_TIMES * path.stat().st_size + (1 << 20)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes."""
         data = super().read(size)
         self._left -= len(data)
         if self._left < 0:
@@ -220,7 +207,6 @@ class _Counted(io.BufferedReader):
 
 
 def ulog(path: Path, topics: Topics) -> BootMessages:
-    """Read these topics, the parameters and the dropouts."""
     try:
         from pyulog import ULog
     except ImportError:
@@ -230,7 +216,7 @@ def ulog(path: Path, topics: Topics) -> BootMessages:
         with _Counted(path) as file, contextlib.redirect_stdout(None):
             log = ULog(file, [*topics])
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
     except Exception as error:  # noqa: BLE001 - pyulog raises anything of a damaged file
         raise StorageError(f"{path}: not a readable log of PX4: {' '.join(str(error).split())[:200]}") from None
     start = BootMessages({name: len(fields) for name, fields in topics.items()})
@@ -246,16 +232,78 @@ def ulog(path: Path, topics: Topics) -> BootMessages:
     return start
 
 
+# --- flights, whichever firmware wrote the log
+
+
+class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one log, numbered from 1 as in the configuration.
+
+    Readings (n, 6) are in rad/s and m/s^2, corrected by the firmware, vehicle FRD; `means`: each is the mean since the
+    one before, not an instant. Temperatures and vibration levels (m/s^2) have rows of time and value. `estimated` are
+    biases of an EKF, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), sigma of each; NaN where unknown.
+    Readings at `failed_s`, when the autopilot took the IMU for failed, are left out.
+    """
+
+    number: int
+    t_s: Floats
+    readings: Floats
+    means: bool
+    gyro_id: int | None = None
+    accel_id: int | None = None
+    degc: Floats = np.zeros((0, 2))
+    vibration: Floats = np.zeros((0, 2))
+    estimated: Floats | None = None
+    failed_s: Floats = np.zeros(0)
+
+    @property
+    def rate_hz(self) -> float:
+        return (len(self.t_s) - 1) / float(self.t_s[-1] - self.t_s[0]) if len(self.t_s) > 1 else 0.0
+
+
+class Boot(msgspec.Struct, frozen=True, kw_only=True):
+    """Log of one start of the autopilot; times in s on its clock, which `unix_offset_s` takes to UTC.
+
+    A simulator may have no Earth's rate, and standard gravity everywhere.
+    """
+
+    firmware: FirmwareName
+    imus: tuple[FlownImu, ...]
+    solution: Navigation | None
+    truth: Navigation | None = None
+    armed: tuple[tuple[float, bool], ...] = ()
+    motors: tuple[tuple[float, bool], ...] = ()
+    airborne: tuple[tuple[float, bool], ...] = ()
+    parameters: tuple[tuple[float, str, float], ...] = ()
+    unix_offset_s: float | None = None
+    place: tuple[float, float] | None = None
+    """Latitude in degrees, height in m."""
+    earth_turns: bool = True
+    standard_gravity: bool = False
+    notes: tuple[str, ...] = ()
+
+    def parameters_at(self, t_s: float) -> dict[str, float]:
+        """Return the parameters at a time; one that was logged only later has its first value."""
+        found: dict[str, float] = {}
+        for told_s, name, value in self.parameters:
+            if told_s <= t_s or name not in found:
+                found[name] = value
+        return found
+
+
+def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]) -> tuple[tuple[float, bool], ...]:
+    found: list[tuple[float, bool]] = []
+    for at_s, state in zip(t_s, states, strict=True):
+        if not found or found[-1][1] != bool(state):
+            found.append((float(at_s), bool(state)))
+    return tuple(found)
+
+
+def in_use(choices: Floats, t_s: Floats) -> Floats:
+    """Look up which of (n, 2) times and choices is in use at each time; before the first, the first."""
+    return np.asarray(choices[np.maximum(np.searchsorted(choices[:, 0], t_s, side="right") - 1, 0), 1])
+
+
 # --- IMUs at rest
-
-
-def reader_of(path: Path) -> Callable[[Path], list[StillLog]] | None:
-    """Return the reader of an autopilot's log; None: the file is none."""
-    with path.open("rb") as file:
-        head = file.read(len(ULOG_MAGIC))
-    if head.startswith(ULOG_MAGIC):
-        return read_ulog
-    return read_dataflash if head.startswith(DATAFLASH_MAGIC) else None
 
 
 def read_ulog(path: Path) -> list[StillLog]:
@@ -278,7 +326,6 @@ def read_ulog(path: Path) -> list[StillLog]:
 
 
 def read_dataflash(path: Path) -> list[StillLog]:
-    """Read the IMUs of an ArduPilot log, from its IMU messages."""
     starts = list(dataflash(path, {"IMU": ("I", _FIELDS)}))
     logs: list[StillLog] = []
     for instance in sorted({each for start in starts for each in start.instances("IMU")}):
@@ -288,10 +335,7 @@ def read_dataflash(path: Path) -> list[StillLog]:
 
 
 def _log(path: Path, imu: str, table: Floats, notes: tuple[str, ...]) -> Iterator[StillLog]:
-    """Make the log of an IMU from the samples that are whole and in order of time, if there are any.
-
-    The table has a column of times, six of readings and one of temperatures.
-    """
+    """Make the log of an IMU from the samples that are whole and in order; rows of time, six readings, temperature."""
     t_s, readings = table[:, 0], table[:, 1:7]
     whole = (np.abs(t_s) < LAST_S) & (np.abs(readings) < _LARGEST).all(axis=1)
     ahead = whole.copy()
@@ -302,7 +346,6 @@ def _log(path: Path, imu: str, table: Floats, notes: tuple[str, ...]) -> Iterato
         yield StillLog(
             imu=imu,
             files=(path.name,),
-            began_unix_s=None,
             t_s=t_s[ahead],
             readings=readings[ahead],
             temperature_degc=table[ahead, 7],

@@ -25,9 +25,9 @@ from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Remedies, Whereabouts, local_earth
-from companion.estimation.solution.solve import solve
+from companion.estimation.solution.solve import Solution, solve
 from companion.formats import Object
-from companion.lab.logs.still_log import StillLog
+from companion.lab.still_log import StillLog
 from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import DEG
 from companion.samples import ImuSample, Vector
@@ -45,54 +45,47 @@ _REMEDIES: Final = Remedies(
     any_bias="--any-bias takes it",
 )
 _LONGER: Final = 1.02
-"""A window is chosen again when the stretch has grown by so much."""
 _AT_ONCE: Final = 4096
 
 MOST_WINDOWS: Final = 100_000
-"""Eleven days of the shortest; a clock that jumps makes more."""
+"""Eleven days of the shortest windows; a clock that jumps makes more."""
 PAUSE_S: Final = 3.0
 """A sensor that was silent for longer may have been switched off."""
 HORIZON_S: Final = 180.0
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
 _SAME_RAD: Final = 1.0 * DEG
-"""More than any bias drifts by: gravity from elsewhere is another pose."""
+"""More than any bias drifts by: a larger turn of gravity is another pose."""
 _EXACT_DEG: Final = 1e-4
 _LATITUDE_DEG: Final = 45.0
-"""Any: the Earth's rate cancels, too."""
+"""Any will do: the Earth's rate cancels."""
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
-    """Pose and place of the IMU, which the log does not contain; None: not known, which widens the sigmas."""
+    """Pose and place of the IMU, which the log does not contain; an unknown one (None) widens the sigmas.
+
+    The heading is true. `powered`: least time in s from the switch-on to the beginning of the log. `mounting`: IMU to
+    vehicle FRD. `profile`: the IMU's model, or learned figures. `any_bias`: accept biases beyond those of any part.
+    """
 
     pitch_deg: float | None = None
     roll_deg: float | None = None
     heading_deg: float | None = None
-    """True."""
     sigma_deg: float = 0.05
     heading_sigma_deg: float = 3.0
     latitude_deg: float | None = None
     height_m: float | None = None
     powered: float = 0.0
-    """Time in s for which the IMU had been switched on when the log began, at least."""
     mounting: Mounting = "ROTATION_NONE"
-    """IMU to vehicle FRD."""
     profile: str | NoiseProfile | None = None
-    """The IMU's model, or figures learned, for its Allan figures."""
     any_bias: bool = False
-    """True: accept biases beyond those of any part."""
 
 
 def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Object]:
-    """Estimate the biases from the longest still stretch of a log.
-
-    Return also which part of the log went into the means, in seconds from its first sample on, as JSON has it.
-    """
+    """Estimate the biases from the longest still stretch of a log; return also which part of it was used, for JSON."""
     return _Pass(log, given, max_still_s).run()
 
 
 class _Pass:
-    """One log through one collector."""
-
     def __init__(self, log: StillLog, given: Given, max_still_s: float) -> None:
         self._log, self._given = log, given
         self._gradienter = self._compass = None
@@ -117,7 +110,6 @@ class _Pass:
         self._obstacle = ""
 
     def run(self) -> tuple[Record, Object]:
-        """Run from the first sample to the last."""
         log, collector = self._log, self._collector
         began_at = datetime.datetime.now(tz=datetime.UTC)
         offset_s = _FIRST_S - float(log.t_s[0])
@@ -132,17 +124,22 @@ class _Pass:
             collector.add_imu(log.imu, ImuSample(now_s, gyro, accel, degc))
         collector.tick(end_s + 0.3)
         self._look(end_s + 0.3, longer=1.0)
-        best, refused = _latest(self._found)
         seconds = end_s - _FIRST_S
-        if best is None:
-            why = refused or f"no {MIN_STILL_S:.0f} s at rest in it: {self._obstacle or self._unusable(seconds)}"
-            record = record_of(None, began_at, seconds, state="failed", reason=why)
-            return record, self._used([], seconds)
-        measurement, window = best
-        return self._solved(began_at, window, seconds), self._used(measurement.slots, seconds)
+        slots: Sequence[int] = ()
+        warnings = (
+            [] if self._gradienter is not None else ["no accelerometer biases without --pitch-deg and --roll-deg"]
+        )
+        try:
+            measurement, window = self._latest(seconds)
+            slots = measurement.slots
+            solution = self._solve(window, began_at.date())
+        except CalibrationRefusedError as error:
+            record = record_of(None, began_at, seconds, state="failed", reason=str(error), warnings=warnings)
+        else:
+            record = record_of(solution, began_at, seconds, warnings=warnings)
+        return record, self._used(slots, seconds)
 
     def _look(self, now_s: float, longer: float = _LONGER) -> None:
-        """Measure at the end of a second if the stretch has grown enough."""
         glance = self._collector.glance(now_s)
         if glance.obstacle is not None:
             if glance.obstacle.hold_still_s is None:
@@ -151,8 +148,21 @@ class _Pass:
             self._found.append(self._aged(self._collector.measurement(now_s)))
             self._still_s = glance.still_s
 
+    def _latest(self, seconds: float) -> tuple[Measurement, Window]:
+        """Find the latest measurement that gives a window; if none does, raise the reason of the last."""
+        refusals = []
+        for each in reversed(self._found):
+            try:
+                return each, each.window()
+            except CalibrationRefusedError as error:
+                refusals.append(error)
+        if refusals:
+            raise refusals[0]
+        raise CalibrationRefusedError(
+            f"no {MIN_STILL_S:.0f} s at rest in it: {self._obstacle or self._unusable(seconds)}"
+        )
+
     def _unusable(self, seconds: float) -> str:
-        """Give the reason where no second could be judged."""
         (imu, *_) = self._collector.status(seconds + _FIRST_S).sources
         worst = max(imu.dropped, key=lambda why: imu.dropped[why], default="")
         return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
@@ -167,21 +177,13 @@ class _Pass:
             return measurement
         return msgspec.structs.replace(measurement, begun_s={self._log.imu: begun_s - powered})
 
-    def _solved(self, began_at: datetime.datetime, window: Window, seconds: float) -> Record:
+    def _solve(self, window: Window, today: datetime.date) -> Solution:
         given = self._given
-        blind = self._gradienter is None
-        warnings = ["no accelerometer biases without --pitch-deg and --roll-deg"] if blind else []
         source = None if given.latitude_deg is None and given.height_m is None else "command line"
-        where = Whereabouts(given.latitude_deg, None, given.height_m, source, began_at.date())
-        try:
-            earth = local_earth(where, _REMEDIES)
-            solution = solve(
-                _posed(window, given), earth, self._gradienter, self._compass, What.GYROS if blind else What.BOTH,
-                any_bias=given.any_bias,
-            )  # fmt: skip
-        except CalibrationRefusedError as error:
-            return record_of(None, began_at, seconds, state="failed", reason=str(error), warnings=warnings)
-        return record_of(solution, began_at, seconds, warnings=warnings)
+        earth = local_earth(Whereabouts(given.latitude_deg, None, given.height_m, source, today), _REMEDIES)
+        what = What.GYROS if self._gradienter is None else What.BOTH
+        window = _posed(window, given)
+        return solve(window, earth, self._gradienter, self._compass, what, any_bias=given.any_bias)
 
     def _used(self, slots: Sequence[int], seconds: float) -> Object:
         first = math.ceil(_FIRST_S)
@@ -205,19 +207,7 @@ def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vecto
             yield now_s, (gx, gy, gz), (ax, ay, az), None if degc != degc else degc
 
 
-def _latest(found: list[Measurement]) -> tuple[tuple[Measurement, Window] | None, str]:
-    """Find the latest measurement that gives a window; without one, the reason of the very latest."""
-    refused = ""
-    for each in reversed(found):
-        try:
-            return (each, each.window()), ""
-        except CalibrationRefusedError as error:
-            refused = refused or str(error)
-    return None, refused
-
-
 def _posed(window: Window, given: Given) -> Window:
-    """Replace gradienter and compass of a window by the given pose."""
     tilt, heading = window.tilt, window.heading
     if given.pitch_deg is not None and given.roll_deg is not None:
         tilt = TiltWindow(
@@ -234,17 +224,16 @@ def _posed(window: Window, given: Given) -> Window:
 def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
     """Check sigma on a sensor: calibrate every window of a length in seconds by itself, as after a start.
 
-    What a window finds is compared with what the windows after it find: the difference has to be within 2 sigma in 95
-    of 100 cases. How the sensor lay is the same in both and cancels: the pose counts as known, and sigma is the
-    sensor's alone. Windows between which it was moved are not compared.
+    The result of a window is compared with those of the windows after it: in 95 of 100 cases they should agree within
+    2 sigma. The pose is the same in both and cancels: it counts as known, and sigma is the sensor's alone. Windows are
+    not compared across a move of the sensor.
 
     Returns:
-        Number of windows; number of those without a result by reason, the commonest first, where reasons that differ in
-        figures are one; comparisons by axis, none where fewer than two windows in a row gave a result.
+        Number of windows; number of failed ones by reason, whatever its figures, the commonest first; comparisons by
+        axis, none where no two windows in a row gave a result.
     """
     posed, force = given, np.zeros(3)
     found: list[Floats | None] = []
-    """Bias, sigma_stat and sigma_use of each window, (3, 6); None: it gave none."""
     whys: list[str] = []
     begin_s = float(log.t_s[0])
     starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
@@ -279,7 +268,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str
 
 
 def _posed_by(force: Floats, given: Given) -> Given:
-    """Fill in what was not given: a pose by that specific force (3,), and a place, both exact."""
+    """Fill in what was not given: the pose by that specific force (3,), and a place, both exact."""
     mean = rotation_matrix(given.mounting) @ force
     roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
     return msgspec.structs.replace(
@@ -301,7 +290,6 @@ def _figures(imu: ImuRecord) -> Floats | None:
 
 
 def _counted(whys: Sequence[str]) -> dict[str, int]:
-    """Count reasons without their figures, the commonest first; the key is the first of a kind."""
     kinds = Counter(re.sub(r"\d+(\.\d+)?", "", why) for why in whys)
     first = {re.sub(r"\d+(\.\d+)?", "", why): why for why in reversed(whys)}
     return {first[kind]: count for kind, count in kinds.most_common()}
@@ -310,8 +298,8 @@ def _counted(whys: Sequence[str]) -> dict[str, int]:
 def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[Object]:
     """Compare every window with the mean of the `span` windows after it; by axis, in rad/s or m/s^2.
 
-    `rms` is of the misses, `sigma_use` the median of the promised sigmas, `ratio` the root mean square of a miss over
-    its sigma (1 where sigma is right), `share` that within 2 sigma, the white noise of the windows after allowed for.
+    `rms`: of the differences; `sigma_use`: median; `ratio`: root mean square of a difference over its sigma (1 where
+    sigma is right); `share`: part within 2 sigma. Both allow for the white noise of the windows after.
     """
     misses, uses, seen = [], [], []
     for at, one in enumerate(found):

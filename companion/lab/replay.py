@@ -1,8 +1,8 @@
 """A recording through the daemon's decoders, collector and estimator, in the recorded order and at the recorded times.
 
 Recomputed: every sample from its raw bytes, every batch, verdict of stillness and mean, pose, biases and sigmas. Taken
-from the recording: the times of ticks and windows, the parameters in force in the autopilot, the place, what earlier
-power-ups had told, and all that only the autopilot can tell: what was written and read back, with which outcome.
+from the recording: times of ticks and windows, parameters of the autopilot, the place, the expectation from earlier
+power-ups, and everything that only the autopilot knows, such as the outcome of a write.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.results import imu_records, record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
-from companion.lab.logs.recording import UNUSABLE, Head, Playback, Recording, config_of
+from companion.lab.recording import Playback, Recording, reporting_damage
 from companion.recording import messages
 from companion.recording.messages import ImuState, Measured, Solved, Start, decode
 
 FOLLOWS_S: Final = 3.0
-"""Longest gap between two files that follow on one another; a longer one means that a file between them is missing."""
+"""Longest gap between consecutive files; a longer one means that a file between them is missing."""
 TOLERANCE_SIGMAS: Final = 0.01
 """Largest accepted difference of a replayed bias from the recorded one, in its sigma_use."""
 _SIGMAS: Final = {
@@ -44,51 +44,49 @@ _SIGMAS: Final = {
     "accel_bias_m_s2": "accel_sigma_use_m_s2",
     "residual_accel_m_s2": "accel_sigma_use_m_s2",
 }
-"""Compared fields, and the sigma of each."""
 _BEFORE: Final = "it was measured before the recording began"
 
 
 class Replayed(msgspec.Struct, frozen=True):
-    """One calibration again."""
+    """One calibration again.
+
+    `differences` are biases that differ by more than the tolerance; `worst_sigmas` is the largest difference, in
+    sigma_use; both are empty where the estimates were taken from the recording, for the reason `not_recomputed`.
+    """
 
     record: Record
     differences: list[str]
-    """Biases that differ by more than the tolerance, such as `imus[fc].gyro_bias_rad_s[0]: recorded ...`."""
     worst_sigmas: float | None
-    """Largest difference of all biases, in sigma_use; None where nothing was recomputed."""
     not_recomputed: str | None
-    """Reason why its estimates were taken from the recording, if so."""
 
 
 class Replay:
     """One pass over a recording: one file, or several of a ring, the oldest first."""
 
-    def __init__(self, head: Head, path: Path) -> None:
-        config = config_of(head, path)
-        self._path, self._config, self._head = path, config, head
-        self._playback = Playback(config)
+    def __init__(self, recording: Recording) -> None:
+        self._config = recording.config()
+        self._playback = Playback(self._config)
         self._collector: RollingCollector | None = None
         self.calibrations: list[Replayed] = []
-        theirs = head.versions.get("companion")
-        self.notes = [] if theirs == __version__ else [f"recorded with companion {theirs}, here {__version__}"]
-        """Other versions, gaps."""
+        self.notes: list[str] = []
+        if recording.companion != __version__:
+            self.notes.append(f"recorded with companion {recording.companion}, here {__version__}")
         self.cut_short: str | None = None
-        """Why the first file that ends early does so."""
         self._is_cut = False
         self._first_s = self._now_s = self._begun_s = math.nan
         self._where = Whereabouts()
         self._measured: Measurement | CalibrationRefusedError | None = None
         self._offsets: dict[str, ImuCalibration | None] = {}
-        """Offsets in force at the latest window, by IMU."""
         self._solution: Solution | None = None
         self._not_recomputed = _BEFORE
 
-    def take(self, topic: str, t_s: float, data: bytes) -> None:
-        """Replay the next message."""
-        try:
-            self._take(topic, data, t_s)
-        except UNUSABLE as error:
-            raise StorageError(f"{self._path}: a message on {topic} cannot be used by this version ({error})") from None
+    def take(self, recording: Recording) -> None:
+        """Replay one file; if its end is missing, the next one begins anew."""
+        for topic, t_s, data in recording.read():
+            with reporting_damage(recording.path, topic):
+                self._take(topic, data, t_s)
+        self._is_cut = self._is_cut or recording.cut_short is not None
+        self.cut_short = self.cut_short or recording.cut_short
 
     def _take(self, topic: str, data: bytes, t_s: float) -> None:
         if topic == messages.START:
@@ -136,7 +134,7 @@ class Replay:
     def _measure(
         self, collector: RollingCollector, measured: Measured, now_s: float
     ) -> Measurement | CalibrationRefusedError | None:
-        """Take the window of the recorded seconds; None: the recording does not have them all."""
+        """Measure the window of the recorded seconds; None: the recording lacks some of them."""
         if measured.start_s < self._begun_s:
             return None
         try:
@@ -151,7 +149,6 @@ class Replay:
         )
 
     def _solve(self, detail: Solved) -> None:
-        """Estimate from the latest window what the daemon estimated from it."""
         self._solution, self._where = None, detail.where
         if self._measured is None:
             self._not_recomputed = _BEFORE
@@ -179,7 +176,7 @@ class Replay:
         return dataclasses.replace(imu, subtracted=calibration.subtracted(imu.temperature_degc))
 
     def _compare(self, recorded: Record) -> Replayed:
-        """Compare a recorded calibration with its replay; the record takes from it what only the autopilot can tell."""
+        """Compare a recorded calibration with its replay, which copies what only the autopilot knows."""
         solution, self._solution = self._solution, None
         if recorded.pose is None:
             return Replayed(recorded, [], None, "it ended before anything was worked out")
@@ -197,21 +194,10 @@ class Replay:
 
     @property
     def seconds(self) -> float:
-        """Length of the recording."""
         return 0.0 if math.isnan(self._first_s) else self._now_s - self._first_s
-
-    def cut(self, why: str) -> None:
-        """Note that the end of a file is missing, so that the next one begins anew."""
-        self.cut_short = self.cut_short or why
-        self._is_cut = True
-
-    def goes_on(self, head: Head) -> bool:
-        """Return whether a file with this head is of the same run of the daemon."""
-        return (head.offset_ns, head.config) == (self._head.offset_ns, self._head.config)
 
 
 def compared(recorded: Record, again: Record) -> Replayed:
-    """Compare the biases of a record with those of a replay."""
     differences: list[str] = []
     worst = 0.0
     ours = {imu.name: imu for imu in again.imus}
@@ -233,7 +219,6 @@ def compared(recorded: Record, again: Record) -> Replayed:
 
 
 def _change(collector: RollingCollector, before: ImuState | None, state: ImuState) -> None:
-    """Give the collector another stream or other offsets, as the daemon does."""
     name = state.input.name
     if before is None or messages.encode(before.input) != messages.encode(state.input):
         collector.set_imu(state.input)
@@ -244,19 +229,14 @@ def _change(collector: RollingCollector, before: ImuState | None, state: ImuStat
 
 
 def replay(paths: Iterable[Path]) -> Replay:
-    """Replay recordings in this order, each to its end or to where it is cut."""
-    found: Replay | None = None
-    for path in paths:
-        recording = Recording(path)
-        for item in recording.items():
-            if not isinstance(item, Head):
-                if found is not None:
-                    found.take(*item)
-            elif found is None:
-                found = Replay(item, path)
-            elif not found.goes_on(item):
-                raise StorageError(f"{path}: not of the same run of the daemon as the file before; replay it alone")
-        if recording.cut_short is not None and found is not None:
-            found.cut(recording.cut_short)
-    assert found is not None
+    recordings = map(Recording, paths)
+    first = next(recordings)
+    found = Replay(first)
+    found.take(first)
+    for recording in recordings:
+        if not first.is_same_run(recording):
+            raise StorageError(
+                f"{recording.path}: not of the same run of the daemon as the file before; replay it alone"
+            )
+        found.take(recording)
     return found

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.autopilot.firmware.ardupilot import ArduPilot
-from companion.lab.flight.inertial import Boot, FlownImu, changes, joined
-from companion.lab.logs.autopilot_logs import BootMessages, dataflash
+from companion.lab.autopilot_logs import Boot, BootMessages, FlownImu, changes, dataflash, in_use
+from companion.lab.inertial import joined
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
 
@@ -33,7 +33,6 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "EV": ("", ("Id",)),
     "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
 }
-"""Field with the instance, and fields to read, by message."""
 _IMUS: Final = 5
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
@@ -45,7 +44,6 @@ _TURNING_US: Final = 30.0
 
 
 def read(path: Path) -> Iterator[Boot]:
-    """Each start of the autopilot in it, one after another: memory is that of one."""
     return map(_boot, dataflash(path, _ROWS))
 
 
@@ -58,7 +56,7 @@ def _boot(start: BootMessages) -> Boot:
     return Boot(
         firmware=ArduPilot.name,
         imus=tuple(_imu(start, number, parameters, cores) for number in start.instances("IMU")),
-        solution=joined(_in_use(start, "XKQ", lanes), _in_use(start, "XKF1", lanes)),
+        solution=joined(*(_of_core_in_use(start, name, lanes) for name in ("XKQ", "XKF1"))),
         truth=joined(start.rows("SIM"), start.rows("SIM2")),
         armed=_events(start, "armed"),
         motors=_motors(start.rows("RCOU"), parameters),
@@ -77,19 +75,17 @@ def _boot(start: BootMessages) -> Boot:
 
 
 def _lanes(start: BootMessages) -> Floats:
-    """Give the EKF core in use over time, (n, 2); each core logs it."""
+    """Find the EKF core in use over time, (n, 2); each core logs it."""
     told = next((start.rows("XKF4", core) for core in start.instances("XKF4")), np.zeros((0, 2)))
     told = told[(told[:, 1] >= 0) & (told[:, 1] < _IMUS)]
     return told if len(told) else np.zeros((1, 2))
 
 
-def _in_use(start: BootMessages, name: str, lanes: Floats) -> Floats:
-    """Select the rows of a message of the EKF core in use."""
+def _of_core_in_use(start: BootMessages, name: str, lanes: Floats) -> Floats:
     parts = [start.rows(name)[:0]]
     for core in start.instances(name):
         rows = start.rows(name, core)
-        now = np.searchsorted(lanes[:, 0], rows[:, 0], side="right") - 1
-        parts.append(rows[lanes[np.maximum(now, 0), 1] == core])
+        parts.append(rows[in_use(lanes, rows[:, 0]) == core])
     found = np.concatenate(parts)
     return np.asarray(found[np.argsort(found[:, 0])])
 
@@ -146,7 +142,6 @@ def _events(start: BootMessages, what: str) -> tuple[tuple[float, bool], ...]:
 
 
 def _motors(outputs: Floats, parameters: dict[str, float]) -> tuple[tuple[float, bool], ...]:
-    """Read whether any motor turns from the outputs to them."""
     used = [k for k in range(1, 15) if round(parameters.get(f"SERVO{k}_FUNCTION", 0.0)) in _MOTOR_FUNCTIONS]
     if not len(outputs) or not used:
         return ()
@@ -157,10 +152,8 @@ def _motors(outputs: Floats, parameters: dict[str, float]) -> tuple[tuple[float,
 
 def _unix_offset(gps: Floats) -> float | None:
     fixed = gps[(gps[:, 1] >= 3) & (gps[:, 2] > 0)]
-    if not len(fixed):
-        return None
     unix_s = _GPS_UNIX_S + fixed[:, 2] * 604800.0 + fixed[:, 3] * 1e-3 - _LEAP_S
-    return float(np.sort(unix_s - fixed[:, 0])[len(fixed) // 2])
+    return float(np.median(unix_s - fixed[:, 0])) if len(fixed) else None
 
 
 def _place(gps: Floats) -> tuple[float, float] | None:

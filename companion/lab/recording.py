@@ -1,12 +1,13 @@
-"""Reads a recording front to back, as far as it goes, and gives its bytes to the daemon's decoders.
+"""Reads a recording, and gives its bytes to the daemon's decoders.
 
-A power cut or a broken copy may end a file anywhere.
-
-The `mcap` library does the parsing. Lengths are checked before it unpacks anything, since it believes what a file says.
+A power cut or a broken copy may end a file anywhere. The `mcap` library does the parsing; lengths are checked before it
+unpacks anything, since it believes what a file says.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from companion.autopilot.firmware.imu_messages import EkfBiasReading, ImuSamples
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
 from companion.errors import StorageError
+from companion.lab.still_log import unreadable
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.recording import messages
 from companion.recording.messages import EKF_BIAS, IMU, MAVLINK, SERIAL, ImuState, decode
@@ -30,92 +32,89 @@ MOST_BYTES: Final = 4 * 1024 * 1024
 _NEEDS_MORE: Final = (
     "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
-UNUSABLE: Final = (
+_UNUSABLE: Final = (
     msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
 )  # fmt: skip
-"""Errors that a message raises which nobody could have written."""
 Part = tuple[Role, Sample]
 _KINDS: Final = {
     each.message for firmware in FIRMWARES for sources in firmware.imu_messages.values() for each in sources
 }
 
 
-class Head(msgspec.Struct, frozen=True):
-    """Versions, clock and configuration; comes before the first message."""
-
-    versions: dict[str, str]
-    offset_ns: int
-    """UTC minus the daemon's clock."""
-    config: bytes
-    """JSON."""
-
-
-class _DamagedError(Exception):
-    """The rest cannot be read; its argument says why."""
-
-
-def is_text(path: Path) -> bool:
-    """Return whether a file is no recording but looks like a log in text."""
-    with path.open("rb") as file:
-        head = file.read(len(MAGIC))
-    return bool(head) and not MAGIC.startswith(head) and b"\0" not in head
-
-
 class Recording:
-    """An MCAP file of ours."""
+    """An MCAP file of ours, opened up to its first message; `offset_ns` is UTC minus the daemon's clock."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.cut_short: str | None = None
-        """After reading: why it ended before its end; None when it is whole."""
+        self.companion = ""
+        self.offset_ns = 0
+        self._config: bytes | None = None
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
         except OSError as error:
-            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+            raise unreadable(path, error) from None
         if not head:
             raise StorageError(f"{path}: the file is empty")
         if not MAGIC.startswith(head):
             raise StorageError(f"{path}: not a recording (MCAP), nor any log that is known")
+        self._rest = self._messages()
+        self._first = [*itertools.islice(self._rest, 1)]
 
-    def items(self) -> Iterator[Head | messages.Message]:
-        """Give the head, then the messages in the order of writing, until the end or a cut."""
+    def config(self) -> Config:
+        try:
+            return msgspec.json.decode(self._config or b"", type=Config)
+        except ValueError as error:
+            raise StorageError(f"{self.path}: its configuration is of another version: {error}") from None
+
+    def read(self) -> Iterator[messages.Message]:
+        """Yield the messages in the order of writing, once, until the end or a cut."""
+        return itertools.chain(self._first, self._rest)
+
+    def is_same_run(self, later: Recording) -> bool:
+        return (self.offset_ns, self._config) == (later.offset_ns, later._config)
+
+    def _checked(self, versions: dict[str, str]) -> dict[str, str]:
+        self.companion = versions.get("companion", "")
+        if (found := versions.get("format")) != messages.FORMAT_VERSION:
+            raise StorageError(
+                f"{self.path}: found recording format {found}; allowed: {messages.FORMAT_VERSION};"
+                f" companion {self.companion}, which wrote it, replays it"
+            )
+        return versions
+
+    def _messages(self) -> Iterator[messages.Message]:
         try:
             import zstandard
             from mcap import exceptions, records, stream_reader
         except ImportError:
             raise StorageError(_NEEDS_MORE) from None
-        table: dict[str, str] | None = None
-        head: Head | None = None
+        versions: dict[str, str] = {}
         topics: dict[int, str] = {}
         try:
             with self.path.open("rb") as file:
                 for record in _records(file):
                     if isinstance(record, records.Metadata) and record.name == messages.METADATA:
-                        table = record.metadata
-                        if (found := table.get("format")) != messages.FORMAT_VERSION:
-                            raise StorageError(
-                                f"{self.path}: found recording format {found}; allowed: {messages.FORMAT_VERSION};"
-                                f" companion {table.get('companion')}, which wrote it, replays it"
-                            )
-                    elif isinstance(record, records.Attachment) and record.name == messages.CONFIG and table:
-                        head = Head(table, int(table["offset_ns"]), record.data)
-                        yield head
+                        versions = self._checked(record.metadata)
+                    elif isinstance(record, records.Attachment) and record.name == messages.CONFIG and versions:
+                        if self._config is None:
+                            self.offset_ns, self._config = int(versions["offset_ns"]), record.data
                     elif isinstance(record, records.Channel):
                         topics[record.id] = record.topic
-                    elif isinstance(record, records.Message) and head is not None and record.channel_id in topics:
-                        t_s = (record.log_time - head.offset_ns) / 1e9
+                    elif isinstance(record, records.Message) and self._config and record.channel_id in topics:
+                        t_s = (record.log_time - self.offset_ns) / 1e9
                         yield topics[record.channel_id], t_s, record.data
         except OSError as error:
-            raise StorageError(f"{self.path}: cannot be read: {error.strerror or error}") from None
+            raise unreadable(self.path, error) from None
         except (exceptions.EndOfFile, exceptions.InvalidMagic, struct.error):
             self.cut_short = "cut, or damaged near its end"
         except (
-            _DamagedError, exceptions.McapError, stream_reader.CRCValidationError, zstandard.ZstdError,
+            exceptions.McapError, stream_reader.CRCValidationError, zstandard.ZstdError,
             KeyError, OverflowError, ValueError,
         ) as error:  # fmt: skip
             self.cut_short = f"damaged: {' '.join(str(error).split())[:200]}"
-        if head is None:
+        if self._config is None:
             cut = self.cut_short
             whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
             raise StorageError(f"{self.path}: {whose}")
@@ -128,14 +127,13 @@ class _Bounded:
         self._file = file
 
     def read(self, length: int) -> bytes:
-        """Read so many bytes."""
         if length > MOST_BYTES:
-            raise _DamagedError(f"found {length} bytes in one piece; allowed: {MOST_BYTES}")
+            raise ValueError(f"found {length} bytes in one piece; allowed: {MOST_BYTES}")
         return self._file.read(length)
 
 
 def _records(file: IO[bytes]) -> Iterator[Any]:
-    """Give all records but chunks, whose records are given in their place."""
+    """Yield all records; a chunk is replaced by its records."""
     from mcap.records import Chunk, DataEnd
     from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -151,38 +149,36 @@ def _records(file: IO[bytes]) -> Iterator[Any]:
 
 
 def _check_size(chunk: Any) -> None:
-    """Check how much a chunk unpacks to; the zstd frame reserves what it says of itself, whatever the chunk says."""
+    """Check the unpacked size; the zstd frame reserves what it states itself, whatever the chunk says."""
     import zstandard
 
     size: int = chunk.uncompressed_size
     if chunk.compression not in ("zstd", ""):
-        raise _DamagedError(f"compressed by {chunk.compression}, which is not read here")
+        raise ValueError(f"compressed by {chunk.compression}, which is not read here")
     inside = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
     if size > MOST_BYTES or inside > size:
-        raise _DamagedError(f"found {max(size, inside)} bytes in one piece; allowed: {MOST_BYTES}")
+        raise ValueError(f"found {max(size, inside)} bytes in one piece; allowed: {MOST_BYTES}")
 
 
 # --- the daemon's decoders
 
 
-def config_of(found: Head, where: object) -> Config:
-    """Decode the configuration in force."""
+@contextlib.contextmanager
+def reporting_damage(path: Path, topic: str) -> Iterator[None]:
+    """Raise StorageError for the errors of a message that no companion wrote."""
     try:
-        return msgspec.json.decode(found.config, type=Config)
-    except ValueError as error:
-        raise StorageError(f"{where}: its configuration is of another version: {error}") from None
+        yield
+    except _UNUSABLE as error:
+        raise StorageError(f"{path}: a message on {topic} cannot be used by this version ({error})") from None
 
 
 class Playback:
-    """The devices of a configuration, fed with what was recorded of them."""
-
     def __init__(self, config: Config) -> None:
         self._devices = {device.name: device for device in serial_devices(config)}
         self._autopilots = [imu.name for imu in config.imu if imu.source == "autopilot"]
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew: something is missing before what comes next."""
         self._decoders = {
             name: device.info.decoder(device.settings.seconds_per_byte) for name, device in self._devices.items()
         }
@@ -195,11 +191,10 @@ class Playback:
             self._link.subscribe(kind, self._on_message)
 
     def state(self, name: str) -> ImuState | None:
-        """Return the state of an IMU; None: it is none of the autopilot's, or nothing is known yet."""
         return self._states.get(name)
 
     def take(self, topic: str, data: bytes, t_s: float) -> list[Part]:
-        """Take a message; return the samples that came of it, each with its role."""
+        """Decode a message; return its samples, each with its role."""
         self._found = []
         if topic.startswith(SERIAL):
             name = topic.removeprefix(SERIAL)
@@ -229,7 +224,6 @@ class Playback:
                 self._found.append((Role(name, "imu"), sample))
 
     def _sample(self, message: Any, t_s: float, state: ImuState, samples: ImuSamples) -> ImuSample | None:
-        """Return the sample of an IMU in a message; None: it carries none that counts."""
         sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
         source = next((each for each in sources if each.message is type(message)), None)
         header = message.get_header()

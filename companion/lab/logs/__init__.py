@@ -1,1 +1,0 @@
-"""Readers of recordings and of logs, one for each format."""
