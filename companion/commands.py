@@ -18,14 +18,14 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.machine import LONGEST_S, What
 from companion.formats import Object, printable
 
-MAX_SHOWN: Final = 60
+MAX_SHOWN: Final = 60  # The most characters of a value in a refusal
 
 
 class Interface(enum.Flag):
     """The ways by which a command reaches the daemon; the control socket is open to all of them."""
 
     COMMAND_LINE = enum.auto()
-    GROUND = enum.auto()
+    GROUND = enum.auto()  # `companion ground` over MAVLink
     MQTT = enum.auto()
     PAGE = enum.auto()
 
@@ -39,16 +39,16 @@ class Field(NamedTuple):
     """A field of a command; its type is filled in from the class."""
 
     help: str = ""
-    by: Interface = _SHELL
+    by: Interface = _SHELL  # The interfaces that may set the field
     metavar: str | None = None
     allowed_words: str = ""
     """The allowed values in words, where the type does not tell them."""
     flags: Mapping[str, str] = {}
     """Values that the command line takes as options of their own (--gyros), with their help."""
-    positional: bool = False
+    positional: bool = False  # True: the command line takes a value that is none of `flags` without an option
     short: str = ""
-    default: Any = None
-    group: str = ""
+    default: Any = None  # The value for the command line where none is given
+    group: str = ""  # Options of the same group exclude each other
     type: Any = None
 
     @property
@@ -75,7 +75,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
     """One request to the daemon. The tag is its name."""
 
     help: ClassVar[str] = ""
-    by: ClassVar[Interface] = _SHELL
+    by: ClassVar[Interface] = _SHELL  # The interfaces that may ask for it
     urgent: ClassVar[bool] = False
     """True: the control socket keeps places free for it."""
 
@@ -274,6 +274,7 @@ ALL: Final = {
         Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, RecordInputs, Answer
     )
 }  # fmt: skip
+"""The commands by name."""
 
 
 def asked_by(interface: Interface) -> dict[str, type[Command]]:

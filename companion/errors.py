@@ -15,7 +15,7 @@ class ConfigError(CompanionError):
 
 
 class LinkError(CompanionError):
-    pass
+    """A port, socket or stream could not be opened or was lost."""
 
 
 class DaemonUnreachableError(CompanionError):
@@ -31,7 +31,7 @@ class NobodyHeardError(CompanionError):
 
 
 class StorageError(CompanionError):
-    pass
+    """A record could not be written or read."""
 
 
 class CalibrationRefusedError(CompanionError):
@@ -47,7 +47,7 @@ class RequestRefusedError(CalibrationRefusedError):
 
 
 class AutopilotError(CompanionError):
-    pass
+    """The autopilot did not do what was asked."""
 
 
 class NotDisarmedError(AutopilotError):
@@ -55,7 +55,7 @@ class NotDisarmedError(AutopilotError):
 
 
 class ParameterTimeoutError(AutopilotError):
-    pass
+    """The autopilot did not answer a parameter request within all retries."""
 
 
 class ParameterRefusedError(AutopilotError):
@@ -63,8 +63,8 @@ class ParameterRefusedError(AutopilotError):
 
 
 class ParameterMismatchError(ParameterRefusedError):
-    pass
+    """The autopilot answered a write with another value than was set."""
 
 
 class AutopilotRebootedError(AutopilotError):
-    pass
+    """The autopilot restarted in the middle of an exchange."""

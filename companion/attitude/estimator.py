@@ -48,11 +48,11 @@ Phase = Literal["ground", "flight"]
 LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
 """Largest deviation of specific force from g, as a share, at which a self-levelling compass is used."""
-STEADY_RAD_S: Final = math.radians(20.0)
+STEADY_RAD_S: Final = math.radians(20.0)  # Largest rate at which the compass is used
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
-REST_SIGMAS: Final = 5.0
-KEPT_S: Final = 2.0
+REST_SIGMAS: Final = 5.0  # Threshold beyond which a rest was a movement that began unnoticed
+KEPT_S: Final = 2.0  # Orientations kept for compass readings that come late
 FORCE_SMOOTHED_S: Final = 1.0
 """Averaging time of the length of specific force, longer than vibration and gusts."""
 DOUBTED_SHARE: Final = 0.03
@@ -65,7 +65,7 @@ TAU_S: Final = 9.0
 GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
-FIRST_S: Final = 0.1
+FIRST_S: Final = 0.1  # Time that the first reading counts for
 BADLY: Final = 1.5
 """Sigma of a poorly known heading, in sigmas of the compass."""
 REFUSED_S: Final = 20.0
@@ -82,7 +82,7 @@ class AttitudeSettings:
     """None: the Earth's rotation is not subtracted, an error of up to 15 deg/h."""
     gyro_noise: AllanModel
     gyro_bias_rad_s: Triple
-    gyro_covariance: Matrix
+    gyro_covariance: Matrix  # (3, 3) covariance of the bias in the next minutes
     accel_bias_m_s2: Triple
     accel_sigma_m_s2: Triple
 
@@ -98,9 +98,9 @@ class Attitude(msgspec.Struct, frozen=True, gc=False):
     """w, x, y, z; body to NED; w >= 0."""
     roll_rad: float
     pitch_rad: float
-    yaw_rad: float
+    yaw_rad: float  # In [-pi, pi], from true north
     rate_rad_s: Triple
-    sigma_rad: Triple
+    sigma_rad: Triple  # One sigma of roll, pitch and yaw
 
 
 class Leveller:
@@ -145,6 +145,8 @@ class Leveller:
 
 
 class HeadingAid:
+    """Gain and gate of the heading correction."""
+
     def __init__(self) -> None:
         self._last_s: float | None = None
         self._refused_since_s: float | None = None

@@ -28,7 +28,7 @@ from companion.config.sections import AllanModel
 from companion.physics.frames import Array, Matrix
 from companion.samples import ImuSample
 
-STEP_S: Final = 0.02
+STEP_S: Final = 0.02  # Length of the steps over which specific force is averaged for levelling
 TURN_S: Final = 0.004
 """Longest time between rotations of the specific force into E: 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
@@ -46,10 +46,10 @@ class MotionStep(NamedTuple):
 
     t_s: float
     span_s: float
-    force_m_s2: Triple
-    rate_rad_s: Triple
+    force_m_s2: Triple  # Mean specific force in E
+    rate_rad_s: Triple  # Mean rate in the sensor's axes, bias removed
     missing_s: float
-    orientation: Quaternion
+    orientation: Quaternion  # Sensor axes to E at its end
 
 
 class Strapdown:
@@ -211,6 +211,7 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
+        """Return the sigma of the mean rate of a rest, (3,), sensor axes."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:

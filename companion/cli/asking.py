@@ -19,7 +19,7 @@ from companion.setup.draft import Question, one_of
 _MOST_BYTES: Final = 4096
 OPEN_WITHIN_S: Final = 5.0
 EVERY_S: Final = 0.5
-SHOWN_S: Final = 1.0
+SHOWN_S: Final = 1.0  # A page that is open shows the last state within this time
 
 
 class Asking:
@@ -108,6 +108,7 @@ class PageAsking(Asking):
         self._page = Page(bind, storage, self._answer)
 
     async def __aenter__(self) -> Self:
+        """Open the page; raise CompanionError with the reason if that fails."""
         self._serving = asyncio.create_task(self._page.run(), name="page")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(OPEN_WITHIN_S):

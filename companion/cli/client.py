@@ -25,7 +25,7 @@ from companion.cli.terminal import (
 from companion.formats import Object
 from companion.links.system.connection import ask
 
-SILENT_S: Final = 2.0
+SILENT_S: Final = 2.0  # Silence after which the command says that it waits for an answer
 
 
 CANCEL: Final = {"command": "cancel"}

@@ -93,6 +93,7 @@ def _absolute(text: str) -> Path:
 
 
 FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
+"""Options of the `setup` that `run` starts without a configuration; its output has the token of the page."""
 
 
 async def run(options: argparse.Namespace) -> int:

@@ -28,6 +28,7 @@ NO_DAEMON: Final = 3
 
 Command = Callable[[argparse.Namespace], Coroutine[Any, Any, int]]
 AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
+"""Adds a command to a parser: its name, function and line of help."""
 
 
 class DaemonRefusedError(CompanionError):
@@ -117,6 +118,8 @@ class _Removed(argparse.Action):
 
 
 class Parser(argparse.ArgumentParser):
+    """Says a usage error in one line, and what was probably meant."""
+
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         for command, _, option in (words.partition(" --") for words in COMMAND_LINE):
@@ -162,7 +165,7 @@ def within(least: float, most: float, kind: type[float] = float, unit: str = "")
     return parsed
 
 
-seconds: Final = within(1e-3, 1e6, unit=" s")
+seconds: Final = within(1e-3, 1e6, unit=" s")  # The type of an argument that is a time in seconds
 _ARGUMENTS: Final = {float: seconds, int: within(1, 1e6, int)}
 
 

@@ -39,7 +39,7 @@ MAV_RESULT_CANCELLED = 6
 """In MAVLink's common messages; ArduPilot's dialect lacks the name."""
 ACK_PERIOD_S = 0.4
 """QGroundControl gives up 1.2 s after the last IN_PROGRESS, so that two may be lost in a row."""
-NOTHING_RAN: Final = 1
+NOTHING_RAN: Final = 1  # `result_param2` of a cancel's ACK when there was nothing to cancel
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
 MAX_REMEMBERED: Final = 32
@@ -60,7 +60,7 @@ _WORDS = {
     What.GYROS: "gyros",
     What.ACCELEROMETERS: "accelerometers",
 }
-_NAMES: dict[type, str] = {Calibrate: "Calibration", Undo: "Undo", Cancel: "Cancel"}
+_NAMES: dict[type, str] = {Calibrate: "Calibration", Undo: "Undo", Cancel: "Cancel"}  # Requests that need permission
 
 CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message
 
@@ -73,13 +73,15 @@ class Key(NamedTuple):
     command: int
 
 
-Request = Calibrate | Undo | Cancel | Literal["version"]
+Request = Calibrate | Undo | Cancel | Literal["version"]  # A checked request; "version": for AUTOPILOT_VERSION
 
 
 class Permission:
+    """Checks senders against `mavlink.allow`, counts refusals, and logs the first one of each sender."""
+
     def __init__(self, senders: Senders) -> None:
         self.senders = senders
-        self.refused: Counter[tuple[int, int]] = Counter()
+        self.refused: Counter[tuple[int, int]] = Counter()  # Refusals of the first 32 senders
 
     def refuses(self, sender: tuple[int, int], what: str) -> str:
         """Return why a sender (system, component) may not request this; empty when it may."""

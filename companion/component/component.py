@@ -115,12 +115,14 @@ class ArmingScript:
 
 HEARTBEAT_PERIOD_S = 1.0
 _RETRY_S = 0.05
-PROGRESS: Final = "CMP_PROG"
-READY: Final = "CMP_READY"
+PROGRESS: Final = "CMP_PROG"  # Progress of the calibration under way in percent; 100 where none is
+READY: Final = "CMP_READY"  # 1: it may arm; 0: not now
 IDLE_BEATS: Final = 5
 
 
 class MavlinkComponent:
+    """The companion on the MAVLink network; a loop that stalls stops its heartbeat too."""
+
     def __init__(
         self,
         link: MavlinkLink,
@@ -133,7 +135,7 @@ class MavlinkComponent:
     ) -> None:
         self._link, self._service, self._gate, self._texts, self._tunes = link, service, gate, texts, tunes
         self._woken = texts.woken
-        self._known_as = link.system_id
+        self._known_as = link.system_id  # The system id under which we were heard last
         self._next_heartbeat_s = -math.inf
         self._beats = 0
         self.turns = 0

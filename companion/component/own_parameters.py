@@ -28,8 +28,8 @@ from companion.links.mavlink.link import MavlinkLink
 logger = logging.getLogger(__name__)
 
 VALUES_PER_S = 40.0
-AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
-RESULTS: Final = ("none", "done", "failed", "cancelled")
+AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")  # CMP_AT_ARM
+RESULTS: Final = ("none", "done", "failed", "cancelled")  # CMP_STATE: end of the last calibration since the start
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
@@ -50,6 +50,8 @@ class Parameter:
 
 
 class OwnParameters:
+    """The parameters of component 191."""
+
     def __init__(
         self, link: MavlinkLink, parameters: Sequence[Parameter], texts: StatusText, permission: Permission
     ) -> None:

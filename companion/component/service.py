@@ -26,11 +26,15 @@ class Refusal(msgspec.Struct, frozen=True):
 
 
 class JobResult(msgspec.Struct, frozen=True):
+    """End of a job; `reason` is one line for people (the figures when done)."""
+
     outcome: Literal["done", "failed", "cancelled"]
     reason: str = ""
 
 
 class AcceptedJob(Protocol):
+    """A calibration or an undo under way."""
+
     progress_percent: int
     """0 to 100; never falls."""
     finished: asyncio.Future[JobResult]
@@ -70,7 +74,7 @@ class ArmAnswer(msgspec.Struct, frozen=True):
     words: str
     hold_still_s: int | None = None
     """Time to hold still, where nothing else is needed."""
-    meanwhile: str = ""
+    meanwhile: str = ""  # Activity while it is held still
     against: str = ""
     """Reason why it would arm uncalibrated; empty where the reason is another."""
 

@@ -37,8 +37,8 @@ QUEUE_TEXTS = 16
 LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
-GOES_ON = "... "
-SPOKEN = 4
+GOES_ON = "... "  # Beginning of a line that continues the one before
+SPOKEN = 4  # Number of spoken texts kept for page and monitor
 STALE_S = 20.0
 """Age at which a text that could not be sent (no link) is dropped, unless it is a result."""
 RECENT_TEXTS = 32
@@ -75,7 +75,7 @@ class Weight(enum.IntEnum):
     RESULT = 2
 
 
-Say = Callable[[Severity, str, Weight], object]
+Say = Callable[[Severity, str, Weight], object]  # Sends a text to the ground stations
 
 
 def to_ascii(text: str) -> str:
@@ -125,14 +125,17 @@ def _end_of_line(text: str, *, figures: bool, most: int = LINE_BYTES) -> int:
 
 
 class StatusText:
+    """Queue of texts; `step` sends what may be sent now."""
+
     def __init__(self, link: MavlinkLink) -> None:
-        self.woken = asyncio.Event()
+        self.woken = asyncio.Event()  # Set when there is something new to send, for the caller of `step`
         self._link = link
         self._waiting: list[tuple[Weight, float, Severity, str]] = []
         self._recent: deque[tuple[Severity, str, float]] = deque(maxlen=RECENT_TEXTS)
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
         self.spoken: deque[dict[str, object]] = deque(maxlen=SPOKEN)
+        """The latest spoken texts, the oldest first, numbered from 1."""
         self._numbers = itertools.count(1)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
@@ -187,7 +190,7 @@ class StatusText:
 
 TUNES_APART_S: Final = 1.5
 """Time between the beginnings of two tunes: the longest takes 1.1 s."""
-TUNE_STALE_S: Final = 3.0
+TUNE_STALE_S: Final = 3.0  # Age at which a tune that could not be played is dropped
 
 
 class Tune(enum.Enum):
@@ -208,7 +211,7 @@ class Tunes:
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, wanted: Callable[[], bool], woken: asyncio.Event) -> None:
         self._link, self._vehicle, self._wanted, self._woken = link, vehicle, wanted, woken
-        self._waiting: tuple[Tune, float] | None = None
+        self._waiting: tuple[Tune, float] | None = None  # The latest tune, and the time of its request
         self._free_s = -math.inf
 
     def play(self, tune: Tune) -> None:

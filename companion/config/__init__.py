@@ -47,6 +47,7 @@ def _none(_directory: Path, wanted: str) -> NoiseProfile:
 
 
 def load(path: Path, saved: Saved = _none) -> Config:
+    """Read and check a configuration file; raise ConfigError in one line as `parse`."""
     text = read(path, "companion setup makes it (or give another with -c FILE)")
     return parse(text, str(path), saved)
 

@@ -16,12 +16,13 @@ from companion.rotations import ROTATIONS_DEG
 UPRIGHT_COSINE = 0.5
 LAST_PORT = 65535
 LEAST_RECORDINGS_MB = 8
-MAX_TOPIC_BYTES = 200
+MAX_TOPIC_BYTES = 200  # Limit of `base_topic`; MQTT itself allows 65535
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 _SERIAL = 'only with source = "serial"'
 
 
 def check_together(config: Config, name: str) -> None:
+    """Check the rules; raise ConfigError with the first complaint."""
     for complaint in _complaints(config):
         raise ConfigError(f"{name}: {complaint}")
 

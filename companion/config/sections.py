@@ -119,9 +119,9 @@ class Mavlink(Section, frozen=True):
 class AllanModel(msgspec.Struct, frozen=True):
     """Noise of one axis: N, B and K of the Allan deviation, in rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
 
-    white: float
-    flicker: float
-    walk: float
+    white: float  # N
+    flicker: float  # B; the floor of the Allan deviation is 0.664 B
+    walk: float  # K
 
     @property
     def floor(self) -> float:
@@ -134,7 +134,7 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     name: NonEmpty
     gyro: AllanModel
     accel: AllanModel
-    origin: str = ""
+    origin: str = ""  # Words: the recordings that a saved profile was learned from
     warm_up: tuple[float, float] | None = None
     """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: not known."""
 
@@ -151,14 +151,14 @@ class Imu(Section, frozen=True):
 
     name: NonEmpty
     source: Literal["autopilot", "serial"]
-    instance: Annotated[int, Meta(ge=1, le=3)] | None = None
+    instance: Annotated[int, Meta(ge=1, le=3)] | None = None  # Number of the autopilot's IMU; None: 1
     port: NonEmpty | None = None
     baud: Baud | None = None
     protocol: ImuProtocol | None = None
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
-    read_only: bool = False
-    profile: str | NoiseProfile | None = None
+    read_only: bool = False  # True: nothing is ever sent to the device on that port
+    profile: str | NoiseProfile | None = None  # One of the catalogue (`Profile`), or a saved one
 
 
 class Gradienter(Section, frozen=True):
@@ -233,7 +233,7 @@ class Mqtt(Section, frozen=True):
     username: NonEmpty | None = None
     password_file: NonEmpty | None = None
     tls: bool = False
-    ca_file: NonEmpty | None = None
+    ca_file: NonEmpty | None = None  # Authority that signed the broker's certificate; None: the system's authorities
     cert_file: NonEmpty | None = None
     key_file: NonEmpty | None = None
     keepalive_s: Annotated[int, Meta(ge=5, le=600)] = 15
@@ -250,13 +250,13 @@ class Mqtt(Section, frozen=True):
 class Fleet(Section, frozen=True):
     """Items for a fleet's collector, kept and sent over `mqtt`; without the section there are none."""
 
-    name: NonEmpty | None = None
-    location: Location = "off"
+    name: NonEmpty | None = None  # Name of the aircraft
+    location: Location = "off"  # Precision of the place in the items
 
 
 class Control(Section, frozen=True):
     socket: NonEmpty | None = None
-    group: NonEmpty | None = None
+    group: NonEmpty | None = None  # Group whose members may use it, besides the daemon's own user and root
 
     @property
     def group_name(self) -> str | None:

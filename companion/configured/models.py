@@ -44,11 +44,11 @@ IMU_RATE_HZ: Final = 100.0
 """Rate asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
 LEAST_IMU_RATE_HZ: Final = 10.0
 LINE_SHARE: Final = 0.5
-BITS_PER_BYTE: Final = 10.0
+BITS_PER_BYTE: Final = 10.0  # Bits on the wire for one byte (8N1): a start bit, eight bits of data, a stop bit
 # Lengths in MAVLink 2 of HIGHRES_IMU, VISION_POSITION_ESTIMATE and SCALED_IMU2: 63, 117 and 24 bytes, and 12 around.
-HIGHRES_BYTES: Final = 75.0
-VISION_BYTES: Final = 129.0
-SCALED_BYTES: Final = 36.0
+HIGHRES_BYTES: Final = 75.0  # Length of HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them
+VISION_BYTES: Final = 129.0  # Length of VISION_POSITION_ESTIMATE: 117 bytes and 12
+SCALED_BYTES: Final = 36.0  # Length of SCALED_IMU2 and SCALED_IMU3: 24 bytes and 12
 
 TILT_SIGMA_DEG: Final = 0.05
 """Sigma of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
@@ -205,9 +205,11 @@ def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> Gradie
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Role:
+    """One use of a device."""
+
     name: str
     kind: Kind
-    north: Literal["magnetic", "true"] | None = None
+    north: Literal["magnetic", "true"] | None = None  # The north that a compass' headings are configured to mean
 
     def refuses(self, sample: Sample) -> bool:
         """Return whether the device itself calls this a heading to another north than the configured one."""
@@ -319,6 +321,7 @@ class Profiles:
         return self.of(name) != before
 
     def of(self, name: str) -> str | NoiseProfile | None:
+        """Return the profile of an IMU; None: nobody has named its part."""
         return self._imus[name].profile or self._parts.get(name)
 
     def imu(self, name: str) -> Imu:

@@ -52,9 +52,12 @@ _IN_WORDS: Final = {
     "accel": "accelerometer (device id)",
     "scale": "accelerometer scale",
 }
+"""Words for keys of the identity, where the key is not plain."""
 
 
 class BiasMemory:
+    """Predicts biases before a result is used, and remembers the result."""
+
     def __init__(self, core: Core, devices: Devices, used: ActiveAlignment) -> None:
         self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
         self._vehicle, self._collector, self._imus, self._alignment = core.vehicle, core.collector, devices.imus, used
@@ -72,6 +75,7 @@ class BiasMemory:
         self._written_s = -math.inf
 
     def load(self) -> None:
+        """Load the stored biases; blocking."""
         self._known = self._store.read()
         self.follow()
 
@@ -305,6 +309,7 @@ class BiasMemory:
     # --- what is known
 
     def temperature(self) -> list[Object]:
+        """Summarise the biases over temperature; blocking."""
         # Imported here: the start is shorter without.
         from companion.estimation.solution.by_temperature import by_temperature
 

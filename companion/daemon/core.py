@@ -92,6 +92,8 @@ class RepeatedRead:
 
 
 class Core:
+    """The configuration, the autopilot's link and the collector, which all subsystems share; `link` is for tests."""
+
     def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
         self.config, self.offload = config, offload
         self.only_listening = only_listening
@@ -101,7 +103,7 @@ class Core:
         self.vehicle = Vehicle(self.link, system_id=system_id, is_carried=self._is_carried)
         self.parameters = ParameterClient(self.link, self.vehicle)
         self.profiles, self.collector, self.machine = Profiles(config), models.collector(config), Machine()
-        self.on_tick: Listeners[[float]] = Listeners()
+        self.on_tick: Listeners[[float]] = Listeners()  # Notified of the time of every tick, before the collector
         self.wanted, self.texts = RuntimeSettings(config, self._retarget), StatusText(self.link)
         self.tunes = Tunes(self.link, self.vehicle, lambda: self.wanted.tunes, self.texts.woken)
 
@@ -146,6 +148,8 @@ class Core:
 
 
 class Subsystem:
+    """A part of the daemon, for the service."""
+
     def load(self) -> None:
         """Load stored data before anything runs; blocking."""
 

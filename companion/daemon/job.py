@@ -29,6 +29,8 @@ class JobCancelledError(Exception): ...
 
 
 class Job:
+    """Raised inside a job at the next safe point after somebody cancelled it."""
+
     """One request, as its requesters see it; `finished` is done exactly once."""
 
     def __init__(
@@ -43,8 +45,8 @@ class Job:
     ) -> None:
         loop = asyncio.get_running_loop()
         self.kind, self.what, self.requester = kind, what, requester
-        self.reboot = reboot
-        self.automatic = automatic
+        self.reboot = reboot  # Restart the autopilot once the result is stored
+        self.automatic = automatic  # Started by the daemon itself
         self.was_armed = False
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
         """Loop time by which measuring must end; None: no limit."""
@@ -52,7 +54,7 @@ class Job:
         self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Object | None = None
         self.undid_calibration = kind == "undo"
         """False also where an alignment or a temperature curve was undone: the last calibration stays."""
-        self.words = ""
+        self.words = ""  # Present activity, for people
         self.hold_still_s: int | None = None
         """Time to hold still before anything else goes on."""
         self.progress_percent = 0
@@ -96,10 +98,12 @@ class Job:
         self._nudge.set()
 
     def check_cancelled(self) -> None:
+        """Raise JobCancelledError, with the canceller, if it was cancelled: a safe point."""
         if self.cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self.cancelled_by}")
 
     def check_time(self) -> None:
+        """Raise CalibrationRefusedError after the deadline."""
         if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
             boat = '; on a boat? set vehicle.platform = "deck"' if self.words.startswith("hold still: ") else ""
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")

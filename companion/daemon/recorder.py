@@ -73,6 +73,8 @@ class _OnRequest:
 
 
 class Recorder(Subsystem):
+    """Records the inputs of calibrations."""
+
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating) -> None:
         config = core.config
         self.fault: str | None = None

@@ -26,6 +26,8 @@ class What(enum.Enum):
 
 
 class State(enum.Enum):
+    """State of a calibration."""
+
     IDLE = "idle"
     WAITING = "waiting"
     COLLECTING = "collecting"
@@ -59,6 +61,8 @@ class State(enum.Enum):
 
 
 class Event(enum.Enum):
+    """Event in a calibration."""
+
     REQUEST = "request"
     UNDO = "undo"
     STILL = "still long enough"
@@ -117,6 +121,8 @@ class IllegalEventError(Exception):
 
 
 class Machine:
+    """One calibration's state."""
+
     def __init__(self) -> None:
         self.state = State.IDLE
 

@@ -41,11 +41,11 @@ ASK_AFTER: Final = 50
 WAITING: Final = 20 * BATCH
 """Most messages that wait to be written; more are dropped, and sent again by their aircraft."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
-BATCH_BYTES: Final = 4 * 1024 * 1024
-AT_ONCE: Final = 50
-SWEEP_S: Final = 5.0
+BATCH_BYTES: Final = 4 * 1024 * 1024  # Most bytes of a batch; a database makes several copies of it
+AT_ONCE: Final = 50  # Answers sent concurrently; the time that aiomqtt takes for each grows with their number
+SWEEP_S: Final = 5.0  # Time to receive the retained hellos, which shared subscriptions do not deliver
 JUDGE_S: Final = 2.0
-REST: Final = 4.0
+REST: Final = 4.0  # Pause after a judgement, as a multiple of its duration: collecting goes first
 ANSWER_S: Final = 10.0
 STOP_AGAIN_S: Final = 0.5
 _HELLO: Final = "fleet/+/hello"
@@ -104,6 +104,8 @@ class BoundedMessages(asyncio.Queue[Any]):
 
 
 class Collector:
+    """Collector at one broker, beside any number of others; `run` it as a task."""
+
     def __init__(self, settings: Mqtt, store: Store) -> None:
         self.store = store
         client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"

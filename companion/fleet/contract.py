@@ -47,6 +47,10 @@ class NotTakenError(Exception): ...
 
 
 class Hello(msgspec.Struct, frozen=True):
+    """A payload breaks the contract; the message is one line with the reason."""
+
+    """Range of the items that an aircraft keeps."""
+
     format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]
     aircraft: _Aircraft
     epoch: _Epoch
@@ -209,15 +213,18 @@ def moment(words: str) -> datetime.datetime:
 
 
 def addressed(topic: str) -> tuple[str, str] | None:
+    """Give the aircraft of a topic and "hello" or "item"; None: it is another topic."""
     match = _AIRCRAFT.fullmatch(topic)
     return None if match is None else (match[1], match[2])
 
 
 def read_hello(aircraft: str, payload: bytes) -> Hello:
+    """Parse a hello; raise NotTakenError where it is none, names another aircraft, or has a newer format."""
     return _decode(aircraft, payload, Hello)
 
 
 def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
+    """Parse the key of an item of any format; raise NotTakenError where it has none, or names another aircraft."""
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
     return _decode(aircraft, payload, ReceivedItem)

@@ -53,6 +53,7 @@ _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
 _TOGETHER_WITHIN_POWER_UPS: Final = 10
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
+"""Least sizes of findings, by kind, for the word "replace"."""
 
 
 class PartHistory(NamedTuple):
@@ -64,9 +65,9 @@ class PartHistory(NamedTuple):
     """
 
     at: Sequence[datetime.datetime]
-    temperature_degc: Floats
+    temperature_degc: Floats  # (n,)
     biases: Floats
-    sigma_use: Floats
+    sigma_use: Floats  # (n, 6) sigma of the biases, same units
     white: Floats
     new_zero: NDArray[np.bool_]
 
@@ -78,7 +79,7 @@ class PartFinding(NamedTuple):
     is the move of a level, rad/s or m/s^2.
     """
 
-    kind: str
+    kind: str  # bias, drift, scatter, noise, zero, compass
     axis: int
     since: int
     size: float

@@ -35,6 +35,7 @@ _STANDINGS: Final = (
     ("caution", "last try failed", "tried_state IN ('failed', 'cancelled') AND tried_reason <> ''"),
     ("fine", "calibrated", "1 = 1"),
 )
+"""Kind, word and condition of each standing, the worst first: the first condition that holds counts."""
 _CASES: Final = " ".join(f"WHEN {holds} THEN {place}" for place, (_, _, holds) in enumerate(_STANDINGS))
 _FLEET: Final = (
     f"SELECT f.*, CASE {_CASES} END AS standing,"  # noqa: S608 - constants
@@ -101,6 +102,7 @@ def _line(one: Any, now: datetime.datetime) -> Markup:
 
 
 def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
+    """Show one aircraft; None: it was never heard."""
     query = f"SELECT * FROM ({_FLEET}) s WHERE aircraft = :which"  # noqa: S608 - constants
     found = _rows(connection, query, which=which, stale=now - STALE, silent=now - SILENT)
     if not found:
@@ -179,6 +181,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:
+    """Give a figure of three axes in deg/h or mg; None: it is not known of all."""
     column = f"{triad}_{what}_{UNITS[triad].name.replace('/', '_')}"
     x, y, z = (getattr(axes[axis], column) for axis in "xyz")
     return None if None in (x, y, z) else (x, y, z)

@@ -18,9 +18,11 @@ from companion.errors import StorageError
 
 VERSION: Final = 4
 _LOCK: Final = 0x636F6D70616E696F
+"""Key of PostgreSQL's advisory lock that the collector holds while it reads and changes the version."""
 _STATEMENT_MS: Final = 30_000
 _BUSY_S: Final = 10.0
 OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
+"""Errors of a database that cannot be reached, is full or broken."""
 OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
 
 

@@ -127,7 +127,7 @@ class Columns(NamedTuple):
     in usual scatters.
     """
 
-    values: Floats
+    values: Floats  # (n, c) in usual scatters; NaN: not measured
     variance: Floats
     """Variance of a value beyond the usual one."""
     temperature_degc: Floats
@@ -137,8 +137,8 @@ class Columns(NamedTuple):
     """True where the reference of the measurement has changed, so that the level may differ."""
     first: NDArray[np.int_]
     """Number of power-ups at the beginning that define what is usual, at least 3."""
-    most_own: Floats
-    least: Floats
+    most_own: Floats  # (c,) largest accepted scatter of the column itself, in usual scatters
+    least: Floats  # (c,) least move or scatter that raises an alarm
     unit: Floats
 
 
@@ -258,4 +258,5 @@ def _scatter(level: Floats) -> float:
 
 
 def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:
+    """Reduce the values of one column to one temperature, (n,)."""
     return np.asarray(y[:, column] - laws[:, column, 1:] @ x[column, 1:])

@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 LEAST_PASSWORD: Final = 12
 WRONG_PASSWORD_S: Final = 2.0
 AGAIN_S: Final = 30
-SOON_S: Final = 2
+SOON_S: Final = 2  # Period after which a browser tries again when the database could not be read
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
 
 

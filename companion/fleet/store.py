@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 MOST_REJECTED: Final = 10_000
 _SHOWN_BYTES: Final = 4096
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
-_AGAIN: Final = 500
+_AGAIN: Final = 500  # Items of a newer aircraft that are parsed again in one transaction after an update
 
 
 class BatchResult(NamedTuple):
@@ -51,6 +51,8 @@ class BatchResult(NamedTuple):
 
 
 class Store:
+    """Store of items, hellos and judgements; calls block, so call them in a thread."""
+
     def __init__(self, database: str) -> None:
         self._engine, self._reads = engine_of(database), engine_of(database, reads_only=True)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert

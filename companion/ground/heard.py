@@ -20,11 +20,15 @@ Fields = Mapping[str, object]
 
 
 class Address(NamedTuple):
+    """A component of a vehicle."""
+
     system_id: int
     component_id: int
 
 
 class PeerState(NamedTuple):
+    """The last heartbeat of a component."""
+
     kind: int
     autopilot: int
     base_mode: int
@@ -37,6 +41,8 @@ class PeerState(NamedTuple):
 
 
 class Text(NamedTuple):
+    """A STATUSTEXT."""
+
     system_id: int
     severity: int
     words: str
@@ -44,6 +50,8 @@ class Text(NamedTuple):
 
 
 class AutopilotSeen(NamedTuple):
+    """The autopilot as its heartbeat shows it."""
+
     system_id: int
     firmware: str | None
     armed: Literal["armed", "disarmed", "unknown"]
@@ -57,7 +65,7 @@ class GroundListener:
         self.first_s: float | None = None  # of the first heartbeat
         self.heartbeats: dict[Address, PeerState] = {}
         self.texts: list[Text] = []  # of all vehicles' companions, oldest first
-        self.on_text: Listeners[[Text]] = Listeners()
+        self.on_text: Listeners[[Text]] = Listeners()  # Listeners for every text, with its system id
 
     def update(self, name: str, source: Address, fields: Fields, now_s: float) -> None:
         if name == "HEARTBEAT":

@@ -80,7 +80,7 @@ class GroundLink:
     ) -> None:
         self.own, self.heard = own, heard
         self._sdk, self._direct, self._signing = sdk, direct, signing
-        self.on_ack: Listeners[[Address, Fields]] = Listeners()
+        self.on_ack: Listeners[[Address, Fields]] = Listeners()  # Listeners for every COMMAND_ACK to us
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
@@ -251,7 +251,7 @@ class Exchange:
         self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
         self.result: int | None = None
         self.detail = 0
-        self.unanswered = False
+        self.unanswered = False  # No answer came to any attempt
         self._answered = asyncio.Event()
         self._heard_s = 0.0
         self._confirmation = 0

@@ -49,6 +49,8 @@ _SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}  # sev
 
 @dataclasses.dataclass(frozen=True)
 class RequestOutcome:
+    """Outcome of a request: for programs (`answer`, with `state` and `reason` first) and for people (`lines`)."""
+
     state: State
     reason: str
     good: bool
@@ -61,6 +63,8 @@ class RequestOutcome:
 
 
 class Display:
+    """Progress and texts on stderr."""
+
     def __init__(self) -> None:
         self._shown: tuple[str, int] | None = None
 
@@ -75,6 +79,8 @@ class Display:
 
 
 class Station:
+    """Speaks to the one companion that `find` found."""
+
     def __init__(self, link: GroundLink, url: str, display: Display) -> None:
         self._link, self._url, self._display = link, url, display
         self._heard: GroundListener = link.heard
@@ -318,4 +324,5 @@ class Station:
 
 
 def _result(state: float | None) -> str | None:
+    """Name the end of the last calibration by CMP_STATE; None: there was none, or it is not known."""
     return RESULTS[int(state)] if state in (1.0, 2.0, 3.0) else None

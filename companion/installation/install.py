@@ -38,6 +38,7 @@ with `systemctl edit`, in /etc); all else is below /etc/companion, the owner's."
 
 
 def folder() -> Path:
+    """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError where there is none."""
     here = Path(__file__).resolve().parent
     for candidate in (here / "systemd", here.parents[1] / "systemd"):
         if (candidate / SERVICE).is_file():
@@ -46,6 +47,7 @@ def folder() -> Path:
 
 
 def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
+    """Return a shipped file for this executable, without stamp; raise CompanionError where that cannot be."""
     text = (folder() / shipped).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
@@ -207,6 +209,7 @@ def _check_user(command: str) -> None:
 
 
 def _check_reach(executable: str) -> None:
+    """Raise CompanionError where the service, nobody's account, could not run this installation."""
     package = Path(companion.__file__).parent
     for path in (Path(executable), package, Path(sys.base_prefix)):
         why = unreachable(path)

@@ -33,6 +33,7 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "EV": ("", ("Id",)),
     "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
 }
+"""Field with the instance, and fields to read, by message."""
 _IMUS: Final = 5
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0

@@ -27,13 +27,14 @@ from companion.physics.frames import Floats
 
 US: Final = 1e-6
 DATAFLASH_MAGIC: Final = b"\xa3\x95\x80"
+"""Beginning of a dataflash log: the head of a format message that describes format messages."""
 ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
 _HEAD: Final = DATAFLASH_MAGIC[:2]
 _FMT: Final = np.dtype([("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")])
 _CLOCK: Final = "TimeUS"
 _PARAMETER: Final = "PARM"
 _MOST_PARAMETERS: Final = 1 << 16
-_INSTANCES: Final = 16
+_INSTANCES: Final = 16  # Most instances: a larger number is damage
 
 Fields = Mapping[str, tuple[str, tuple[str, ...]]]
 """Field with the instance (or ""), and fields to read, by message."""
@@ -66,7 +67,7 @@ class BootMessages:
         self._fields = fields
         self._chunks: dict[tuple[str, int], list[Floats]] = defaultdict(list)
         self.parameters: list[tuple[float, str, float]] = []
-        self.gaps = 0
+        self.gaps = 0  # Gaps in which the autopilot could not write
 
     def add(self, name: str, instance: int, rows: Floats) -> None:
         """Add rows in the order of the file: the autopilot's clock in s, then the fields; NaN: no such field."""
@@ -101,7 +102,7 @@ def ascending(rows: Floats) -> Floats:
 class _Kind:
     def __init__(self, length: int, name: str = "") -> None:
         self.length, self.name = length, name
-        self.layout: np.dtype[np.void] | None = None
+        self.layout: np.dtype[np.void] | None = None  # None: not to be read
         self.factors: dict[str, float] = {}
         self.data = bytearray()
 
@@ -165,6 +166,7 @@ def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
 
 
 def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
+    """Give the head and the kind of the messages that a format message describes; None: it cannot be one."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT
 
     number, length, *said = np.frombuffer(data, _FMT)[0].tolist()
@@ -244,13 +246,13 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
     Readings at `failed_s`, when the autopilot took the IMU for failed, are left out.
     """
 
-    number: int
+    number: int  # Number from 1, as in the configuration
     t_s: Floats
-    readings: Floats
+    readings: Floats  # (n, 6) rad/s and m/s^2, corrected by the firmware, vehicle FRD
     means: bool
     gyro_id: int | None = None
     accel_id: int | None = None
-    degc: Floats = np.zeros((0, 2))
+    degc: Floats = np.zeros((0, 2))  # Time and temperature
     vibration: Floats = np.zeros((0, 2))
     estimated: Floats | None = None
     failed_s: Floats = np.zeros(0)
@@ -269,7 +271,7 @@ class Boot(msgspec.Struct, frozen=True, kw_only=True):
     firmware: FirmwareName
     imus: tuple[FlownImu, ...]
     solution: Navigation | None
-    truth: Navigation | None = None
+    truth: Navigation | None = None  # Truth of a simulator
     armed: tuple[tuple[float, bool], ...] = ()
     motors: tuple[tuple[float, bool], ...] = ()
     airborne: tuple[tuple[float, bool], ...] = ()

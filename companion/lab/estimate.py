@@ -44,7 +44,7 @@ _REMEDIES: Final = Remedies(
     mounting="--mounting {}",
     any_bias="--any-bias takes it",
 )
-_LONGER: Final = 1.02
+_LONGER: Final = 1.02  # A window is chosen again when the stretch has grown by so much
 _AT_ONCE: Final = 4096
 
 MOST_WINDOWS: Final = 100_000
@@ -69,7 +69,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
 
     pitch_deg: float | None = None
     roll_deg: float | None = None
-    heading_deg: float | None = None
+    heading_deg: float | None = None  # True
     sigma_deg: float = 0.05
     heading_sigma_deg: float = 3.0
     latitude_deg: float | None = None
@@ -233,7 +233,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str
         axis, none where no two windows in a row gave a result.
     """
     posed, force = given, np.zeros(3)
-    found: list[Floats | None] = []
+    found: list[Floats | None] = []  # Bias, sigma_stat and sigma_use of each window, (3, 6); None: it gave none
     whys: list[str] = []
     begin_s = float(log.t_s[0])
     starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))

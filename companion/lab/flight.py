@@ -49,6 +49,7 @@ _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 _UNKNOWN: Final[Sequence[Term | None]] = (None,) * 4
 
 Knowledge = tuple[Sequence[Record], Mapping[str, KnownImu]]
+"""Records, the newest first, and learned biases on the companion's disk."""
 
 
 def read(path: Path) -> Iterator[Boot]:
@@ -348,6 +349,7 @@ def _written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple
 
 
 def _iso(unix_s: float | None) -> str | None:
+    """Format a time in UTC, ISO 8601; None: it is not believable."""
     if unix_s is None or not 0.0 < unix_s < 1e11:
         return None
     return datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).isoformat(timespec="seconds")

@@ -37,11 +37,11 @@ class Navigation(NamedTuple):
     """
 
     t_s: Floats
-    attitude: Floats
+    attitude: Floats  # (n, 4) quaternions, body FRD to NED
     velocity: Floats
     position: Floats
     gravity_m_s2: float = 9.80665
-    earth_rate_ned_rad_s: Floats = np.zeros(3)
+    earth_rate_ned_rad_s: Floats = np.zeros(3)  # (3,); zero: a simulator without, or a place that is not known
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
         """Interpolate rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3)."""
@@ -73,10 +73,10 @@ class Increments(NamedTuple):
     Times are the ends of the increments.
     """
 
-    t_s: Floats
+    t_s: Floats  # (n,) the ends
     dt_s: Floats
-    angle: Floats
-    velocity: Floats
+    angle: Floats  # (n, 3) rad, body axes at the beginning of each
+    velocity: Floats  # (n, 3) m/s, likewise
 
     def shifted(self, rate_rad_s: Floats, force_m_s2: Floats) -> Increments:
         """Add a rate and a force, (3,) or (n, 3), to the output."""

@@ -23,7 +23,7 @@ from companion.estimation.stillness.own_noise import OwnNoise
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, rows_of
 
-MIN_SECONDS: Final = 16
+MIN_SECONDS: Final = 16  # Least seconds of a stretch: a shorter one shows nothing of what averaging leaves
 LEAST_STILL_S: Final = 60
 """Least time at rest in all; a calibration measures as long itself."""
 _MIN_GOOD: Final = 10

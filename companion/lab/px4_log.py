@@ -88,6 +88,7 @@ def _imus(start: BootMessages) -> tuple[FlownImu, ...]:
 
 
 def _selection(start: BootMessages) -> Floats:
+    """Give the device id of the gyro in use over time, (n, 2)."""
     told = _whole(start.rows("sensor_selection"))
     return told if len(told) else np.zeros((1, 2))
 

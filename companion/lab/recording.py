@@ -46,7 +46,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.cut_short: str | None = None
+        self.cut_short: str | None = None  # After reading: why it ended before its end; None when it is whole
         self.companion = ""
         self.offset_ns = 0
         self._config: bytes | None = None
@@ -173,6 +173,8 @@ def reporting_damage(path: Path, topic: str) -> Iterator[None]:
 
 
 class Playback:
+    """The devices of a configuration, fed with what was recorded of them."""
+
     def __init__(self, config: Config) -> None:
         self._devices = {device.name: device for device in serial_devices(config)}
         self._autopilots = [imu.name for imu in config.imu if imu.source == "autopilot"]
@@ -191,6 +193,7 @@ class Playback:
             self._link.subscribe(kind, self._on_message)
 
     def state(self, name: str) -> ImuState | None:
+        """Return the state of an IMU; None: it is none of the autopilot's, or nothing is known yet."""
         return self._states.get(name)
 
     def take(self, topic: str, data: bytes, t_s: float) -> list[Part]:
@@ -224,6 +227,7 @@ class Playback:
                 self._found.append((Role(name, "imu"), sample))
 
     def _sample(self, message: Any, t_s: float, state: ImuState, samples: ImuSamples) -> ImuSample | None:
+        """Return the sample of an IMU in a message; None: it carries none that counts."""
         sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
         source = next((each for each in sources if each.message is type(message)), None)
         header = message.get_header()

@@ -45,6 +45,7 @@ _SIGMAS: Final = {
     "residual_accel_m_s2": "accel_sigma_use_m_s2",
 }
 _BEFORE: Final = "it was measured before the recording began"
+"""Initial variances in scatters: of the level, and of the three coefficients over temperature."""
 
 
 class Replayed(msgspec.Struct, frozen=True):
@@ -68,15 +69,15 @@ class Replay:
         self._playback = Playback(self._config)
         self._collector: RollingCollector | None = None
         self.calibrations: list[Replayed] = []
-        self.notes: list[str] = []
+        self.notes: list[str] = []  # Other versions, gaps
         if recording.companion != __version__:
             self.notes.append(f"recorded with companion {recording.companion}, here {__version__}")
-        self.cut_short: str | None = None
+        self.cut_short: str | None = None  # Why the first file that ends early does so
         self._is_cut = False
         self._first_s = self._now_s = self._begun_s = math.nan
         self._where = Whereabouts()
         self._measured: Measurement | CalibrationRefusedError | None = None
-        self._offsets: dict[str, ImuCalibration | None] = {}
+        self._offsets: dict[str, ImuCalibration | None] = {}  # Offsets in force at the latest window, by IMU
         self._solution: Solution | None = None
         self._not_recomputed = _BEFORE
 

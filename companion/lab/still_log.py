@@ -66,14 +66,14 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
 
     imu: str
     files: tuple[str, ...]
-    t_s: Floats
+    t_s: Floats  # (n,) ascending
     readings: Floats
-    temperature_degc: Floats
+    temperature_degc: Floats  # (n,); NaN where unknown
     profile: str | NoiseProfile | None = None
     clock_offset_s: float | None = None
     breaks_s: tuple[float, ...] = ()
 
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Assumptions and oddities, in words
     left_out: dict[str, int] = {}
     clock_from_start: bool = False
 

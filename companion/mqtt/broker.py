@@ -180,13 +180,16 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
 
 
 UNSUPPORTED_PROTOCOL: Final = 132
+"""Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
 _BAD_PASSWORD: Final = (134, 135)
 _TAKEN_OVER: Final = (
     "another client called {id!r} has taken over: is there a second companion for this vehicle?"
     " (mqtt.base_topic tells them apart)"
 )
 _LOST: Final = "the connection is gone (broker stopped? network? another client called {id!r}?)"
+"""Codes of a lost connection: paho's own, and that of MQTT 5."""
 _SILENT: Final = "nothing heard from the broker any more"
+"""Codes of silence for twice the keepalive: paho's own, and that of MQTT 5."""
 _REASONS: Final = {
     7: _LOST,
     16: _SILENT,

@@ -35,19 +35,21 @@ GREETING_DEADLINE_S: Final = 5.0
 ANSWER_DEADLINE_S: Final = 5.0
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
-WORTH_S: Final = 10.0
+WORTH_S: Final = 10.0  # Least duration of a connection after which the next attempts begin with short waits again
 MAX_PACKET_BYTES: Final = 64 * 1024
 """The longest message that the broker may send us (MQTT 5)."""
 MAX_WAITING: Final = 1000
 """The most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
 than it empties it: a flood of some hundred requests has to fit. With 64 KiB each they fit the process's memory."""
 MAX_ANSWERS: Final = 64
-LONG_BYTES: Final = 1024
+LONG_BYTES: Final = 1024  # A message that is longer may be too long for a broker
 MOST_TRIES: Final = 3
 """Connections that may end while one long message is being sent, before it is given up."""
 
 
 class Incoming(NamedTuple):
+    """A message from the broker."""
+
     topic: str
     payload: bytes
     retained: bool = False

@@ -28,14 +28,14 @@ AGAIN_S: Final = 1.0
 ANSWER_WITHIN_S: Final = 10.0
 CLOCKS_AGREE_S: Final = 2.0
 
-Ask = Callable[[Object], AsyncGenerator[Object, None]]
+Ask = Callable[[Object], AsyncGenerator[Object, None]]  # Sends a request to the control socket and yields the replies
 Transaction = str | int | None
 
 MAX_PAYLOAD_BYTES: Final = 4096
 MAX_TRANSACTION: Final = 128
 MAX_NUMBER: Final = 2**53
 """The largest integer that every reader of JSON keeps exactly."""
-MAX_PENDING: Final = 8
+MAX_PENDING: Final = 8  # The most requests that wait for their end, such as cancels in the middle of a write
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
 KNOWN: Final = asked_by(Interface.MQTT)
@@ -52,7 +52,7 @@ class Daemon:
         self.ask = ask
         self.status: Object | None = None
         self.pose: Object | None = None
-        self.record: Object | None = None
+        self.record: Object | None = None  # The last calibration's record
         self.alive = False
         self.news = asyncio.Event()
         self.clock_agrees = False

@@ -32,20 +32,20 @@ from companion.storage.state import UNREADABLE
 logger = logging.getLogger(__name__)
 
 COLLECT_EVERY_S: Final = 2.0
-BATCH: Final = 20
-WINDOW: Final = 8
+BATCH: Final = 20  # Most entries read from the disk at once; a whole history may wait there
+WINDOW: Final = 8  # The most items under way without a confirmation
 CONFIRMED_WITHIN_S: Final = 30.0
 LONGEST_WAIT_S: Final = 600.0
 HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
 PAUSE_S: Final = 0.05
-CURVES_AFTER_S: Final = 60.0
+CURVES_AFTER_S: Final = 60.0  # Delay of the first curves, which have to be worked out first
 CURVES_EVERY_S: Final = 6 * 3600.0
 INBOX: Final = 64
 AIRCRAFT_MARK, CURVE_MARKS = "aircraft", "curve/"
 
 FORMAT_VERSION: Final = 1
-MOST_RANGES: Final = 256
+MOST_RANGES: Final = 256  # Most ranges of sequences in one message to an aircraft
 MOST_SEQUENCE: Final = 2**53
 
 _Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
@@ -90,7 +90,7 @@ class AircraftFleet:
         self._kept: list[Kept] = []
         self._aircraft: str | None = None
         self._has_news = True
-        self._caught_up = False
+        self._caught_up = False  # True once files of earlier runs were read
         self._started_s = 0.0
         self._curves_s = math.inf
         self._connection: tuple[MqttLink, int] | None = None
@@ -133,6 +133,7 @@ class AircraftFleet:
             self._woken.set()
 
     async def run(self) -> None:
+        """Keep and send until cancelled; never raises anything else."""
         self._started_s = asyncio.get_running_loop().time()
         self._curves_s = self._started_s + CURVES_AFTER_S
         try:

@@ -22,7 +22,7 @@ RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/"
 TOLD: Final = "told"
 _WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles", "flights")
 _NAME: Final = re.compile(r"([a-z0-9][a-z0-9._-]*)\.json")
-_LISTED: Final = 200
+_LISTED: Final = 200  # Most entries of a list; the daemon keeps no more
 FORMAT_VERSION: Final = 1
 
 

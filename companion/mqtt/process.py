@@ -26,6 +26,7 @@ _json: Final = msgspec.json.encode
 MEMORY_MIB: Final = 128
 """The process needs 30 MiB, the fleet's part included."""
 FOUND_WITHIN_S: Final = 3.0
+"""Wait this long for the autopilot's system id; without it the vehicle is number 1, as on MAVLink."""
 NEWS_WITHIN_S: Final = 1.0
 PROGRESS_S: Final = 0.5
 ANSWER_AT_END_S: Final = 0.5

@@ -21,7 +21,7 @@ _SEMI_MAJOR_M: Final = 6378137.0
 _FLATTENING: Final = 1 / 298.257223563
 _M: Final = 0.00344978650684
 
-WMM_VALID_YEARS: Final = (2025.0, 2030.0)
+WMM_VALID_YEARS: Final = (2025.0, 2030.0)  # The years for which the world magnetic model WMM2025 is made
 
 GAUSS_PER_NT: Final = 1e-5
 CompassUse = Literal["good", "poor", "none"]
@@ -52,13 +52,13 @@ class MagneticField:
     by the model's warning zones: "none" below 2000 nT of horizontal field, "poor" below 6000 nT.
     """
 
-    declination_deg: float
-    inclination_deg: float
+    declination_deg: float  # East positive: true heading = magnetic heading + declination
+    inclination_deg: float  # Down positive: 90 at the north magnetic pole, -90 at the south
     strength_gauss: float
     declination_sigma_deg: float
     inclination_sigma_deg: float
     strength_sigma_gauss: float
-    compass_use: CompassUse
+    compass_use: CompassUse  # The model's warning zones: "none" below 2000 nT of horizontal field, "poor" below 6000 nT
 
     @property
     def horizontal_gauss(self) -> float:

@@ -24,6 +24,7 @@ _VERTICAL: Final = 1e-9
 
 
 def horizontal(vector: Array, up: Array) -> Array:
+    """Return the part of a vector across up, (3,)."""
     return vector - (vector @ up) * up
 
 

@@ -7,19 +7,19 @@ from typing import Final, NamedTuple
 
 from companion.samples import Triad
 
-DEG: Final = math.pi / 180.0
+DEG: Final = math.pi / 180.0  # rad per degree
 
-DEG_H: Final = math.pi / 180.0 / 3600.0
+DEG_H: Final = math.pi / 180.0 / 3600.0  # rad/s per degree per hour
 
-G: Final = 9.80665
+G: Final = 9.80665  # m/s^2 per g of the standard gravity
 
-MG: Final = 9.80665e-3
+MG: Final = 9.80665e-3  # m/s^2 per milli-g of the standard gravity, the unit in which accelerometers are specified
 
 
 class Unit(NamedTuple):
-    si: float
+    si: float  # The unit in SI units
     name: str
-    digits: int
+    digits: int  # Decimals that a bias is worth
 
 
 UNITS: Final[dict[Triad, Unit]] = {"gyro": Unit(DEG_H, "deg/h", 0), "accel": Unit(MG, "mg", 1)}

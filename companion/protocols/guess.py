@@ -37,6 +37,8 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
+    """A protocol that the bytes may be."""
+
     protocol: str
     kinds: tuple[Kind, ...]
     accepted: int
@@ -125,6 +127,8 @@ _X25_POLYNOMIAL: Final = 0x8408
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
+    """Sender of a HEARTBEAT."""
+
     system_id: int
     component_id: int
     kind: int

@@ -46,6 +46,8 @@ _MOST_DAMAGE_NAMED: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
+    """A fault: a key to count it under, and one line for people."""
+
     key: str
     words: str
     implausible: bool = False
@@ -55,6 +57,8 @@ _Counts = tuple[int, Counter[str]]  # frames accepted, and rejected by reason
 
 
 class StreamHealth:
+    """Watches one stream; `protocol`: its name in the configuration."""
+
     def __init__(self, protocol: str, decoder: Decoder) -> None:
         self._protocol, self._decoder = protocol, decoder
         self.last_sample_s: float | None = None

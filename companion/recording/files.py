@@ -41,7 +41,7 @@ class Beginning:
     t_s: float
     offset_ns: int
     """UTC minus the daemon's clock, fixed when the daemon started: setting the host's clock makes no jump."""
-    config: bytes
+    config: bytes  # JSON
     states: Sequence[Message]  # states in force at `t_s`
 
 
@@ -72,6 +72,8 @@ def is_available() -> bool:
 
 
 class RecordingFile:
+    """One MCAP file in the making."""
+
     def __init__(self, path: Path) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
 

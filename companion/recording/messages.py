@@ -37,6 +37,8 @@ Message = tuple[str, float, bytes]  # topic, time on the daemon's clock, data
 
 
 class Start(msgspec.Struct, frozen=True):
+    """A recording begins here, or begins anew after a gap."""
+
     lost: int = 0  # messages dropped right before, because the disk did not keep up
     continues: bool = False  # True: the file before this one in the ring ends where this one begins
 

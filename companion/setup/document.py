@@ -28,6 +28,7 @@ class _Block:
         return keys[-1] if keys else 0
 
     def set(self, key: str, value: Any) -> None:
+        """Let the section say so; None: let it say nothing of it."""
         places = [(index, match) for index, line in enumerate(self.lines) if (match := _KEY.match(line))]
         mine = sorted(
             ((match["off"] is not None, index, match) for index, match in places if match["key"] == key),

@@ -34,12 +34,14 @@ _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compas
 
 @dataclass(frozen=True, slots=True)
 class Question:
+    """A question for the operator."""
+
     words: str
-    now: str
+    now: str  # Present answer
     put: Callable[[str], None]
     """Accepts an answer; raises ConfigError, in one line, for a wrong one."""
     hint: str = ""
-    choices: Sequence[str] = ()
+    choices: Sequence[str] = ()  # Answers that a page shows as buttons
     key: str = ""
 
 
@@ -52,9 +54,11 @@ class Draft:
         self.guessed: set[str] = set()
 
     def result(self) -> str:
+        """Return the new text; raise CompanionError where single lines of it cannot be changed."""
         return render(self.text, self.wanted)
 
     def parsed(self) -> Config:
+        """Parse the new text; raise ConfigError with one line where it is wrong."""
         # Names of saved profiles are for the daemon to look up.
         return config.parse(self.result(), "answer", lambda _, name: name)
 
@@ -78,6 +82,7 @@ class Draft:
         return found
 
     def take_url(self, url: str) -> None:
+        """Set the autopilot's url; raise ConfigError for a wrong one."""
         self._put("mavlink", "url", url)
         self.is_new = False
 
@@ -87,6 +92,7 @@ class Draft:
         self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
     def show_page(self, bind: str) -> None:
+        """Add the page at an address unless there is one; raise ConfigError where it is no address."""
         if "web" not in self.wanted:
             self._put("web", "bind", bind)
 
@@ -260,6 +266,7 @@ def sample() -> str:
 
 
 def begin(path: Path) -> Draft:
+    """Load the configuration, or the sample where there is none; raise ConfigError where it cannot be used."""
     try:
         text = read_regular(path, config.MOST_BYTES).decode()
     except FileNotFoundError:

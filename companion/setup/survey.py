@@ -32,6 +32,8 @@ listens longer."""
 
 
 class HeardUdp(asyncio.DatagramProtocol):
+    """Messages heard on a UDP port."""
+
     def __init__(self, senders: Iterable[Heartbeat] = (), *, from_here: bool = True) -> None:
         self.senders = dict.fromkeys(senders)
         self.from_here = from_here
@@ -70,6 +72,8 @@ async def listen_udp(port: int) -> HeardUdp:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
+    """Everything heard on every port."""
+
     serial: dict[str, Heard | str]
     udp: dict[int, HeardUdp | str]
 

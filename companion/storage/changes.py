@@ -55,6 +55,7 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
+    """Name: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
     at: Moment = ""
     since: Moment = ""  # begin of the first of several writes in one step; empty: it is the only one
 
@@ -64,6 +65,8 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Changes of one write on one vehicle."""
+
     system_id: int
     changes: tuple[Changed, ...]
     origin: Origin = Origin()
@@ -152,6 +155,8 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 class ChangeLog:
+    """The change files of one storage folder."""
+
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._allowed = {name: one for each in CALIBRATION.values() for name, one in each.items()}
@@ -195,7 +200,9 @@ PENDING: Final = "old values not restored yet: disarm and keep the link up"
 
 
 class Interruption(msgspec.Struct, frozen=True, kw_only=True):
-    what: str
+    """One interrupted write."""
+
+    what: str  # Kind of write, as `Origin.what`
     began_at: str  # begin of the calibration or alignment that wrote, UTC, ISO 8601; empty: not kept
     ended_at: str | None  # end of the restore, UTC, ISO 8601; None: pending
     system_id: int

@@ -31,10 +31,12 @@ Range = tuple[int, int]  # first and last sequence, both included
 
 
 class Item(NamedTuple):
+    """Item for the fleet."""
+
     kind: str
     at: str  # time of the event: UTC, ISO 8601
     clock: Clock
-    body: bytes
+    body: bytes  # A JSON object
 
 
 class Mark(NamedTuple):
@@ -45,11 +47,15 @@ class Mark(NamedTuple):
 
 
 class SourceItems(NamedTuple):
+    """Items, and the marks of their sources."""
+
     marks: dict[str, Mark]
     items: Sequence[Item] = ()
 
 
 class Kept(NamedTuple):
+    """Items of one aircraft."""
+
     aircraft: str
     epoch: str
     first: int  # first sequence that is kept; `last` + 1: none is
@@ -59,6 +65,8 @@ class Kept(NamedTuple):
 
 
 class Waiting(NamedTuple):
+    """Item that is not confirmed yet."""
+
     number: int  # number over all aircraft, in order
     aircraft: str
     epoch: str

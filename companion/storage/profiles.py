@@ -29,6 +29,8 @@ _FILE: Final = re.compile(rf"({_NAME.pattern})\.json")
 
 
 class ProfileSource(msgspec.Struct, frozen=True, kw_only=True):
+    """One recording that a profile was learned from."""
+
     file: str
     began_at: str | None  # UTC, where the recording tells it
     still_s: float
@@ -36,6 +38,8 @@ class ProfileSource(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
+    """The file."""
+
     format_version: int
     name: str
     saved_at: str
@@ -58,6 +62,7 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check_name(name: str) -> None:
+    """Raise StorageError where a profile may not be saved under this name: the catalogue's, or no name for a file."""
     if _plain(name) in CATALOGUE:
         raise StorageError(f"profile {name!r}: that name is the catalogue's; allowed: another one")
     if not _NAME.fullmatch(name):
@@ -72,6 +77,8 @@ def _plain(name: str) -> str:
 
 
 class ProfileStore:
+    """The folder `profiles` of a storage directory."""
+
     def __init__(self, directory: Path) -> None:
         self._folder = directory / "profiles"
 
@@ -79,9 +86,11 @@ class ProfileStore:
         return self._folder / f"{name}.json"
 
     def names(self) -> list[str]:
+        """List all profiles, unreadable ones too; raises StorageError."""
         return named_in(self._folder, _FILE)
 
     def read(self, name: str) -> SavedProfile:
+        """Read one profile; raises StorageError in one line."""
         path = self.path(name)
         found = read_profile(path)
         if found.name != name:
@@ -89,6 +98,7 @@ class ProfileStore:
         return found
 
     def write(self, profile: SavedProfile) -> Path:
+        """Save a profile, in the place of one of that name; return its file. Raises StorageError."""
         check_name(profile.name)
         path = self.path(profile.name)
         # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.

@@ -34,7 +34,7 @@ class NumberedFiles(Generic[T]):
     Methods raise StorageError; nothing is half written.
     """
 
-    name: ClassVar[str]
+    name: ClassVar[str]  # Name of the folder
     kind: ClassVar[Any]
     newest_format: ClassVar[int]
     keep: ClassVar[int]  # most files; the oldest make room
@@ -44,12 +44,14 @@ class NumberedFiles(Generic[T]):
         self.folder = directory / self.name
 
     def numbers(self) -> list[int]:
+        """List all numbers, ascending, of unreadable files too; raises StorageError."""
         return numbers_in(self.folder, _NAME)
 
     def file(self, number: int) -> StateFile[T]:
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
+        """Add a file; return its number. Raises StorageError; nothing is half written."""
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 1
         self.file(number).write(value)
@@ -132,6 +134,8 @@ def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):
+    """Outcome of one alignment."""
+
     what: str  # "zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1
     state: str  # "done", "failed", or "predicted" of version 0.1
     measured_at: str
@@ -158,6 +162,8 @@ KEEP_IMUS: Final = 8
 
 
 class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
+    """Identity and points of one IMU, oldest first."""
+
     identity: dict[str, str]
     points: tuple[history.Point, ...] = ()  # oldest first
 
@@ -168,6 +174,8 @@ class _File(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BiasStore:
+    """`biases.json` in the storage directory."""
+
     def __init__(self, directory: Path) -> None:
         self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=BIASES_VERSION)
 
@@ -196,7 +204,7 @@ class SigningTime(msgspec.Struct, frozen=True):
 
     ticks: int
     reserved: int  # largest tick that may have been used before the next write
-    uptime_s: float
+    uptime_s: float  # Uptime of the board at the write
     boot_id: str  # boot of the board; empty: unknown
 
 

@@ -62,6 +62,7 @@ def remove_durably(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
+    """Have what was made, renamed or removed in it on the disk; raises OSError."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -75,7 +76,7 @@ MOST_BYTES: Final = 2_000_000
 """The most bytes of a state file; the largest of ours, with the earlier biases of eight IMUs, has 1.7 MB at most."""
 
 ASIDE: Final = ".unusable"
-MOST_ASIDE: Final = 3
+MOST_ASIDE: Final = 3  # The most set-aside files of each name; the last one makes room
 
 UNREADABLE: Final = (ValueError, RecursionError, OverflowError, msgspec.MsgspecError)
 """Errors of reading any bytes as JSON of a type."""
@@ -110,6 +111,7 @@ def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
 
 
 def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
+    """Return the numbers in such names, ascending; raises as `named_in`."""
     return sorted(map(int, named_in(folder, kind)))
 
 
@@ -189,6 +191,7 @@ class StateFile(Generic[T]):
         write_atomically(self.path, data, mode=self._mode)
 
     def clear(self) -> None:
+        """Remove the file; raises StorageError."""
         remove_durably(self.path)
 
 
@@ -223,9 +226,11 @@ class BoundedList(Generic[T]):
         return _listed(self._file.read())
 
     def append(self, entry: T) -> None:
+        """Add an entry; raises StorageError."""
         self.write([*self.read(), entry][-self._keep :])
 
     def write(self, entries: list[T]) -> None:
+        """Replace the entries; raises StorageError."""
         self._file.write(_Entries(entries))
 
 

@@ -100,6 +100,7 @@ class Access:
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
     def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
+        """Return why a request comes from another site's page; None: it comes from our own."""
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "asked by another site"
         origin, host = headers.get("origin"), headers.get("host", "")
@@ -108,6 +109,7 @@ class Access:
         return None
 
     def refuses_token(self, headers: Mapping[str, str]) -> str | None:
+        """Return why no action may be started; None: one may."""
         given = _bare(headers.get(TOKEN_HEADER, ""))
         if not given:
             return "needs the token: companion web-token, on the board, shows it"

@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
 
-WORTH_S: Final = 10.0
+WORTH_S: Final = 10.0  # A page that was open for this long is opened again at once
 WRONG_TOKEN_S: Final = 2.0
 MAX_WAITING: Final = 16
 """The most answers to wrong tokens that are delayed at a time: each holds a connection."""
@@ -43,9 +43,10 @@ ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 MAX_VIEWERS: Final = 16
 MAX_STRANGERS: Final = 4
+"""The most viewers of one address without the token; on the board itself all have the same address."""
 MAX_BEHIND: Final = 20
 """Ten seconds of events: a viewer that has so many to read yet is dropped, and begins anew."""
-AGAIN_S: Final = 0.5
+AGAIN_S: Final = 0.5  # Pause after which a companion that gave no status is asked again
 ACTIONS: Final = asked_by(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
 _STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
@@ -63,10 +64,10 @@ class Page:
         self._directory, self._ask = directory, ask
         self.local = is_loopback(self._host)
         self.access = Access(new_token(), handed_out=self.local)
-        self.problem: str | None = "not open yet"
+        self.problem: str | None = "not open yet"  # Why nobody can look, in one line; None while the page is there
         self._html = _assembled()
         self._tag = hashlib.sha256(self._html).hexdigest()[:16]
-        self._viewers: dict[Viewer, None] = {}
+        self._viewers: dict[Viewer, None] = {}  # The oldest first
         self._looked_at = asyncio.Event()
         self._delayed = self._wrong_tokens = 0
         self._reconnection = Reconnection("page", worth_s=WORTH_S, first_s=1.0, cap_s=30.0, on_state=self._on_state)
@@ -256,6 +257,8 @@ class Page:
 
 
 class Viewer:
+    """One stream of events."""
+
     def __init__(self, connection: Connection, peer: str, *, has_token: bool) -> None:
         self.connection, self.peer, self.has_token = connection, peer, has_token
         self._events: asyncio.Queue[bytes] = asyncio.Queue(MAX_BEHIND)

@@ -54,6 +54,7 @@ _TCAL_ON: Final = 1
 _TCAL_LEARNING: Final = 2
 
 TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
+"""Roll and pitch of the board against the aircraft, rad; taken off the attitude, never off IMU data."""
 _TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")  # ArduPilot cuts it off there
 _TCAL_RANGE: Final = Range(-1e6, 1e6)  # millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin
 
@@ -73,6 +74,7 @@ class ArduPilotParameters(ImuParameters):
     """Parameter names of one IMU, counting from 1; the first is irregular, 4 and 5 are again (autopilots 1.1)."""
 
     def __init__(self, instance: int) -> None:
+        """Raise AutopilotError where there is no such instance."""
         if instance not in INSTANCES:
             raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
         # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
@@ -91,7 +93,7 @@ class ArduPilotParameters(ImuParameters):
         """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
         self.tcal_enable, self.tcal_low, self.tcal_high = f"{tcal}ENABLE", f"{tcal}TMIN", f"{tcal}TMAX"
         """ENABLE: 0 off, 1 on, 2 learning until the next boot."""
-        self.tcal_gyro = [_xyz(f"{tcal}GYR{power}_") for power in (1, 2, 3)]
+        self.tcal_gyro = [_xyz(f"{tcal}GYR{power}_") for power in (1, 2, 3)]  # Coefficients by power of the temperature
         self.tcal_accel = [_xyz(f"{tcal}ACC{power}_") for power in (1, 2, 3)]
         coefficients = (name for names in (*self.tcal_accel, *self.tcal_gyro) for name in names)
         self.tcal = (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
@@ -113,6 +115,8 @@ def _ranges() -> dict[str, Range]:
 
 
 class ArduPilot(Firmware):
+    """Copter, Plane and Rover with EKF3."""
+
     name: FirmwareName = "ardupilot"
     words = "ArduPilot"
     mav_autopilot = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -314,6 +318,11 @@ async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
 
 
 async def _read_board_rotation(parameters: Parameters) -> Matrix:
+    """Read the matrix from the board's axes to the vehicle's FRD.
+
+    Raises:
+        AutopilotError: an unknown orientation, or a custom one that is not in force; or as `Parameters.read`.
+    """
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1
     if 0 <= number < len(ROTATION_NAMES):

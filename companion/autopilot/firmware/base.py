@@ -181,6 +181,8 @@ class Firmware:
 
 
 class OtherFirmware(Firmware):
+    """An autopilot that is neither of those that are known."""
+
     name = "other"
 
 

@@ -31,6 +31,7 @@ believed of a file."""
 
 
 def firmware_named(name: FirmwareName | None) -> Firmware:
+    """Return the firmware of a name; None: not heard yet."""
     return UNHEARD if name is None else next((one for one in FIRMWARES if one.name == name), OTHER)
 
 

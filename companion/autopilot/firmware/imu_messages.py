@@ -27,6 +27,8 @@ def all_zero(sample: ImuSample) -> bool:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuMessage:
+    """A message that may carry an IMU's samples."""
+
     name: str
     message: type[Message]
     decode: Callable[[Message, float], ImuSample | str]  # the sample in a message, or why there is none
@@ -43,7 +45,7 @@ class ImuMessage:
         return MG if self.integers else 0.0
 
 
-_ACCEL_AND_GYRO: Final = 0b111111
+_ACCEL_AND_GYRO: Final = 0b111111  # HIGHRES_IMU.fields_updated: all three axes of both
 
 
 def _highres(message: Any, t_s: float) -> ImuSample | str:

@@ -109,6 +109,8 @@ def _ranges() -> dict[str, Range]:
 
 
 class PX4(Firmware):
+    """PX4 with EKF2."""
+
     name: FirmwareName = "px4"
     words = "PX4"
     mav_autopilot = mavlink.MAV_AUTOPILOT_PX4
@@ -266,6 +268,8 @@ def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Slot:
+    """One slot that holds a device id."""
+
     number: int
     device_id: int
     enabled: bool
@@ -276,6 +280,7 @@ class Slot:
 
 
 async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
+    """Read all slots that hold a device id, in order. Raises as `Parameters.read_optional`."""
     found: list[Slot] = []
     for number in range(SLOTS):
         device_id = await parameters.read_integer(f"{PREFIX[sensor]}{number}_ID")

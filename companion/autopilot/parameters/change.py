@@ -68,6 +68,8 @@ class Parameters(abc.ABC):
 
     @abc.abstractmethod
     async def ensure_same_boot(self, boots: int, words: str) -> None:
+        """None: not known yet."""
+        """Read one; None: there is no such parameter."""
         """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
 
     async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
@@ -174,6 +176,8 @@ there is one.
 
 @dataclasses.dataclass(slots=True)
 class PendingChange:
+    """One parameter of a write, and its state."""
+
     change: Change
     sent: bool = False
     confirmed: bool = False  # it answered with a value of ours: another one found later is somebody else's

@@ -56,10 +56,12 @@ class Observation:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class EffectVerdict:
+    """One vector."""
+
     axes: Mapping[str, AxisWord]
     fraction_sigma: float | None  # of the share of the expected step that was made; None: nothing had to move
     problems: tuple[str, ...]
-    hidden: tuple[str, ...]
+    hidden: tuple[str, ...]  # The parameters whose step could not be judged
 
     @property
     def ok(self) -> bool:

@@ -76,6 +76,8 @@ def attitude_messages(
 
 
 class TimesyncResponder:
+    """Answers the latched autopilot, with the clock that stamps what we send."""
+
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0
         self._link = link

@@ -124,6 +124,7 @@ class ImuStream:
         return None if self._current is None else self._current.rates_hz[self._current.rate]
 
     async def run(self) -> None:
+        """Keep the samples coming until cancelled; raises nothing else."""
         kinds = {each.message for firmware in FIRMWARES for each in firmware.imu_messages.get(self._instance, ())}
         subscriptions = [self._link.subscribe(kind, self._on_message) for kind in kinds]
         subscriptions.append(self._vehicle.on_event.add(self._on_event))

@@ -43,6 +43,8 @@ _PROMPT: Final = re.compile("(nsh|pxh)> ")
 
 
 class Px4Console:
+    """Has the console print topics."""
+
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.text = ""
         self._link, self._vehicle = link, vehicle
@@ -100,6 +102,8 @@ _IMU: Final = re.compile(
 
 
 class EkfBias:
+    """Reads the bias again and again; `run` it."""
+
     def __init__(self, console: Px4Console, vehicle: Vehicle) -> None:
         self.instance: int | None = None  # IMU (1..) that HIGHRES_IMU shows; None while its bias is not known
         self.settled = asyncio.Event()  # set once the bias is known, or the first answer did not tell it
@@ -234,6 +238,8 @@ _STATUS: Final = re.compile(
 
 
 class ImuStatus:
+    """Has the console print the status of the IMUs that want it, in turn; `run` it."""
+
     def __init__(
         self,
         console: Px4Console,

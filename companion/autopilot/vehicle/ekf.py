@@ -45,6 +45,8 @@ _AHRS_LOOK_S: Final = 0.25
 
 
 class EkfWatch:
+    """Asks for AHRS while somebody wants to know, and averages what comes over 2 s."""
+
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._seen: deque[tuple[float, float, float, float]] = deque(maxlen=2048)
@@ -213,6 +215,7 @@ class OwnAttitude:
         return np.asarray(np.mean(ups, axis=0))
 
     async def up_since(self, since_s: float) -> Array | None:
+        """Wait for it a few seconds; None: this autopilot does not tell."""
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + _OLD_S
         while (found := self.up(since_s)) is None and loop.time() < give_up_s:

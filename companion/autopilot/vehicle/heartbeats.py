@@ -34,12 +34,15 @@ class ArmState(enum.Enum):
 
     @property
     def why_not_written(self) -> str | None:
+        """Why nothing may be written, for people; None: it may."""
         if self is ArmState.DISARMED:
             return None
         return "the aircraft is armed" if self is ArmState.ARMED else "it is unknown whether the aircraft is armed"
 
 
 class ArmingWatch:
+    """Takes the heartbeats of one vehicle and says what may be believed of them."""
+
     def __init__(self) -> None:
         self._armed: bool | None = None
         self._armed_s = self._disarmed_s = self._two_s = self._restarted_s = -math.inf
@@ -120,6 +123,8 @@ def version_text(packed: int) -> str:
 
 
 class Latch:
+    """Decides which autopilot is taken."""
+
     def __init__(self, system_id: int | None) -> None:
         self._system_id = system_id
         self._candidates: dict[tuple[int, int], float] = {}

@@ -57,7 +57,7 @@ _ERROR_WORDS: Final = {
 }
 """MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
 
-_Answer = float | str
+_Answer = float | str  # Value of a PARAM_VALUE, or PARAM_ERROR in words
 
 
 class _Inbox:
@@ -84,6 +84,8 @@ class _Inbox:
 
 
 class ParameterClient(Parameters):
+    """The parameters of one autopilot."""
+
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.writes = 0  # PARAM_SET messages sent, repetitions included
@@ -111,6 +113,7 @@ class ParameterClient(Parameters):
         self.require_same_boot(boots, words)
 
     def require_same_boot(self, boots: int, words: str) -> None:
+        """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
         if self.boots != boots:
             raise AutopilotRebootedError(f"{self.vehicle.name} {words}")
 

@@ -63,6 +63,8 @@ class _Failure(Exception):  # noqa: N818 - never leaves this module
 
 
 class ParameterWriter:
+    """Writes sets of parameters to one autopilot, one set at a time."""
+
     def __init__(self, parameters: ParameterClient, vehicle: Vehicle) -> None:
         self.written: dict[str, WrittenParameter] = {}  # by the last operation, whatever its end: also a cancel
         self.left_changed: tuple[str, ...] = ()

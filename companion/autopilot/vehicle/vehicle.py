@@ -69,11 +69,11 @@ class Vehicle:
         self.system_id: int | None = None
         self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
         self.kind: Firmware = UNHEARD
-        self.version: str | None = None
-        self.capabilities: int | None = None
+        self.version: str | None = None  # Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come
+        self.capabilities: int | None = None  # MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come
         self.uid: str | None = None  # the board's; like version and capabilities None until AUTOPILOT_VERSION has come
         self.system_status: int | None = None
-        self.signs = False
+        self.signs = False  # The autopilot signed its last heartbeat (MAVLink 2)
         self.boots = 0
         self.place = TimeAndPlace(is_carried)
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))

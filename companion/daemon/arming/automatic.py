@@ -40,11 +40,13 @@ WORTH_FOR_S: Final = 30.0
 PER_DAY: Final = 24
 """Most automatic writes a day: some 300 parameters; a page of flash bears 10 000 rewrites."""
 FAILURES: Final = 3
-RETRY_S: Final = 60.0
+RETRY_S: Final = 60.0  # Wait after a failure; doubled with each further one
 TIMEOUT_S: Final = 180.0
 
 
 class Automatic:
+    """Starts calibrations by itself; `run` decides when."""
+
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], in_force: ActiveCalibration) -> None:
         self._core, self._manager, self._imus, self._in_force = core, in_force.manager, imus, in_force
         self._file = BoundedList(core.config.storage.path / "automatic.json", dict[str, float], PER_DAY + 8)

@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
 """Findings that count although a result is held back: choices of people, and writes without a seen effect."""
-SETTLED_EVERY_S: Final = 5
+SETTLED_EVERY_S: Final = 5  # Interval of checks of the output without a finding; otherwise every second
 
 
 @dataclasses.dataclass(slots=True)
@@ -66,6 +66,8 @@ class _TriadState:
 
 
 class ActiveCalibration:
+    """The active calibration; `poll` often, `measure` whenever there may be a new window."""
+
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
         self.manager, self._memory = calibrating.manager, calibrating.memory
@@ -82,7 +84,7 @@ class ActiveCalibration:
         """Biases that an automatic calibration determines."""
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
-        self.temperatures_degc: dict[str, float] = {}
+        self.temperatures_degc: dict[str, float] = {}  # Temperatures of the IMUs at the last check of their output
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
         self.offsets = OffsetWatch(core.vehicle, imus, self._lose)

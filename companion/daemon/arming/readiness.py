@@ -32,8 +32,8 @@ POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
 """Stillness required after somebody has let go of the aircraft."""
-COUNTDOWN_KEPT_S: Final = 2.0
-OLDEST_ANSWER_S: Final = 1.5
+COUNTDOWN_KEPT_S: Final = 2.0  # Age at which a countdown starts anew
+OLDEST_ANSWER_S: Final = 1.5  # Age at which an answer that was not renewed is void
 _STEPS: Final[dict[State, str]] = {
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
@@ -59,6 +59,8 @@ ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
 
 class Readiness:
+    """The arm gate's answer with its words; `run` keeps it fresh."""
+
     def __init__(self, core: Core, owed: RebootOwed, in_force: ActiveCalibration, automatic: Automatic) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
@@ -67,6 +69,7 @@ class Readiness:
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._countdown = -math.inf, math.inf
+        """Time of the last countdown to a calibration, and the seconds that it named."""
         self._has_gated = False
         self.turns = 0
 

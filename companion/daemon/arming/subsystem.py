@@ -38,6 +38,8 @@ SCRIPT_STARTS_S: Final = 10.0
 
 
 class Armings:
+    """Reports and records the active calibration at each arming; `run` writes to disk."""
+
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._readiness, self._say, self._offload = readiness, core.say, core.offload
         self.file = armings_in(core.config.storage.path)
@@ -83,6 +85,8 @@ class Armings:
 
 
 class GateSetup:
+    """Checks whether the autopilot asks before it arms."""
+
     def __init__(self, core: Core) -> None:
         self._core, self._vehicle = core, core.vehicle
         self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
@@ -112,6 +116,8 @@ class GateSetup:
 
 
 class Arming(Subsystem):
+    """Wires the active calibration, the gate, automatic calibrations and the history of armings."""
+
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
         self.manager = calibrating.manager

@@ -47,7 +47,7 @@ class Precondition(enum.Enum):
     DISARMED = enum.auto()
     ARM_STATE_KNOWN = enum.auto()
     ONE_COMPANION = enum.auto()
-    RESTORED = enum.auto()
+    RESTORED = enum.auto()  # No restore of an interrupted write is pending
 
 
 REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = {
@@ -80,6 +80,8 @@ def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple
 
 
 class CalibrationManager:
+    """The calibration service behind MAVLink, the control socket, MQTT and the page."""
+
     def __init__(self, parts: CalibrationParts, store: RecordStore, by_hand: ByHand) -> None:
         core = parts.core
         self._parts, self._core, self._machine, self._vehicle = parts, core, core.machine, core.vehicle
@@ -89,12 +91,13 @@ class CalibrationManager:
         self.job: Job | None = None
         """The running or the latest job."""
         self.reason = ""
-        self.last: Record | None = None
-        self.on_ended: Listeners[Job, JobResult] = Listeners()
+        self.last: Record | None = None  # Record of the latest calibration, loaded from disk at start
+        self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified of the end of a job, before its requester
         core.vehicle.on_event.add(self._on_event)
         self._recovery.on_recovered = self._recovered
 
     def load(self) -> None:
+        """Load the latest record; blocking."""
         try:
             self.last = next(iter(self._store.history(limit=1)), None)
         except StorageError as error:

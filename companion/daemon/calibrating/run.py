@@ -51,7 +51,7 @@ from companion.storage.changes import AUTOMATIC
 
 logger = logging.getLogger(__name__)
 
-Key = tuple[str, Triad]
+Key = tuple[str, Triad]  # Name of an IMU, and its gyros or its accelerometers
 
 WRONG_IMU_ATTEMPTS: Final = 3
 """Most writes that act on the wrong IMU: two of three may be mistaken for the right one."""
@@ -59,6 +59,8 @@ _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers
 
 
 class CalibrationParts(NamedTuple):
+    """Parts of the daemon that every calibration uses."""
+
     core: Core
     imus: Mapping[str, AutopilotImu]
     measuring: Measuring
@@ -68,6 +70,8 @@ class CalibrationParts(NamedTuple):
 
 
 class CalibrationRun(Job):
+    """One calibration; `Job` adds request, progress, cancel and outcome."""
+
     def __init__(
         self,
         parts: CalibrationParts,
@@ -97,11 +101,11 @@ class CalibrationRun(Job):
         self._forget()
 
     def _forget(self) -> None:
-        self.measured: Window | None = None
+        self.measured: Window | None = None  # Window of telemetry under the active offsets
         self.solution: Solution | None = None
         """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
-        self.points: dict[str, Point] = {}
-        self.unchanged: set[Key] = set()
+        self.points: dict[str, Point] = {}  # Biases by IMU for later predictions, once this calibration has ended well
+        self.unchanged: set[Key] = set()  # Triads whose offsets are as good as new ones, and stay
         self.plan: Plan | None = None
         self.held_back.clear()
         self.log.written.clear()

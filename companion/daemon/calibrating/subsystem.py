@@ -52,6 +52,8 @@ _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
 
 
 class Calibrating(Subsystem):
+    """Wires calibrations and alignments, and answers their commands."""
+
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
         self._core, self._offsets, self._imus = core, offsets, imus

@@ -37,6 +37,8 @@ CONFIRMED_WITHIN_S: Final = 3.0
 
 
 class AutopilotImu:
+    """Gives the collector the samples of one autopilot IMU while the offsets behind them are known."""
+
     def __init__(self, core: Core, imu: Imu, slots: SlotMemory, ekf_bias: EkfBias, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
@@ -46,7 +48,7 @@ class AutopilotImu:
         self.upsets = 0
         self.upset = ""
         self.on_sample: Listeners[ImuSample] = Listeners()
-        self.on_counting: Listeners[ImuSample] = Listeners()
+        self.on_counting: Listeners[ImuSample] = Listeners()  # Listeners to samples that count, before the collector
         self.on_raw: Listeners[float, Six, float | None] = Listeners()
         """Listeners to means of raw readings: time, output less the offsets in force, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
@@ -241,10 +243,10 @@ class OffsetWatch:
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost
         self._known: dict[str, _Known] = {}
-        self._before: dict[str, _Known] = {}
+        self._before: dict[str, _Known] = {}  # Offsets before a job, until those after it are read
         self._failed = self._asked_restart = False
-        self._written: dict[str, dict[str, float]] = {}
-        self.foreign: str | None = None
+        self._written: dict[str, dict[str, float]] = {}  # Values just written, by IMU, until they are read
+        self.foreign: str | None = None  # Change by somebody else since the last request, in short
 
     def known(self) -> dict[str, _Known]:
         return dict(self._known)

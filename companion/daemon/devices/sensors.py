@@ -44,6 +44,8 @@ AGAIN_S: Final = 60.0
 
 
 class SensorHealth:
+    """Present trouble of one sensor, and how often each trouble has begun."""
+
     def __init__(self, link: ByteLink, protocol: str, decoder: Decoder) -> None:
         self.link, self._decoder = link, decoder
         self.stream = StreamHealth(protocol, decoder)
@@ -118,6 +120,8 @@ def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
 
 
 class SensorRole:
+    """One use of a device, as `companion status` shows it."""
+
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
         self.name, self.kind = role.name, role.kind
         self._sensor = sensor
@@ -174,6 +178,8 @@ class SensorRole:
 
 
 class SerialSensor:
+    """One serial device, read and decoded once for all its roles; `take` gets the part of each sample for each role."""
+
     def __init__(
         self, device: SerialDevice, take: Callable[[Role, Sample], None], offload: Offload = asyncio.to_thread
     ) -> None:
@@ -193,6 +199,7 @@ class SerialSensor:
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
         """Listeners to name, bytes and time before decoding; None for bytes that are missing."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
+        """Listeners to all samples of a read and its time, before the collector."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None

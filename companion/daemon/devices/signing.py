@@ -28,7 +28,7 @@ than a minute behind are refused at first (specification), so it stays well belo
 RESERVE_BEFORE_TICKS: Final = 5 * TICKS_PER_S
 UNANSWERED: Final = 3
 """Unanswered requests in a row, one a second, after which the autopilot is taken to want signatures."""
-ASK_AGAIN_S: Final = 30.0
+ASK_AGAIN_S: Final = 30.0  # Pause before an autopilot that has answered is asked again
 AFTER_S: Final = 3.0
 """Time without a verified message before a fault is reported: longer than a key takes to be changed."""
 AHEAD_OF_CLOCK_S: Final = 86400.0
@@ -64,8 +64,8 @@ class LinkSigning:
         self._stored = signing_time_in(config.storage.path)
         self._reserved = 0
         self._write_failed = False
-        self._named: set[Reason] = set()
-        self.warning: str | None = None
+        self._named: set[Reason] = set()  # Reasons for which a sender other than the autopilot was named
+        self.warning: str | None = None  # Present fault of the autopilot's signatures, with its remedy
         self._refused: Counter[Reason] = Counter()
         """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
         self._verified = False

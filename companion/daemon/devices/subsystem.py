@@ -40,6 +40,8 @@ RETRY_S: Final = 10.0
 
 
 class Reach:
+    """Knows whether a ground station reaches the companion, and what the autopilot's parameters say of forwarding."""
+
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
         self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
         self._heard_s = -math.inf

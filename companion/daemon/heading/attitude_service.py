@@ -49,7 +49,7 @@ SHOWN_EVERY_S: Final = 0.2
 _ROUNDING_S: Final = 1e-6
 SCRIPT_STARTS_S: Final = 15.0
 """Time from the first heartbeat until it is known whether there is a script."""
-WELL_S: Final = 10.0
+WELL_S: Final = 10.0  # Time for which our heading must have been pushed before its source set is requested again
 AGAIN_S: Final = 1.0
 _OURS, _COMPASS, _GYROS = 1, 2, 3
 _WORDS: Final = {
@@ -118,6 +118,8 @@ class Fallback:
 
 
 class Sender:
+    """Sends the attitude to the autopilot when it is due; to ground stations too, if `full`."""
+
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
         self._link, self._full = link, full
@@ -148,6 +150,8 @@ class Sender:
 
 
 class AttitudeService:
+    """Carries, pushes and supervises the attitude; `run` it."""
+
     def __init__(self, core: Core, devices: Devices, in_force: ActiveCalibration, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
         self.turns = 0

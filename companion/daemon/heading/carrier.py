@@ -95,6 +95,8 @@ def without_truncation(sample: ImuSample, step_rad_s: float) -> ImuSample:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandingAttitude:
+    """Attitude of the standing aircraft at the end of a window."""
+
     t_s: float
     body_from_ned: Matrix
     covariance: Matrix
@@ -117,6 +119,8 @@ def standing_attitude(
 
 
 class Carrier:
+    """Carries the attitude of one IMU."""
+
     def __init__(self, core: Core, imu: Imu, in_force: ActiveCalibration, alignment: ActiveAlignment) -> None:
         self.imu = imu
         self.estimator: AttitudeEstimator | None = None

@@ -38,7 +38,7 @@ THEIR_TILT_DEG: Final = 2.0
 """One sigma of the error of the autopilot's own tilt, with trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
 """One sigma of the error of the autopilot's heading, from a compass or the companion."""
-GOOD_S: Final = 3.0
+GOOD_S: Final = 3.0  # Time without a fault before a stopped push begins again
 TOLD_TILT_DEG: Final = 4.0
 TOLD_HEADING_DEG: Final = 8.0
 """Smoothed differences that cause a warning; it ends at half of them."""
@@ -55,10 +55,10 @@ _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 STRAYS_RAD: Final = math.radians(5.0)
 FADES_S: Final = 4.0
 """Time in which the sum fades: a drift of 1.25 deg/s goes unnoticed, and the compass corrects it."""
-STRAYS_SIGMAS: Final = 3.0
+STRAYS_SIGMAS: Final = 3.0  # Allowed turn in sigmas of the heading: the compass may correct a poorly known one
 SCALES: Final = 0.01
 """Share of a turn by which two gyros may differ."""
-LATE_S: Final = 0.03
+LATE_S: Final = 0.03  # Usual difference of the two times
 LONGEST_STEP_S: Final = 0.25
 """Longest step that is compared: it hides a turn to and fro."""
 
@@ -99,6 +99,8 @@ class HeadingDriftMonitor:
 
 
 class Difference:
+    """Difference of our attitude to the latched autopilot's, by its ATTITUDE messages."""
+
     def __init__(self, vehicle: Vehicle, carrier: Carrier) -> None:
         self._carrier = carrier
         self._offset_s: float | None = None

@@ -26,14 +26,16 @@ from companion.estimation.solution.site import LocalEarth, Whereabouts, local_ea
 from companion.physics.frames import vector
 from companion.physics.units import DEG
 
-AGREES_S: Final = 0.7
-FRESH_S: Final = 1.0
-LATEST: Final = 10
+AGREES_S: Final = 0.7  # Time of agreement before the push, and of disagreement before a new start
+FRESH_S: Final = 1.0  # Largest age of the autopilot's attitude; the gyros carry it on
+LATEST: Final = 10  # Records searched for one that is not cancelled or failed
 DECLINATION_SIGMA_DEG: Final = 1.0
 """Error of a stored declination: 0.3 to 0.5 deg of the model, and the distance flown since."""
 
 
 class Resume:
+    """Resumes the attitude in flight; `step` several times a second until `pending` is false."""
+
     def __init__(
         self, core: Core, carrier: Carrier, difference: Difference, calibrating: Calibrating, imu: AutopilotImu | None
     ) -> None:

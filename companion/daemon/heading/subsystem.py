@@ -31,6 +31,8 @@ DECLINATION_EVERY_S: Final = 60.0
 
 
 class Heading(Subsystem):
+    """Wires the shown pose and the pushed attitude."""
+
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
         self._core = core
         self.attitude: AttitudeService | None = None

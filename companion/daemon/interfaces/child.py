@@ -33,6 +33,8 @@ REPORT_LIMIT: Final = 256 * 1024
 
 
 class Child:
+    """Keeps `python -m MODULE` running; `run` it as a task."""
+
     def __init__(self, name: str, module: str, settings: ChildSettings) -> None:
         self._name, self._module, self._settings = name, module, settings
         self._report: Object | None = None

@@ -38,6 +38,8 @@ URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
 
 
 class ControlServer:
+    """Serves the control socket; `async with` it."""
+
     def __init__(self, path: Path, handler: Handler, *, group: str | None = None) -> None:
         self._path, self._group = path, group
         self._handler = handler

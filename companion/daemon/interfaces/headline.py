@@ -22,10 +22,12 @@ Tone = Literal["good", "wait", "busy", "bad"]
 """good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
 
 
-Headline = tuple[str, str, Tone]
+Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, and the tone
 
 
 class Headlines:
+    """Works out the headline, for all interfaces alike."""
+
     def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings

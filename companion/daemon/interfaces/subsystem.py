@@ -41,9 +41,12 @@ POSE_EVERY_S: Final = 0.2
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
 """Child processes by their name in a request, and as a record names the requester ("cancelled by mqtt cancel")."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
+"""Keys of the page's status while its process reports nothing."""
 
 
 class Interfaces(Subsystem):
+    """The MAVLink component, the control socket's answers, and the child processes."""
+
     def __init__(
         self,
         core: Core,

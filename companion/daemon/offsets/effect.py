@@ -30,7 +30,7 @@ from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
 
-VERIFY_MAX_S: Final = 60.0
+VERIFY_MAX_S: Final = 60.0  # Longest wait for stillness after the write before its effect counts as not seen
 VERIFY_ON_DECK_S: Final = 180.0
 """Longest wait on a deck, where it takes the better part of a minute to see a step."""
 LOOK_S: Final = 10.0
@@ -43,7 +43,7 @@ TELEMETRY: Final = "waiting for the telemetry"
 """Progress shown until then: the step of the new offsets itself looks like a movement."""
 POLL_S: Final = 0.2
 
-Verdicts = Mapping[str, list[EffectVerdict]]
+Verdicts = Mapping[str, list[EffectVerdict]]  # Verdicts by IMU
 
 # Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
 # and 50 micro-g), not for the worst there is as over the minutes of sigma_use: else no step could ever be seen.

@@ -49,6 +49,8 @@ SETTLE_ALONE_S: Final = 150.0
 
 
 class FirmwareCalibration:
+    """Decides whether the firmware's gyro calibration is wanted, and writes around it."""
+
     def __init__(self, core: Core, writer: ParameterWriter, ledger: Ledger) -> None:
         self._vehicle, self._parameters = core.vehicle, core.parameters
         self._on_deck = core.config.vehicle.platform == "deck"

@@ -34,6 +34,8 @@ POLL_S: Final = 0.2
 
 
 class Ledger:
+    """Journal and undo steps of one storage folder."""
+
     def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
         self._log, self._offload, self.why_yield = log, offload, why_yield
         """`why_yield`: reason not to write because another companion does; None without one."""
@@ -42,8 +44,8 @@ class Ledger:
         self._open: ChangeSet | None = None
         self._orphaned = asyncio.Event()
         self._undoable: dict[int, Undoable] = {}
-        self.unusable: tuple[str, ...] = ()
-        self.lost_write = False
+        self.unusable: tuple[str, ...] = ()  # Damaged files that were set aside, each in a line
+        self.lost_write = False  # The journal was damaged, so an interrupted write stays as it is
 
     @property
     def pending(self) -> bool:
@@ -152,6 +154,8 @@ class Ledger:
 
 
 class Recovery:
+    """Restores interrupted writes, and undoes finished ones."""
+
     def __init__(
         self,
         core: Core,
@@ -167,6 +171,7 @@ class Recovery:
         """Called with a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
+        """List interrupted writes, the latest first; blocking."""
         pending = [] if self.ledger.orphaned is None else [Interruption.of(self.ledger.orphaned)]
         return [msgspec.to_builtins(each) for each in (*pending, *reversed(self._interruptions.read()))]
 

@@ -62,6 +62,8 @@ class _Other(msgspec.Struct):
 
 
 class OtherCompanions:
+    """Announces this companion and listens for others; `run` until cancelled."""
+
     def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
         self._link, self._say, self._writes = link, say, writes
         self._instance, self._is_new = int.from_bytes(os.urandom(4)) >> 32 - INSTANCE_BITS, True
@@ -125,8 +127,9 @@ class Rivalry:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._imus, self._say = imus, core.say
-        self.stop_rivals = core.config.push.stop_rivals
+        self.stop_rivals = core.config.push.stop_rivals  # The next write switches rivals off
         self._told: set[str] = set()
+        """Rivals that the ground stations were told of since they were switched on; status shows them always."""
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 

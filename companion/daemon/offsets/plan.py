@@ -39,7 +39,7 @@ class WriteLog:
     written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
     warnings: list[str] = dataclasses.field(default_factory=list)
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
-    notes: list[str] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)  # Additions to the result in words
 
     @property
     def started(self) -> str:
@@ -60,6 +60,8 @@ Residual = tuple[Array | None, Array | None]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuPlan:
+    """New offsets of one autopilot IMU."""
+
     name: str
     calibration: ImuCalibration
     changes: tuple[Change, ...]
@@ -76,12 +78,14 @@ class ImuPlan:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Plan:
+    """Changes of one write."""
+
     targets: tuple[ImuPlan, ...]
     boots: int
     """Restarts of the autopilot seen when the plan was made."""
     collateral: tuple[Change, ...] = ()
     """Other changes by the firmware's own gyro calibration: offsets, temperatures and ids of other gyros."""
-    firmware: GyroOutcome | None = None
+    firmware: GyroOutcome | None = None  # Outcome of the firmware's gyro calibration; None where it was not used
 
     @property
     def changes(self) -> tuple[Change, ...]:

@@ -84,6 +84,8 @@ OnTheWay = Mapping[Triad, tuple[Mean, Array]]
 
 
 class Px4Writes:
+    """Watches the telemetry over a write by far values, and learns the slots; other firmwares need none."""
+
     def __init__(
         self, link: MavlinkLink, vehicle: Vehicle, writer: ParameterWriter, ledger: Ledger, memory: SlotMemory, say: Say
     ) -> None:
@@ -92,7 +94,7 @@ class Px4Writes:
         self._steps: dict[str, ExpectedStep] = {}
         self.on_the_way: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
         """`OnTheWay` of the latest write by instance; only of outputs that moved as expected."""
-        self._learned = False
+        self._learned = False  # The last verification learned something new of the slots
         self._boots = 0
         self._samples: defaultdict[int, deque[ImuSample]] = defaultdict(deque)
         self._before: dict[int, Mean | None] = {}

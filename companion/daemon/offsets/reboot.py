@@ -92,9 +92,9 @@ class _Owed(msgspec.Struct, frozen=True):
 
     system_id: int
     tilt_deg: float
-    boot_s: float
+    boot_s: float  # Time since the boot of the autopilot
     host: str
-    host_s: float
+    host_s: float  # Time on the clock of that boot
 
 
 def owed_in(directory: Path) -> StateFile[_Owed]:
@@ -102,6 +102,8 @@ def owed_in(directory: Path) -> StateFile[_Owed]:
 
 
 class RebootOwed:
+    """Remembers that PX4 must be restarted; `run` forgets it when the restart was seen."""
+
     def __init__(self, core: Core) -> None:
         self._vehicle, self._offload, self._core = core.vehicle, core.offload, core
         self._file, self._host = owed_in(core.config.storage.path), this_boot()
@@ -111,6 +113,7 @@ class RebootOwed:
         self._from_earlier_run = False
 
     def load(self) -> None:
+        """Load the file; blocking."""
         self._owed = self._file.load()
         self._from_earlier_run = True
 

@@ -57,6 +57,8 @@ Note = Callable[[Mapping[str, WrittenParameter], Collection[str]], None]
 
 
 class Offsets(Subsystem):
+    """Writes plans, each as a whole or not at all; wires what restores them and what else changes offsets."""
+
     def __init__(self, core: Core, devices: Devices) -> None:
         vehicle, imus = core.vehicle, devices.imus
         self._core, self._vehicle, self._machine, self._imus = core, vehicle, core.machine, imus

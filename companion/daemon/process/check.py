@@ -37,6 +37,8 @@ _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 @dataclass(frozen=True, slots=True)
 class CheckLine:
+    """One line of the check; `remedy`: what to type, if anything."""
+
     name: str
     good: bool
     words: str

@@ -162,9 +162,10 @@ class WatchedTask:
     name: str
     task: str
     within_s: float
-    who: Any
+    who: Any  # Object that counts its `turns`
     seen: int = 0
     age_s: float = 0.0
+    """Age of the latest turn in calls of `overdue`: while the whole event loop stands still, no task ages."""
 
     def overdue(self, passed_s: float) -> bool:
         before, self.seen = self.seen, self.who.turns
@@ -208,6 +209,7 @@ def main(path: str, *verbose: str) -> int:
 
 
 async def run(wanted: Config) -> None:
+    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
     manager = ServiceManager.from_environment()
     try:
         await Supervisor(Service(wanted), manager).run()
@@ -228,6 +230,8 @@ def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
 
 
 class Supervisor:
+    """Runs a service until a signal or a fault, and feeds the watchdog meanwhile."""
+
     def __init__(self, service: Service, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager
         self.watched = watched_tasks(service)

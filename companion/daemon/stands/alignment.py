@@ -52,6 +52,7 @@ class ActiveAlignment:
         self.on_change: Listeners[[]] = Listeners()
 
     def load(self) -> None:
+        """Load the stored alignment; blocking."""
         self._take(self._store.load())
         if self._store.unusable is not None:
             self.unused = self._store.unusable
@@ -116,6 +117,7 @@ class ActiveSixPosition:
         self.record: FacesRecord | None = None
 
     def load(self) -> None:
+        """Load the stored record; blocking."""
         self.record = self._store.load()
 
     async def keep(self, record: FacesRecord) -> None:
@@ -184,12 +186,15 @@ class ActiveSixPosition:
 
 
 class ByHand:
+    """History of alignments and the parameters that they wrote, for `companion history` and `status`."""
+
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._file = alignments_in(core.config.storage.path)
         self._vehicle, self._offload, self._imus = core.vehicle, core.offload, imus
         self._done: list[Done] = []
 
     def load(self) -> None:
+        """Load the history; blocking."""
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:

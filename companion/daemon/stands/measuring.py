@@ -38,6 +38,8 @@ MOST_UPSETS: Final = 5
 
 
 class Measuring:
+    """Measures still windows of one aircraft, for one job at a time."""
+
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
         self._upsets_before: dict[str, int] = {}
@@ -127,6 +129,8 @@ class Measuring:
 
 
 class Estimator:
+    """Estimates biases with the alignment and the site in force."""
+
     def __init__(self, core: Core, alignment: ActiveAlignment, faces: ActiveSixPosition, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
         self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()

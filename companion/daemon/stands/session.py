@@ -63,15 +63,16 @@ class SessionState:
     windows: list[Window] = dataclasses.field(default_factory=list)
     poses: list[HeldPose] = dataclasses.field(default_factory=list)
     ups: list[Vector] = dataclasses.field(default_factory=list)
+    """Up in the aircraft's axes, of each stand, as its accelerometers read it."""
     first_calibrations: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
-    outcome: str | None = None
+    outcome: str | None = None  # None while it runs
 
     # The present pose
     number: int = 1
     total: int = 1
     wish: Wish = dataclasses.field(default_factory=lambda: Wish(""))
     words: str = ""
-    objection: str = ""
+    objection: str = ""  # Fault of the latest stand, if it was not the one asked for
     share: float = 0.0
     since_s: float = 0.0
     """Time since which it has not moved."""
@@ -112,6 +113,8 @@ class SessionState:
 
 
 class PoseTask(abc.ABC):
+    """Poses, acceptance test, fit and record of one alignment, with its estimate."""
+
     imus_alone: ClassVar[bool] = True
     """Neither gradienter nor compass is waited for: turned over, either may fall silent."""
     if_armed: ClassVar[str | None] = None
@@ -120,7 +123,7 @@ class PoseTask(abc.ABC):
     total: int
     fit_from: int
     """Number of poses from which the estimate is made, after each."""
-    board: Mounting | None = None
+    board: Mounting | None = None  # Tilt of the board, where it can be known
     shortfall: str | None = None
     """Figure that is still unknown after the last pose; then nothing is written or kept."""
 
@@ -129,6 +132,7 @@ class PoseTask(abc.ABC):
 
     @abc.abstractmethod
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
+        """Return the pose wanted next; None: there are enough."""
         """Return the pose of a new window, and why it is not the one asked for, if so."""
 
     @abc.abstractmethod
@@ -151,6 +155,8 @@ class PoseTask(abc.ABC):
 
 
 class PoseSession:
+    """Guides one operator through the poses of one alignment at a time."""
+
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], measuring: Measuring, writes: AlignmentWrites
     ) -> None:

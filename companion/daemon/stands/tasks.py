@@ -42,7 +42,7 @@ READING_SIGMA_DEG: Final = 0.005
 """Noise of one mean of a gradienter (table in method 3.4)."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
-EXPECTED: Final = 12
+EXPECTED: Final = 12  # Usual number of stands
 MOST: Final = 24
 """Stands on all sides; usually there are `EXPECTED`."""
 _FIRST: Final = Wish("any side down, propped up, hands off")
@@ -51,6 +51,8 @@ LOOSE_M_S2: Final = 0.5 * MG
 
 
 class SpotTask(PoseTask):
+    """An alignment on one spot, with its estimate."""
+
     result: Alignment
     stands: Sequence[StandMeans] = ()
     zero_deg: tuple[float, float] = (0.0, 0.0)

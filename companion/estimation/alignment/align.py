@@ -56,7 +56,7 @@ SPOT_W_LIMIT: Final = 3.9
 DETERMINED: Final = 0.2
 """A figure counts as determined where its sigma is below this share of its prior sigma."""
 _LEAST_REDUNDANCY: Final = 1e-3
-_NINETY_NINE: Final = 2.326
+_NINETY_NINE: Final = 2.326  # Sigmas that a normal variable exceeds in one case of a hundred
 MOST_TURNED_DEG: Final = 30.0
 """Largest turn of an IMU against the base: more is another orientation than the one configured."""
 ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
@@ -83,10 +83,11 @@ class ImuAlignment:
 
     name: str
     level_bias_m_s2: Array
+    """Effective bias when level, scale and misalignment included, as a calibration there finds it; (3,)."""
     level_covariance_m2_s4: Matrix
     accel_bias_m_s2: Figures
     scale: Figures
-    shear: Figures
+    shear: Figures  # xy, xz, yz
     misalignment_rad: Figures
     gyro_bias_rad_s: Figures
 
@@ -106,10 +107,10 @@ class Alignment:
     `checked`: a spot that moved between two stands would have been noticed.
     """
 
-    offset_deg: Array
+    offset_deg: Array  # Zero of the gradienter on top of the configured offset; (2,)
     offset_covariance_deg2: Matrix
     imus: tuple[ImuAlignment, ...]
-    slope_deg: float
+    slope_deg: float  # Slope of the spot; 0 without one
     attitudes: tuple[Matrix, ...]
     chi_square: float
     freedom: int

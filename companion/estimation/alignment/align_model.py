@@ -60,7 +60,7 @@ class LeastSquares:
 
     values: Array
     covariance: Matrix
-    residual: Array
+    residual: Array  # Residuals over their sigmas: readings, then the prior of every unknown that is estimated
     redundancy: Array
 
 
@@ -116,14 +116,16 @@ class StandMeans:
     imus: tuple[ImuWindow, ...]
     tilt_deg: tuple[float, float] | None
     tilt_sigma_deg: tuple[float, float]
-    heading_rad: float
+    heading_rad: float  # Heading from a north common to all stands, which need not be the true one
     heading_sigma_rad: float
-    on_spot: bool
+    on_spot: bool  # On the one spot on which the aircraft is turned
     counted: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Ground:
+    """Gravity and the Earth's rate at the place, with their uncertainty."""
+
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     rate_rad_s: Array
@@ -185,6 +187,7 @@ class Model:
 
         angle, bias = priors.misalignment_deg * DEG, (priors.accel_bias_m_s2, priors.gyro_bias_rad_s)
         self.sigma = np.full(self._first_imu + 15 * len(names), _ANYHOW_RAD)
+        """Sigma of every unknown before any reading; 0: not estimated."""
         self.sigma[self.offset] = priors.offset_deg * DEG if self._tilted else 0.0
         self.sigma[self.spot] = _ANYHOW_RAD if self._on_spot else 0.0
         self.sigma[self.gravity] = ground.gravity_sigma_m_s2
@@ -196,8 +199,9 @@ class Model:
         if self._on_spot:
             self.start[self.spot] = self._first_guess[self._on_spot, 2, :2].mean(axis=0)
         self.damped = [*range(2, 4), *range(self.turn.stop, self._first_imu)]
+        """Unknowns that only the readings determine."""
 
-        self.labels: list[ResidualLabel] = []
+        self.labels: list[ResidualLabel] = []  # Labels of the residuals, in their order, and of the priors
         sigmas: list[float] = []
 
         def add(group: Group, k: int, sigma: Iterable[float], name: str = "") -> None:
@@ -221,7 +225,7 @@ class Model:
         for part in np.flatnonzero(self.sigma).tolist():
             group: Group = "zero" if part < self.offset.stop else "nothing" if part in self.damped else "prior"
             add(group, -1, [self.sigma[part]])
-        self.row_sigma = np.array(sigmas)
+        self.row_sigma = np.array(sigmas)  # Sigma of every row of `labels`, SI units
 
     def imu(self, imu: int, part: int) -> slice:
         start = self._first_imu + 15 * imu + 3 * part

@@ -46,8 +46,8 @@ ENOUGH_WANDER: Final = 0.8
 """Share of a bias' wander that may be open: beyond it a dozen stands make a bad sensor no better."""
 SAME_DEG: Final = 20.0
 """Two stands within this angle tell hardly more than one."""
-FACE_DEG: Final = 30.0
-_STAND_SIGMA_M_S2: Final = 0.03 * MG
+FACE_DEG: Final = 30.0  # A stand within this angle of a face has seen it
+_STAND_SIGMA_M_S2: Final = 0.03 * MG  # Predicted sigma of the mean of a coming stand
 _AXES: Final = "xyz"
 _SIDES: Final = {
     "level": (0, 0, -1),
@@ -70,7 +70,7 @@ class Sides(msgspec.Struct, frozen=True):
     Figures (9,) as in `FacesEstimate`, one sigma of each: time and temperature have widened those of the biases.
     """
 
-    figures: Array
+    figures: Array  # (9,), as in `FacesEstimate`, in the sensor's axes; m/s^2 and no unit
     sigma: Array
     vehicle_from_sensor: Matrix
 
@@ -162,7 +162,7 @@ def _fit(
         inverse = np.linalg.inv(response(at[:, SCALE], at[:, SHEAR]))
         inside = (force - at[:, None, BIAS]) @ inverse
         lengths = np.linalg.norm(inside, axis=-1)
-        across = inside / lengths[..., None] @ inverse
+        across = inside / lengths[..., None] @ inverse  # Derivative of each length by its reading
         sigma = np.sqrt(np.einsum("mki,ki->mk", across**2, sigmas**2))
         return np.asarray((lengths - gravity[0] - at[:, FIGURES:]) / sigma)
 

@@ -20,7 +20,7 @@ TURN_TOLERANCE_DEG: Final = 30.0
 QUARTER_DEG: Final = 90.0
 LEAST_TILT_DEG: Final = 15.0
 """Least tilt that separates scale and misalignment from bias: they differ by the tilt's cosine."""
-APART_DEG: Final = 45.0
+APART_DEG: Final = 45.0  # The least angle between two tilts to different sides
 MOST_ASKEW_DEG: Final = 30.0
 """Largest tilt on the base: a slope, an aircraft that sits on its tail, and a board put in by eye."""
 TILTS: Final = 4
@@ -40,11 +40,13 @@ BY_EYE_SIGMA_DEG: Final = 10.0
 
 
 class AlignmentRequest(NamedTuple):
+    """One alignment, as the operator asked for it."""
+
     action: Literal["zero", "tilts", "turn", "faces"]
     headings: int = 2
     """2: there, turned by 180 degrees, and on the same way to the first marks; 4: every quarter turn."""
-    write: bool = False
-    level: bool = False
+    write: bool = False  # Write offsets (and scales, where all sides tell them) to the autopilot
+    level: bool = False  # Write how the board sits as the autopilot's level
 
     @property
     def on_spot(self) -> int:
@@ -67,7 +69,7 @@ class Wish(NamedTuple):
 
     words: str
     up: Vector = LEVEL
-    turn_deg: float = 0.0
+    turn_deg: float = 0.0  # Turn on its spot, clockwise from above
     unknown: tuple[str, ...] = ()
 
 
@@ -80,6 +82,7 @@ class HeldPose(NamedTuple):
 
     up: Array
     heading_deg: float = 0.0
+    """Heading from the compass' own north, else from the first stand; not wrapped where the gyros counted it."""
     heading_sigma_deg: float = 0.0
     counted: bool = False
 

@@ -35,7 +35,7 @@ OFF_DEG: Final = 5.0  # Largest error that a movement leaves in a pose sensor
 _SHARE: Final = 0.1
 
 LOWEST_DEGC: Final = -40.0
-HIGHEST_DEGC: Final = 105.0
+HIGHEST_DEGC: Final = 105.0  # Widest range of IMUs' data sheets
 _NONE_AFTER_S: Final = 10
 _ADJACENT_S: Final = 3
 JUMP_K: Final = 5.0  # Change within a second that no board makes
@@ -65,7 +65,7 @@ class CollectorObstacle(msgspec.Struct, frozen=True):
     """Reason why nothing can be measured now: a movement, which a hand can end, or a fault."""
 
     words: str
-    moving: bool = False
+    moving: bool = False  # True for a movement, which a hand can end; False for a fault
     hold_still_s: int | None = None
     """Seconds to stand still yet, where nothing else is missing."""
 
@@ -97,7 +97,7 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     still_s: float
     steady_s: float
-    good_now: bool
+    good_now: bool  # True if the latest second counts
     hold_still_s: int = 0
     obstacle: CollectorObstacle | None = None
     """A movement now, or a source that is silent or stuck; by an estimate, too, what it still waits for."""
@@ -133,10 +133,10 @@ class Thermometer:
         self._begin(math.inf)
 
     def _begin(self, slot: float) -> None:
-        self.none = False
+        self.none = False  # True for an IMU whose messages carry no temperature
         self.wrong = ""
         """Reason in one line why it is not believed; empty: it is, or there is none."""
-        self._slot = slot
+        self._slot = slot  # Second of the latest reading, or the first second
         self._degc: float | None = None
         self._jumps: deque[float] = deque(maxlen=_JUMPS)
 
@@ -166,10 +166,10 @@ class Settling:
     """
 
     def __init__(self, lag_s: float, sigma_deg: float) -> None:
-        self.left_s = 0
+        self.left_s = 0  # Seconds until its readings count again, as of the last second judged
         # Without a lag nothing follows, however exact the sensor is said to be.
         self._tail_s = math.ceil(lag_s * math.log(max(OFF_DEG / (_SHARE * sigma_deg), 1.0))) if lag_s > 0.0 else 0
-        self._moved: int | None = None
+        self._moved: int | None = None  # Last second in which the aircraft moved
 
     def judge(self, slot: int, *, moved: bool) -> bool:
         """Judge whether the second counts, seconds ascending; `moved`: the IMUs were not still."""
@@ -244,6 +244,8 @@ class Source:
 
 
 class ImuSource(Source):
+    """The stream of one IMU, with what is known of its device."""
+
     gate: ImuGate
 
     def __init__(self, imu: ImuInput, keep: int) -> None:
@@ -252,7 +254,7 @@ class ImuSource(Source):
         self.raw = BatchSource(LIMITS_IMU, keep)
         """Means that come beside a stream of integers, in floats."""
         self._raw_count = 0
-        self.counter: TurnCounter | None = None
+        self.counter: TurnCounter | None = None  # Set while turns on a spot are counted
         self._breaks = 0
         self._restarted_s = -math.inf
         self._up: tuple[float, float] | None = None

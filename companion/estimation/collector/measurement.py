@@ -55,11 +55,11 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
     slots: Sequence[int]
     estimate: Callable[[], Any]
-    settling: str | None = None
+    settling: str | None = None  # Reason why a pose sensor's mean has to wait
     tilt: list[Batch] | None = None
     heading: list[Batch] | None = None
     from_field: bool = False
-    wander_deg: float | None = None
+    wander_deg: float | None = None  # Both as in `HeadingWindow`
     field: FieldWindow | None = None
     begun_s: dict[str, float] = {}
     turn: Turn = Turn()
@@ -102,7 +102,7 @@ class WindowSource(ABC):
 
     def __init__(self) -> None:
         self._kept: dict[float | None, tuple[int, Any]] = {}
-        self.generation = 0
+        self.generation = 0  # Number of the stretch that is under way
 
     @abstractmethod
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
@@ -189,6 +189,8 @@ class WindowSource(ABC):
 
 
 class Stretch:
+    """Counts good and rejected seconds, and knows where the still stretch begins."""
+
     def __init__(self, min_good: int, max_slots: int) -> None:
         self._min_good = min_good
         self.flags: deque[bool] = deque(maxlen=max_slots)

@@ -42,7 +42,7 @@ KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
 """Seconds kept: a window that is the latest until the next one may begin with the first of them."""
 LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
-_KEPT_SHOWN: Final = 4
+_KEPT_SHOWN: Final = 4  # Seconds that wait for the gradienter's readings
 _FALLS: Final = 2.5
 """Power of the time with which the white part of a variance falls: a slope's through waves falls with the third, a
 sensor's own white noise with the first."""
@@ -50,6 +50,8 @@ _IN_MINUTES_S: Final = 90.0
 
 
 class Stream:
+    """One IMU's seconds without a gap, beside the gradienter."""
+
     def __init__(self, imu: ImuInput, gradienter: GradienterModel | None) -> None:
         self.imu, self._gradienter = imu, gradienter
         self.seconds: deque[ImuSecond] = deque(maxlen=KEPT_S)
@@ -144,6 +146,7 @@ class Deck(WindowSource):
         return True
 
     def take_imu(self, name: str, batch: Batch, times: Floats, rows: Floats) -> None:
+        """Add the samples (n, 6) of one second of an IMU, in its own axes."""
         stream = self._streams[name]
         if not stream.add(batch, times, rows):
             self.clear()
@@ -151,12 +154,14 @@ class Deck(WindowSource):
             stream.compare(batch.slot, *self._tilts[batch.slot])
 
     def take_tilt(self, batch: Batch, times: Floats, rows: Floats) -> None:
+        """Add the readings (n, 2) of one second of the gradienter."""
         self._tilts[batch.slot] = times, rows
         _trim(self._tilts, _KEPT_SHOWN)
         for stream in self._streams.values():
             stream.compare(batch.slot, times, rows)
 
     def take_heading(self, batch: Batch, times: Floats, rows: Floats) -> None:
+        """Add the headings (n, 1) of one second, degrees."""
         self._headings[batch.slot] = float(batch.mean[0]) * DEG
         _trim(self._headings, KEPT_S)
 

@@ -36,14 +36,14 @@ COMPASS_SHARE: Final = math.sqrt(0.5)
 """Part of a compass' sigma that changes with the heading; the rest is the same on all headings."""
 FROZEN_S: Final = 20
 """A sensor that is swayed does not repeat one reading for so long."""
-_SWAYS_RAD_S: Final = 0.3 * DEG
+_SWAYS_RAD_S: Final = 0.3 * DEG  # Least scatter of the rates of roll and pitch in that time
 _SAME: Final = 1e-9
 _SPREAD: Final = 1.5
 """Integers spread over so many steps by the swaying hide nothing."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
 """Sigma of the comparison with the gradienter; the error of its zero turns everything alike and comes in `solve`."""
-_MIDDLE: Final = 0.37
+_MIDDLE: Final = 0.37  # Share of K^2 T
 _FLICKER_TO_COME: Final = 0.75
 """Share of B^2: flicker of the next minutes that its past does not tell. Together with the flicker in the window, a
 random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
@@ -62,11 +62,13 @@ ImuSecond = tuple[Batch, Passage]
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DeckWindow:
+    """Readings of a window on a deck, and its estimate."""
+
     imus: Sequence[ImuInput]
     seconds: Sequence[Sequence[ImuSecond]]
     levels: Sequence[Mapping[int, Level]]
     headings: Mapping[int, float]
-    slots: Sequence[int]
+    slots: Sequence[int]  # Seconds of the window, ascending
     gradienter: GradienterModel | None
     compass: CompassModel | None
     horizon_s: float

@@ -37,7 +37,7 @@ EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
 RAMP_T: Final = 5.0
 """Sigmas from which on a ramp is believed, as at rest (`noise.lines`)."""
 _ROUNDS: Final = 7
-_NEAR: Final = 0.1
+_NEAR: Final = 0.1  # Change of the biases in the last round, in sigmas
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
 _UNKNOWNS: Final = 14
 _NO_RAMP: Final = 11
@@ -47,15 +47,15 @@ _NO_RAMP: Final = 11
 class Believed:
     """Priors, one sigma each; noise of the worst axis: N in SI * sqrt(s), K in rad/s / sqrt(s)."""
 
-    accel_m_s2: Array
+    accel_m_s2: Array  # (3,) of the accelerometers' bias, from the comparison with the gradienter
     accel_sigma_m_s2: float
-    compass_sigma_rad: float
-    gyro_white: float
-    gyro_walk: float
+    compass_sigma_rad: float  # Part of the compass' error that changes with the heading
+    gyro_white: float  # N of the gyros, rad/s * sqrt(s): the largest of the axes
+    gyro_walk: float  # K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)
     gyro_slope: float
     """One sigma of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
     compass_lag_s: float
-    accel_white: float
+    accel_white: float  # N of the accelerometers, m/s^2 * sqrt(s)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -68,11 +68,11 @@ class Found:
     """
 
     gyro_rad_s: Array
-    gyro_covariance: Matrix
+    gyro_covariance: Matrix  # (3, 3) of that
     by_earth: Matrix
-    ramp_rad_s2: Array
-    turn_rad_s: Array
-    force_m_s2: float
+    ramp_rad_s2: Array  # (3,) zero where none is plain
+    turn_rad_s: Array  # (3,) how fast it turned on the mean
+    force_m_s2: float  # Mean specific force along the vertical, up
     force_sigma_m_s2: float
     body_to_ned: Floats
     heading_sigma_rad: float
@@ -100,6 +100,7 @@ class _Stretch:
         return np.asarray(earth @ running_products(np.concatenate([start[None], steps])))
 
     def forces(self, attitudes: Floats, gyro: Array, accel: Array) -> Floats:
+        """(n, 3) mean specific force of every passage, NED."""
         # The second order in the bias of gravity's own part: 0.6 mg at 3 deg/s.
         bent = np.cross(gyro, np.cross(gyro, self.velocity)) * np.square(self.spans[:, None]) / 6.0
         felt = self.velocity + self.by_bias @ gyro + bent - self.turned @ accel

@@ -117,10 +117,12 @@ class Level(msgspec.Struct, frozen=True):
     reading: Floats
     difference: Floats
     """Gradienter minus what it would show by the accelerometer."""
-    slope: Floats
+    slope: Floats  # Slope of what it would show, degrees a second
 
 
 class Fluid:
+    """The gradienter's reading of one IMU's specific force."""
+
     def __init__(self, model: GradienterModel) -> None:
         self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
         self._last: tuple[float, float, float] | None = None

@@ -38,16 +38,16 @@ mrad/s), by a filter and by noise that is not quite Gaussian."""
 HUBER_C: Final = 4.0
 """Limit in scales of a second for these streams: rare integers make the seconds' means skew, and 1.345 would cut off
 the rare ones, which show the mean."""
-BORROWED_RMS: Final = 0.1
+BORROWED_RMS: Final = 0.1  # Relative difference between the noise of the three axes of one gyro or accelerometer
 # Sigmas in LSB of a mean that the readings do not show: anywhere, and within a step of zero.
-HALF_STEP: Final = 0.5
-NEAR_ZERO: Final = 1.0
+HALF_STEP: Final = 0.5  # Sigma in LSB of a mean that the readings do not show
+NEAR_ZERO: Final = 1.0  # Sigma in LSB of such a mean within a step of zero, on either side
 
 _ROUNDS: Final = 60
 _HALVINGS: Final = 30
 _CONVERGED: Final = 1e-7
 _LEAST_PROBABILITY: Final = 1e-300
-_LEAST_SIGMA: Final = 1e-3
+_LEAST_SIGMA: Final = 1e-3  # LSB; less noise shows no more of the mean
 _OUTLIER: Final = 6.0
 _CORE_SIGMAS: Final = 8.0
 _LEAST_SPREAD: Final = 0.3
@@ -65,7 +65,7 @@ class Fit(msgspec.Struct, frozen=True):
     """
 
     mean: Floats
-    sigma: Floats
+    sigma: Floats  # Noise of one reading
     variance: Floats
     identified: NDArray[np.bool_]
     influence: Floats

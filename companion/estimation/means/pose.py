@@ -30,11 +30,13 @@ LEVEL_COSINE: Final = math.cos(2.0 * DEG)
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GradienterModel:
+    """Gradienter model for up in the vehicle: law, zero offset, mounting, sigma."""
+
     law: Law
     vehicle_from_sensor: Matrix
     offset_deg: tuple[float, float]
     sigma_deg: float
-    lag_s: float = 0.0
+    lag_s: float = 0.0  # Time constant of the device
 
     def up(self, x_deg: float, y_deg: float) -> Array:
         """Return up in the vehicle's axes, (3,), from readings without an offset.
@@ -47,18 +49,21 @@ class GradienterModel:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassModel:
+    """Compass model for a true heading: reference, offset, mounting, sigma."""
+
     magnetic: bool
     vehicle_from_sensor: Matrix
     offset_deg: float
     sigma_deg: float
     counts_per_gauss: float | None = None
     """None: only the direction of a field in counts is known."""
-    prefers_field: bool = False
+    prefers_field: bool = False  # The heading is worked out from the field even where the device gives one of its own
     tilted_sigma_deg: float | None = None
     """Sigma where the compass is not level; None: `sigma_deg`."""
-    lag_s: float = 0.0
+    lag_s: float = 0.0  # Time constant of the device
 
     def sigma_at(self, up: Array) -> float:
+        """Return sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
         upright = float(-(self.vehicle_from_sensor.T @ up)[2])
         if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
             return self.sigma_deg
@@ -97,7 +102,7 @@ class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
 
     heading_deg: float
     sigma_deg: float
-    from_field: bool = False
+    from_field: bool = False  # Worked out from the device's field and the gradienter's tilt; else the device's own
     wander_deg: float | None = None
     """Change while no other sensor showed a turn; None: not watched long enough."""
 
@@ -106,6 +111,8 @@ FieldUnit = Literal["gauss", "counts"]
 
 
 class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean of the magnetic field in the compass' own axes; sigmas are statistical."""
+
     field: tuple[float, float, float]
     sigma: tuple[float, float, float]
     unit: FieldUnit
@@ -166,7 +173,7 @@ class FieldHeading:
         self._begun_s: float | None = None
         self.unit: FieldUnit = "gauss"
         self.batches = BatchSource(_LIMITS, keep)
-        self.from_field = False
+        self.from_field = False  # True: the latest heading that counts was worked out here
         self.hint = ""
         """Why there is none from the field although one is needed; empty while there is."""
 

@@ -24,13 +24,13 @@ from companion.samples import Triad, rows_of
 QUICKEST_S: Final = 60.0  # Shortest time constant of a warm-up; boards take 1 to 20 min
 NEXT_S: Final = 60.0  # Time for which an unseen slope is believed to continue
 _LATER_S: Final = (120.0, 600.0, 3600.0)
-_WORTH_WAITING: Final = 2.0 / 3.0
+_WORTH_WAITING: Final = 2.0 / 3.0  # Share of the present sigma below which a later one is worth waiting for
 _TEMPERATURE_WARNING_K: Final = 3.0
 UNKNOWN: Final = 1.0
 """Variance of a slope that the window does not tell, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
 _TINY: Final = float(np.finfo(float).tiny)
-_BENT_SIGMAS: Final = 3.0
-_STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
+_BENT_SIGMAS: Final = 3.0  # Curvature over its sigma from which the temperature is taken for a parabola
+_STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)  # Resolutions of thermometers
 
 
 State = tuple[float, float]
@@ -40,7 +40,7 @@ State = tuple[float, float]
 class Path(msgspec.Struct, frozen=True, kw_only=True):
     """Temperature at the beginning, in the middle and at the end of a window: a line or a parabola."""
 
-    states: tuple[State, State, State]
+    states: tuple[State, State, State]  # At the beginning, in the middle and at the end
     span_s: float
     variance: float
     """Variance of the difference between end and mean, K^2."""
@@ -66,7 +66,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
     variance: Floats
     level_variance: Floats
     warm_up: tuple[float, float]
-    half_s: float
+    half_s: float  # Half of the window's length
     rate: tuple[float, float] | None
     path: Path | None
 

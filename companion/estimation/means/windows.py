@@ -44,6 +44,7 @@ RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals,
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
+"""Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
 _ALLAN_SIGNIFICANT: Final = 3.0
 """ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 
@@ -59,6 +60,7 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     rotation: NDArray[np.float64]
     profile: NoiseProfile
     gyro_step_rad_s: float = 0.0
+    """Step of integers that are truncated toward zero; 0 for floats. Both triads are one or the other."""
     accel_step_m_s2: float = 0.0
     clock_from_start: bool = False
 
@@ -85,18 +87,18 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     accel_m_s2: Vector
     gyro_sigma_stat_rad_s: Vector
     accel_sigma_stat_m_s2: Vector
-    gyro_sigma_use_rad_s: Vector
+    gyro_sigma_use_rad_s: Vector  # sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`
     accel_sigma_use_m_s2: Vector
     temperature_degc: float | None
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
     hidden: dict[Triad, str] = {}
     useless: frozenset[Triad] = frozenset()
-    named: bool = True
+    named: bool = True  # The part is known
     covariance: NDArray[np.float64] | None = None
     by_earth: NDArray[np.float64] | None = None
     mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    warming: Warming | None = None
+    warming: Warming | None = None  # Slopes by a warm-up; None: none is allowed for
 
     def refused(self, part: Triad) -> str | None:
         return self.hidden[part] if part in self.useless else None
@@ -114,6 +116,7 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     tilt: TiltWindow | None
     heading: HeadingWindow | None
     field: FieldWindow | None = None
+    """Mean field of a compass that sends it, over those of the good seconds in which it came."""
     turn_rad_s: Vector | None = None
     powered_s: dict[str, float] = {}
     turn: Turn = Turn()

@@ -25,7 +25,7 @@ from companion.physics.frames import Floats, vector
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG_H, MG
 
-FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor
+FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor  # Allan deviation of pure flicker noise over B: 0.664
 
 _FLOOR_REACHED_S: Final = 1000.0
 """Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method 2.2)."""
@@ -177,7 +177,7 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
 KNOWN_SIGMAS: Final = 2.0
 """N^2, B^2 or K^2 over its standard error from which the recordings show it: within 25 % of N, B or K."""
 UPPER_SIGMAS: Final = 1.645  # One-sided 95 %: the upper limit of a figure that the recordings do not show
-LEAST_SLOTS: Final = 8
+LEAST_SLOTS: Final = 8  # Least seconds of a stretch: shorter ones have no two averages that show more than white noise
 LONGEST_S: Final = 256
 _LONGEST_SHARE: Final = 3  # The longest average is a third of the stretch: beyond, one difference is all there is
 _ROUNDS: Final = 1000
@@ -205,7 +205,7 @@ class AxisFit(msgspec.Struct, frozen=True):
     recordings are too short for one.
     """
 
-    figures: tuple[float, float, float]
+    figures: tuple[float, float, float]  # N, B, K; none is negative
     sigmas: tuple[float, float, float]
     upper: tuple[float, float, float]
     known: tuple[bool, bool, bool]

@@ -47,7 +47,7 @@ saves (2.4)."""
 RAMP_FLOORS: Final = 3.0
 """Standard deviations of the slope that the part's own flicker and walk make. In a minute of an ADIS16405's
 accelerometers 8 % of the slopes exceed |t| = 5 by flicker alone, and taking their ends costs 12 % of the rms error."""
-RAMP_BATCHES: Final = 8
+RAMP_BATCHES: Final = 8  # Fewer seconds make no line
 _ONE_IN_10000: Final = 3.8906  # Sigmas that a normal number exceeds with this probability, on either side
 
 FEWEST: Final = 3
@@ -182,7 +182,7 @@ class Slope(msgspec.Struct, frozen=True):
 
     per_s: Floats
     variance: Floats
-    white: Floats
+    white: Floats  # N of the values about the line, unit * sqrt(s)
 
 
 def fit_slope(

@@ -19,7 +19,7 @@ from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Vector
 
 FORMAT_VERSION = 1
-_MOST_DEG = 90.0
+_MOST_DEG = 90.0  # Limit of a gradienter's zero and of its sigma
 SAME_START_S = 30.0
 """Drift between two clocks in weeks; a restart moves the start by at least the time that it had been on."""
 
@@ -53,7 +53,7 @@ class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     temperature_degc: float | None
-    level_bias_mg: Vector
+    level_bias_mg: Vector  # Effective accelerometer bias when the base is level, as a calibration there finds it
     level_sigma_mg: Vector
     gyro_bias_deg_h: Determined
 
@@ -67,8 +67,8 @@ class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
 
     accel_bias_mg: Determined
     accel_scale: Determined
-    accel_shear: Determined
-    misalignment_deg: Determined
+    accel_shear: Determined  # xy, xz, yz
+    misalignment_deg: Determined  # Small rotation from the gradienter's axes to this IMU's
 
 
 class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -85,7 +85,7 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
     format_version: int = FORMAT_VERSION
     measured_at: str
     slope_deg: float
-    checked: bool
+    checked: bool  # True if a spot that moved between the stands would have been noticed
     chi_square: float
     freedom: int
     stands: tuple[StandRecord, ...]
@@ -111,7 +111,7 @@ class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
 class Running(msgspec.Struct, frozen=True, kw_only=True):
     """One power-up of a sensor; another one has other biases."""
 
-    host: str
+    host: str  # Identity of the companion computer's start, whose clock counts
     started_s: float
     up_s: float
 
@@ -134,7 +134,7 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     running: Running | None = None
     accel_bias_mg: Determined
     accel_scale: Determined
-    accel_shear: Determined
+    accel_shear: Determined  # xy, xz, yz; no firmware corrects it
     left_out: tuple[int, ...]
     scatter_mg: float
     written: dict[str, WrittenParameter]
@@ -170,6 +170,7 @@ def check(record: AlignmentRecord | FacesRecord) -> None:
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
     written: dict[str, WrittenParameter] = {}
     whole_bias_mg: Vector | None = None
+    """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -189,7 +190,7 @@ class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
 class TurnRecord(SpotRecord, frozen=True, kw_only=True):
     kind: Literal["turn"] = "turn"
     imus: tuple[TurnImuRecord, ...]
-    board: BoardRecord | None = None
+    board: BoardRecord | None = None  # None where the accelerometers are not known from all sides
 
 
 HandRecord = AlignmentRecord | FacesRecord | TurnRecord

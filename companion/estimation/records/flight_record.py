@@ -15,8 +15,9 @@ HEADS: Final = {
     "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
     "vibration": "vibration", "trend": "per minute",
 }  # fmt: skip
+"""Terms of a `Split`, as tables name them (docs/flight.md)."""
 UNSEEN: Final = "accel x, y: not counted, in the air nothing tells them from tilt"
-_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
+_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}  # Smaller findings are nobody's worry
 
 
 class Term(msgspec.Struct, frozen=True):
@@ -73,9 +74,9 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     gyro_id: int | None = None
     accel_id: int | None = None
     set_gyro_rad_s: tuple[float, ...] | None
-    set_accel_m_s2: tuple[float, ...] | None
+    set_accel_m_s2: tuple[float, ...] | None  # Offsets in force, in the IMU's own axes
     axes: tuple[Split, ...]
-    drift: dict[str, list[Drift]]
+    drift: dict[str, list[Drift]]  # Drift without aid, by whose offsets: `flown`, `before`
     notes: tuple[str, ...]
 
 
@@ -114,6 +115,7 @@ def drift_lines(imu: ImuFlight) -> list[str]:
 
 
 def figure(imus: Sequence[ImuFlight]) -> str | None:
+    """Summarise a flight by the drift of its first IMU at 30 s, or next to that; None: it did not fly."""
     first = next((imu for imu in imus if imu.drift.get("flown")), None)
     if first is None:
         return None

@@ -29,8 +29,8 @@ WEIGHS_FROM: Final = 5
 NEW_AFTER: Final = 3
 """Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor was replaced."""
 KEEP_POWER_UPS: Final = 48
-KEEP_POINTS: Final = 8
-NEAR_K: Final = 2.0
+KEEP_POINTS: Final = 8  # Most points of a power-up
+NEAR_K: Final = 2.0  # Temperatures that tell the same
 _LATEST: Final = 10
 """Power-ups that are kept whatever their temperature: a sensor ages."""
 SAME_START_S: Final = 60.0
@@ -44,7 +44,7 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
     """
 
     host: str
-    since_unix_s: float | None
+    since_unix_s: float | None  # Start of the sensor's own device, by the wall clock; None: unknown
 
     def is_same(self, other: PowerUp) -> bool:
         """Return False only if the power was surely off in between."""

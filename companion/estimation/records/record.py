@@ -40,7 +40,7 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     gamma_deg: float | None
     psi_deg: float | None
     sigma_deg: PoseSigma
-    tilt_from: TiltFrom | None = None
+    tilt_from: TiltFrom | None = None  # "accelerometers": those of an IMU that was held on all sides before
     heading_from: HeadingFrom | None = None
 
 
@@ -61,10 +61,11 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     heading_bound_deg: float | None
+    """Exceeded by the heading's error in one case of twenty; None: no field, or no place; 180: the field shows none."""
     heading_from: Literal["device", "field"]
     field_gauss: float | None
-    field_expected_gauss: float | None
-    inclination_deg: float | None
+    field_expected_gauss: float | None  # Field and inclination of the Earth by WMM2025
+    inclination_deg: float | None  # Down positive; needs a gradienter
     inclination_expected_deg: float | None
     device_minus_field_deg: float | None
     wander_deg: float | None
@@ -99,8 +100,10 @@ class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
 
     platform: Literal["ground", "deck"]
     turn_deg_s: float | None
+    """About the vertical, clockwise seen from above, not subtracted; None: not measured, assumed fixed to the Earth."""
     turn_sigma_deg_s: float | None
     told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
+    """Gyros: by their level at an earlier rest; earlier calibrations: by the biases that they have led to expect."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -133,7 +136,7 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
     1 - cos(tilt). `sensor_sigma_m_s2` is that of the sensor's own bias, in its own axes, whatever its attitude.
     """
 
-    scale_from: Literal["assumed", "alignment"]
+    scale_from: Literal["assumed", "alignment"]  # An alignment with tilts has told the scale; else 0.5 % is assumed
     scale_sigma_m_s2: Vector
     level_sigma_m_s2: Vector
     sensor_sigma_m_s2: Vector
@@ -147,7 +150,7 @@ class WhenWarm(msgspec.Struct, frozen=True):
     gyro_sigma_rad_s: Vector
     accel_bias_m_s2: Vector | None
     accel_sigma_m_s2: Vector | None
-    words: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()  # Words for people on the axes that will move most; empty: not worth saying
 
 
 class TriadFigures(NamedTuple):
@@ -187,11 +190,13 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
     gyro_sigma_warm_up_rad_s: Vector | None = None
+    """Part of sigma_use for a warm-up too small to see; only time removes it."""
     accel_sigma_warm_up_m_s2: Vector | None = None
-    when_warm: WhenWarm | None = None
-    gyro_id: int | None = None
+    when_warm: WhenWarm | None = None  # None: the board was warm, or the end of its warm-up is unknown
+    gyro_id: int | None = None  # Device ids in the autopilot; None: it has none, or the record is of an older version
     accel_id: int | None = None
     gyro_sigma_in_force_rad_s: Vector | None = None
+    """One sigma of the offsets that this calibration left unchanged; None where it wrote them."""
     accel_sigma_in_force_m_s2: Vector | None = None
 
     def of(self, triad: Triad) -> TriadFigures:
@@ -259,7 +264,7 @@ class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
     at_arm: Literal["gate", "warn", "off"]
     calibration: str | None
     calibrated_ago_s: float | None
-    confirmed_ago_s: float | None
+    confirmed_ago_s: float | None  # Time since a still window last agreed with the offsets in force
     gyro_sigma_use_rad_s: float | None
     accel_sigma_use_m_s2: float | None
 
@@ -283,14 +288,14 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     state: Literal["done", "failed", "cancelled"]
     reason: str
     warnings: tuple[str, ...]
-    started_at: str
+    started_at: str  # UTC, ISO 8601; the host's clock, which on a field computer may be wrong
     duration_s: float
     pose: Pose | None
     site: SiteRecord | None
     imus: tuple[ImuRecord, ...]
-    system_id: int | None = None
+    system_id: int | None = None  # MAVLink system of the vehicle; None while it had not been heard
     alignment: AlignmentUsed | None = None
-    undone_at: str | None = None
+    undone_at: str | None = None  # UTC, ISO 8601: when what this calibration has written was put back on request
     magnetic: Magnetic | None = None
     standing: PlatformTurn | None = None
     armings: tuple[ArmingRecord, ...] = ()

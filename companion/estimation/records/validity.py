@@ -63,8 +63,8 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     calibrated_s: float | None
-    confirmed_s: float
-    temperature_degc: float | None
+    confirmed_s: float  # Time of the last confirmation
+    temperature_degc: float | None  # Temperature at the confirmation
     sigma_use: Vector
     sigma: Vector
     expected: Vector
@@ -97,7 +97,7 @@ class Present(msgspec.Struct, frozen=True, kw_only=True):
 
     residual: Vector
     sigma_use: Vector
-    sigma: Vector
+    sigma: Vector  # Both as in `Held`
 
 
 class Objection(NamedTuple):

@@ -28,12 +28,12 @@ _OFF_BEAT: Final = 0.25
 _MOST_OFF_BEAT: Final = 0.2
 """With a larger share of such steps the stamps do not count samples: the sender picks some of them."""
 _LEAST_OF_A_PART: Final = 4
-_FINEST: Final = 5
+_FINEST: Final = 5  # Halvings of a second: 1/32 s; what is faster is vibration
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
 _MAX_TIME_S: Final = 1e12
-_BACKWARD_SAMPLES: Final = 20
+_BACKWARD_SAMPLES: Final = 20  # Samples in a row from the past that show a clock gone back; fewer are late
 _BACKWARD_S: Final = 2.0
 _PAUSE_S: Final = 3.0  # A sensor that was silent for longer may have been switched off
 _MAX_DECIMALS: Final = 4
@@ -43,7 +43,7 @@ class Counts(msgspec.Struct, frozen=True):
     """Histogram of one second: how often, (k, c), each integer was read, from `lowest` (c,) on, in steps."""
 
     lowest: NDArray[np.int64]
-    table: NDArray[np.int32]
+    table: NDArray[np.int32]  # (k, c), k at most `MAX_LEVELS`
 
 
 class Batch(msgspec.Struct, frozen=True):
@@ -64,8 +64,8 @@ class Batch(msgspec.Struct, frozen=True):
     low: Floats
     high: Floats
     distinct: NDArray[np.int64]
-    clipped: bool
-    largest_gap_s: float
+    clipped: bool  # Some channel's commonest value is its extreme one: readings pile up at the end of the range
+    largest_gap_s: float  # Between samples, and to both ends of the slot
     missing: int | None
     temperature_degc: float | None
     counts: Counts | None = None
@@ -111,6 +111,7 @@ def summary(
 
 
 def _allan_within(off: Floats) -> Floats:
+    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
     firsts, sizes = _parts_of(len(off))
     depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))
@@ -143,6 +144,7 @@ def _counts(rows: Floats, steps: Floats) -> Counts | None:
 
 
 def unrolled(rows: Floats) -> Floats:
+    """Unroll angles in degrees, (n, 1), from the first finite one."""
     finite = rows[np.isfinite(rows[:, 0]), 0]
     if len(finite) == 0:
         return rows
@@ -232,10 +234,11 @@ class BatchSource:
         self.last_s: float | None = None
         self.begun: int | None = None
         """First second without a longer pause since."""
-        self.lost = 0
-        self.restarts = 0
+        self.lost = 0  # Samples lost since the beginning, by the device's counter or clock
+        self.restarts = 0  # Number of times that the clock went back and everything was dropped
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
+        """Filter of a second's temperature."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
         """Called with every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()

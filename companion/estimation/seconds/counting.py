@@ -36,6 +36,8 @@ class Counted(NamedTuple):
 
 
 class TurnCounter:
+    """Keeps the latest rates of one IMU, sample by sample."""
+
     def __init__(self) -> None:
         self._samples = array("d")
 

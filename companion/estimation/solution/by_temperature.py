@@ -18,7 +18,7 @@ from companion.samples import Vector
 if TYPE_CHECKING:
     from companion.estimation.solution.curve import Curve
 
-STEP_K: Final = 1.0
+STEP_K: Final = 1.0  # Distance between the rows of a curve
 MOST_ROWS: Final = 60
 _ENOUGH_K: Final = 5.0
 """Least span of temperatures for a curve (method 3.3)."""
@@ -33,38 +33,45 @@ class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
 
     at_unix_s: float
     started_at: str
-    power_up: int
+    power_up: int  # Number of the power-up, from 0
     degc: float
     gyro_deg_h: Vector
     sigma_deg_h: Vector
-    accel_mg: Vector | None
+    accel_mg: Vector | None  # None: the tilt was unknown
     accel_sigma_mg: Vector | None
 
 
 class Expected(msgspec.Struct, frozen=True):
+    """Expected gyro biases at a temperature; one sigma."""
+
     degc: float
     gyro_deg_h: Vector
     sigma_deg_h: Vector
 
 
 class ExpectedForces(msgspec.Struct, frozen=True):
+    """Expected accelerometer biases at a temperature; one sigma."""
+
     degc: float
     accel_mg: Vector
     sigma_mg: Vector
 
 
 class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
+    """Biases of one IMU over temperature."""
+
     imu: str
     summary: str = ""
     power_ups: int = 0
     days: int = 0
     points: tuple[WindowBias, ...] = ()
-    curve: tuple[Expected, ...]
+    curve: tuple[Expected, ...]  # Expected gyro biases of the next power-up; empty: not known yet
     accel_curve: tuple[ExpectedForces, ...] = ()
-    needs: str | None = None
-    today: int | None = None
-    now: Expected | None = None
-    at_power_up: Expected | None = None
+    """Expected accelerometer biases of the next power-up; empty: not known yet."""
+    needs: str | None = None  # Reason why there is no curve, and what will make one; None: there is one
+    today: int | None = None  # Number of the present power-up; None: nothing is known of it yet
+    now: Expected | None = None  # Bias now: as last measured in this power-up, moved along the curve since
+    at_power_up: Expected | None = None  # Bias that the curve expects of a power-up at the temperature now
 
 
 def by_temperature(

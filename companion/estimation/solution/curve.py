@@ -49,15 +49,15 @@ _AT_LEAST: Final = 0.5
 _RANGE: Final = 18.0
 """Half the search range of the logarithm of the scatter's variance, about that of a kelvin."""
 _HALVINGS: Final = 25
-_SURELY: Final = 2.0
+_SURELY: Final = 2.0  # Sigmas beyond which an error is not chance
 _LITTLE: Final = 1e-6
 """Lower bounds of variances, as shares of that of a kelvin and of that of the noise."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """Prior sigma of each coefficient, in kelvins of the slope of parts."""
-_SLOWED_K_S: Final = 0.25 / 60.0
+_SLOWED_K_S: Final = 0.25 / 60.0  # Least slowing of a warm-up that tells where it ends
 _TAU_SIGMA: Final = 0.05
 """Least sigma of tau as a share of it: boards have more than one time constant."""
-_WARM_AFTER: Final = 5.0
+_WARM_AFTER: Final = 5.0  # Time constants after which a board is warm
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 _END_LESS_MEAN: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
@@ -124,7 +124,7 @@ class Curve:
     shares: Array
     freedom: float
     span_degc: tuple[float, float]
-    per_kelvin: float
+    per_kelvin: float  # One sigma of the change per kelvin beyond them
 
     def beyond_k(self, degc: float) -> float:
         return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
@@ -327,6 +327,7 @@ class _Fit:
 
 
 def _over(error: Floats, variance: Floats) -> Floats:
+    """Give the actual over the predicted mean square error of each axis, (3,)."""
     return np.asarray((error * error / variance[:, None]).sum(axis=0) / len(error))
 
 
@@ -348,6 +349,7 @@ class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
     high_degc: float = math.inf
 
     def at(self, degc: float) -> Array:
+        """Return the bias at a temperature, (3,)."""
         d = min(max(degc, self.low_degc), self.high_degc) - self.reference_degc
         c0, c1, c2, c3 = np.array(self.coefficients)
         value: Array = c0 + (c1 + (c2 + c3 * d) * d) * d

@@ -31,6 +31,7 @@ _OF_ALL: Final[dict[Cause, str]] = {
     "gravity": "gravity differs",
     "turn": "it turns",
 }
+"""Causes that concern a triad of all IMUs, in a few words."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -50,10 +51,12 @@ class Witness:
 
     @property
     def difference(self) -> Array:
+        """Measurement less prediction, (3,)."""
         return np.asarray(self.measured - np.array(self.expected.value))
 
     @property
     def sigma(self) -> Array:
+        """One sigma of the difference, (3,)."""
         return np.sqrt(self.own_variance + np.diag(self.common))
 
     @property
@@ -81,9 +84,11 @@ class Witness:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Doubt:
+    """A contradiction: its cause, and one line for a pilot."""
+
     triad: Triad
     cause: Cause
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # IMUs whose readings are not to be believed
     words: str
 
     @property

@@ -40,8 +40,8 @@ from companion.samples import TRIADS, Triad, Vector, rows_of
 
 BOUNDS_RAD_S: Final = 0.1 * DEG
 """Largest sigma of a gyro's prediction that says something of a turn."""
-_CONTRADICTS: Final = 4.0
-_WORTH_SAYING: Final = 2.0
+_CONTRADICTS: Final = 4.0  # Sigmas between the slope of the readings and that of the curve
+_WORTH_SAYING: Final = 2.0  # Least change until warm that is reported, in sigma_use
 _END_OF_RAMP: Final = 0.25
 """Variance of a mean over that of the end of a line through the same values (`RobustLine.end_leverage`)."""
 

@@ -49,8 +49,8 @@ class CompassHeading:
     """True heading, its sigma at an exact tilt, and its gradient by up (3,): zero for a device's own heading."""
 
     heading_rad: float
-    sigma_rad: float
-    heading_by_up: Array
+    sigma_rad: float  # One sigma at an exact tilt; `heading_by_up` gives the effect of a wrong one
+    heading_by_up: Array  # Gradient by up in the vehicle's axes, (3,): zero for a device's own heading
     is_usable: bool
     magnetic: Magnetic
     warnings: tuple[str, ...]
@@ -60,8 +60,8 @@ class CompassHeading:
 class _MeanField:
     strength_gauss: float | None = None
     inclination_rad: float | None = None
-    heading_rad: float | None = None
-    bound_deg: float | None = None
+    heading_rad: float | None = None  # Heading of the vehicle by the compass' north, with our tilt compensation
+    bound_deg: float | None = None  # Largest turn of the heading by a disturbance
 
 
 def assess(

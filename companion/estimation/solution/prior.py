@@ -73,6 +73,7 @@ class PoseEffect:
         return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
+        """Make the entry of the record; `up` (3,) is the attitude of the calibration, `sigma_use_m_s2` (3,) there."""
         here = np.square(sigma_use_m_s2)
         scale = np.sqrt(np.diag(np.square(self.mean) + np.square(self.sigma)))
         return Effective(
@@ -83,6 +84,7 @@ class PoseEffect:
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
+        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
         moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
             return None
@@ -130,14 +132,18 @@ class Prediction(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
+    """Predictions for one IMU."""
+
     name: str
     earlier: dict[Triad, Prediction | None] = {}
     today: dict[Triad, Prediction | None] = {}
-    along: dict[Triad, Along | None] = {}
+    along: dict[Triad, Along | None] = {}  # Prediction by the curve for a window in which the temperature changed
     effect: PoseEffect | None = None
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
+    """Predictions for all IMUs of a calibration."""
+
     imus: tuple[ExpectedImu, ...] = ()
     zero_is_known: bool = False
     """True if the sigma of the gradienter's zero was measured or configured, and is no cautious guess."""
@@ -233,6 +239,7 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
 
 
 def _states(groups: Sequence[Sequence[Point]]) -> list[Floats] | None:
+    """Give the temperature and its rate of every point by power-up, (n, 2) each; None: one is not known."""
     if any(point.temperature_degc is None for group in groups for point in group):
         return None
     return [np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64) for group in groups]

@@ -48,6 +48,8 @@ IN_CONFIGURATION: Final = Remedies()
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Whereabouts:
+    """Place and date, and their source ("configuration", "autopilot", ...)."""
+
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     height_m: float | None = None
@@ -67,7 +69,7 @@ class LocalEarth:
     declination_deg: float
     declination_sigma_deg: float
     warnings: tuple[str, ...]
-    field: earth.MagneticField | None = None
+    field: earth.MagneticField | None = None  # The Earth's magnetic field by its model; None without position and date
     remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> tuple[Array, Matrix]:

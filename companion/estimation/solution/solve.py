@@ -87,10 +87,12 @@ class ImuSolution:
 
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
+        """One sigma per axis, shape (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[:3])
 
     @property
     def accel_sigma_use_m_s2(self) -> Array:
+        """One sigma per axis, shape (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[3:])
 
     @property
@@ -117,10 +119,11 @@ class Shared:
     by_reading: Matrix | None
     """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
-    zero_sigma_rad: float
+    zero_sigma_rad: float  # One sigma of the gradienter's zero, the same in every calibration
 
     @property
     def by_zero(self) -> Matrix:
+        """One sigma of the accelerometer biases by each axis of the gradienter's zero, (3, 2)."""
         return self.tilted(self.zero_sigma_rad)
 
     def tilted(self, sigma_rad: float | Array) -> Matrix:
@@ -130,6 +133,8 @@ class Shared:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Solution:
+    """The biases of all IMUs from one still stretch."""
+
     pose: Pose
     site: SiteRecord
     imus: tuple[ImuSolution, ...]
@@ -140,7 +145,7 @@ class Solution:
     magnetic: Magnetic | None = None
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[Doubt, ...] = ()  # Contradictions to earlier calibrations
 
     @property
     def doubted(self) -> dict[tuple[str, Triad], Doubt]:

@@ -32,7 +32,7 @@ from companion.physics.units import DEG, MG
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
-UNKNOWN_K: Final = 5.0
+UNKNOWN_K: Final = 5.0  # Assumed change of an unknown temperature
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
@@ -40,12 +40,16 @@ LENGTH_SIGMAS: Final = 4.0
 
 
 class OwnHeading(msgspec.Struct, frozen=True):
+    """The autopilot's yaw, clockwise from true north."""
+
     heading_deg: float
     sigma_deg: float
 
 
 class Otherwise(msgspec.Struct, frozen=True, kw_only=True):
-    sides: dict[str, Sides] = {}
+    """Fallbacks for a missing gradienter or compass."""
+
+    sides: dict[str, Sides] = {}  # Figures of the accelerometers from all sides, by IMU
     heading: OwnHeading | None = None
 
 
@@ -62,7 +66,7 @@ class Truth:
 
     up: Array
     up_covariance: Matrix
-    attitude_covariance_rad2: Matrix
+    attitude_covariance_rad2: Matrix  # (3, 3) in vehicle FRD
     up_by_reading: Matrix | None
     """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
@@ -71,6 +75,7 @@ class Truth:
     heading_sigma_rad: float | None = None
     heading_from: HeadingFrom | None = None
     magnetic: Magnetic | None = None
+    """Quality of the heading by the compass' field and steadiness; None without a compass."""
 
     @property
     def body_from_ned(self) -> Matrix:
@@ -200,6 +205,7 @@ def _up_by_sides(
 
 
 def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
+    """Give the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
     figures, turn = known.figures, known.vehicle_from_sensor
     inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])

@@ -68,11 +68,11 @@ _TRIADS: Final = (
 )
 _FEW_LEVELS: Final = 4  # Most levels in one second of a stream whose noise is of the size of its steps
 _TIMES_EACH: Final = 4  # Least readings a level: few samples are never the same, and no steps
-_COARSE_S: Final = 3
+_COARSE_S: Final = 3  # Seconds of few levels that show a coarse stream
 _RECENT: Final = 10
 _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
-_STATIONARY: Final = 2.0
+_STATIONARY: Final = 2.0  # Largest ratio of noise at rest to its usual variance
 
 
 class GateVerdict(msgspec.Struct, frozen=True):
@@ -134,6 +134,7 @@ class ImuGate:
         self._few_levels_s = np.zeros(6, dtype=np.int64)
         """Seconds of few levels since the last one of many, for each channel."""
         self._coarse_slot = [-math.inf, -math.inf]
+        """Latest second in which the gyro, or the accelerometer, changed in coarse steps."""
         self._whites: deque[Floats] = deque(maxlen=_RECENT)  # of seconds without motion
         self._noise = np.zeros(6)
         """Variance of one sample's white noise; zero until a second was without motion."""

@@ -37,11 +37,11 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
     a compass has seen the level of the gyros at rest; else that level may hold a turn itself.
     """
 
-    rate_rad_s: float = 0.0
+    rate_rad_s: float = 0.0  # About the vertical, clockwise seen from above; never subtracted
     sigma_rad_s: float = 0.0
     noise_rad_s: float = 0.0
     by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None = None
-    tilting_rad_s: Vector = (0.0, 0.0, 0.0)
+    tilting_rad_s: Vector = (0.0, 0.0, 0.0)  # Level part, vehicle FRD
     tilting_sigma_rad_s: float = 0.0
     step_rad_s: float = 0.0
     is_vouched: bool = True

@@ -53,7 +53,7 @@ BLIND_S: Final = 5  # Longest pause, for example while offsets are written, afte
 _SLOT: Final = 0
 _RATES: Final = slice(1, 4)
 _FORCES: Final = slice(4, 7)
-_READINGS: Final = slice(1, 7)
+_READINGS: Final = slice(1, 7)  # Rates and forces, vehicle FRD
 _DEGC: Final = 7  # NaN without a thermometer
 _TURNED: Final = 8  # Variance of the platform's rate by the compass, for seconds of the level; NaN without a compass
 
@@ -73,7 +73,7 @@ class ImuLevel:
     def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
         self._gyro, self._steps, self._span = profile.gyro, steps, span
         self._rotation = np.kron(np.eye(2), rotation)
-        self._least = columns(profile)
+        self._least = columns(profile)  # N, B and K of its six channels
         self._white = np.zeros(6)
         """N of the gyros in the last window that was long enough to show it."""
         self.window: deque[Floats] = deque()
@@ -81,7 +81,7 @@ class ImuLevel:
         self.turn: Turn | None = None
         self.has_changed = False
         self.tilting_rad_s: Array = np.zeros(3)
-        self.tilting_variance = 0.0
+        self.tilting_variance = 0.0  # Variance of each component
         self.began: int | None = None
         self.step_rad_s = 0.0
         self.white = 0.0
@@ -218,10 +218,10 @@ class TurnWatch:
         self._headings: deque[tuple[bool, Batch]] = deque(maxlen=span)
         """Seconds of the compass since the last movement, and whether each is one of the still stretch."""
         self._last_slot = 0
-        self._start: int | None = None
+        self._start: int | None = None  # First second of the still stretch
         self._is_suspect = False
         """Gyros that have moved or stepped since may be off their level by a turn; else they drift."""
-        self.turn = Turn()
+        self.turn = Turn()  # Rate as of the last second
         self.words = ""
         """Reason why no calibration is possible, for a pilot; empty without one."""
 

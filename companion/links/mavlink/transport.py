@@ -34,6 +34,7 @@ Peer = tuple[Any, ...]
 
 
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
+    """Keep `link` connected through `url` until cancelled; raise LinkError where the url is wrong."""
     kind, where, number = parse_url(url)
     if kind in ("udpin", "udpout"):
         await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)

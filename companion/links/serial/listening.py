@@ -41,6 +41,8 @@ _LOOK_S: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Heard:
+    """Result of listening to a port."""
+
     line: Line | None
     candidate: Candidate | None
     stranger: str | None

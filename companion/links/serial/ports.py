@@ -23,6 +23,8 @@ _TEXT_LIMIT = 80
 
 @dataclass(frozen=True, slots=True)
 class Holder:
+    """A process that has the port open."""
+
     pid: int
     name: str
 
@@ -194,6 +196,8 @@ _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 @dataclass(frozen=True, slots=True)
 class PortFault:
+    """One fault of a port in words, and the command that mends it; `good`: a warning."""
+
     words: str
     remedy: str
     good: bool = False  # True: a warning

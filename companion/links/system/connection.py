@@ -194,6 +194,7 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
 
 
 async def write_line(writer: asyncio.StreamWriter, reply: Object) -> None:
+    """Send one JSON object; raise ConnectionError where the peer is gone or does not read."""
     writer.write(msgspec.json.encode(reply) + b"\n")
     try:
         async with asyncio.timeout(READ_TIMEOUT_S):

@@ -72,6 +72,8 @@ class OneLineFormatter(logging.Formatter):
 
 
 class JournalFormatter(OneLineFormatter):
+    """Lines as journald wants them; it stamps the time itself."""
+
     def format(self, record: logging.LogRecord) -> str:
         prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
         return "\n".join(prefix + line for line in super().format(record).splitlines() or [""])
@@ -169,12 +171,16 @@ OOM_SCORE: Final = "900"
 
 
 class ChildSettings(msgspec.Struct, frozen=True):
+    """Settings that the daemon hands to a child: the configuration in force, and the level of the log."""
+
     config: Config
     log_level: str = "INFO"
     only_listening: str | None = None
 
 
 class ChildWork(Protocol):
+    """Work of a child process."""
+
     async def run(self) -> None:
         """Work until cancelled."""
 

@@ -57,7 +57,7 @@ _FIELDS: Final = (b"MAGX", b"MAGY", b"MAGZ")
 class NmeaDecoder(SentenceDecoder):
     """Sentences of compasses; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
 
-    _heading_from = _tilt_from = _NOBODY
+    _heading_from = _tilt_from = _NOBODY  # The sentences that give headings and tilts, and when they were last heard
     _heading_s = _tilt_s = 0.0
 
     def interrupted(self) -> None:

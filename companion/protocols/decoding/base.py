@@ -43,7 +43,7 @@ class Decoder(ABC):
     never wraps.
     """
 
-    START: ClassVar[re.Pattern[bytes]]
+    START: ClassVar[re.Pattern[bytes]]  # The bytes that may begin a frame
     device_clock_wraps_s: ClassVar[float | None] = None
     clock_from_start: ClassVar[bool] = False  # `ImuSample.t_device_s` counts from the device's start
     sequence_modulus: ClassVar[int | None] = None
@@ -210,6 +210,7 @@ def full_circle(heading_deg: float) -> float:
 
 
 def check_vector(vector: Vector) -> None:
+    """Raise RejectedError where a component is not finite."""
     if not math.isfinite(sum(vector)):
         raise RejectedError("non-finite")
 

@@ -38,7 +38,7 @@ class DeviceClock:
 
     def __init__(self, wraps_s: float | None) -> None:
         self.breaks = 0  # samples before and after a break need not be from one device without a pause
-        self.device_s = 0.0
+        self.device_s = 0.0  # The clock as of the last sample, unwrapped
         self._wraps_s = wraps_s
         self._raw_s = self._arrival_s = self._offset_s = math.nan
         self._new_span(math.nan)

@@ -42,7 +42,7 @@ class PollDialogue(Dialogue):
         self._first = set_up + question
         """Sent first, and after a question in vain: the device may have been without power."""
         self._quiet_until_s = self._next_s = 0.0
-        self._asked_s: float | None = None
+        self._asked_s: float | None = None  # Time of the question that has not been answered yet
         self._since_asked = self._unanswered = 0
         self._set_up = False
 

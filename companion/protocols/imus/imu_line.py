@@ -15,6 +15,8 @@ from companion.samples import ImuSample, Sample
 
 
 class ImuLineDecoder(SentenceDecoder):
+    """Lines of `$IMU`, of which the longest sensible one has some 110 bytes; gives `ImuSample`."""
+
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / 1e6
     sequence_modulus: ClassVar[int | None] = 2**16
 

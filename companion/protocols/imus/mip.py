@@ -29,6 +29,8 @@ _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class MipDecoder(Decoder):
+    """MIP packets; gives `ImuSample`."""
+
     device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week
 
     START = re.compile(rb"\x75(?:\x65|\Z)")

@@ -99,7 +99,7 @@ OUTSIDE_CONDITIONS = "outside operating conditions"
 RANGE_NOT_KNOWN = "accelerometer range not known"
 OUTPUT_UNIT = "output unit"
 
-REST_TICKS: Final = 2000
+REST_TICKS: Final = 2000  # Internal samples at rest (a second of them) that decide the accelerometers' range
 REST_DEG_S: Final = 3.0  # the fastest rate that counts as "at rest"; a turn-on bias is a tenth of it
 
 _ASSUMED_BITS = 19

@@ -95,13 +95,15 @@ _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR"
 
 
 class VectorNavDecoder(SentenceDecoder):
+    """VectorNav outputs; gives `ImuSample`."""
+
     START = re.compile(rb"\xfa|\$(?:V(?:N|\Z)|\Z)")
     END = re.compile(rb"[^ -#%-~]")
     """The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
     LIMIT = 250  # the longest asynchronous sentence has some 200 bytes
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
     clock_from_start: ClassVar[bool] = True
-    _layout: tuple[struct.Struct, dict[str, int]]
+    _layout: tuple[struct.Struct, dict[str, int]]  # Layout of the binary frame that was checked last
 
     def _size(self, buffer: bytes, at: int) -> int:
         if buffer[at] != _SYNC:

@@ -38,6 +38,8 @@ _FLOAT32 = struct.Struct(">3f")
 
 
 class XsensDecoder(Decoder):
+    """MTData2 messages; gives `ImuSample`."""
+
     START = re.compile(rb"\xfa(?:\xff|\Z)")
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
     clock_from_start: ClassVar[bool] = True

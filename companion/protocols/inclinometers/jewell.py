@@ -45,6 +45,8 @@ _START: Final = re.compile(rb".*(?=\$)", re.DOTALL)
 
 
 class JewellDecoder(LineDecoder):
+    """Lines of a Jewell tiltmeter, in whichever of its formats; gives `TiltSample`."""
+
     LIMIT: ClassVar[int] = 90
 
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> TiltSample | None:

@@ -104,7 +104,7 @@ def test_reads_what_is_there() -> None:
 
 
 def board_x(orientation: int, **angles: float) -> list[float]:
-    """Where the board's x axis points in the vehicle."""
+    """Direction of the board's x axis in the vehicle."""
     calibration = read(IMU1 | {"AHRS_ORIENTATION": orientation} | angles)
     pointing: list[float] = (calibration.orientation @ np.array([1.0, 0.0, 0.0])).tolist()
     return pointing

@@ -1,4 +1,4 @@
-"""What ArduPilot takes off by temperature, against figures worked out by hand and numpy's own polynomials."""
+"""ArduPilot's temperature correction, against figures worked out by hand and numpy's own polynomials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What proves that the autopilot is disarmed, on injected times; and that nothing leaves without that proof."""
+"""Proof that the autopilot is disarmed, on injected times; nothing leaves without it."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ async def settle(
     within_s: float = 30.0,
     act: Callable[[ScriptedAutopilot], object] = lambda autopilot: None,
 ) -> tuple[str | None, float, list[str]]:
-    """What settling says, how long it took, and its progress, with omegaI y told every `period_s`."""
+    """Texts, duration and progress of settling, with omegaI y sent every `period_s`."""
     link, autopilot = MavlinkLink(), ScriptedAutopilot()
     vehicle = Vehicle(link)
     watch = EkfWatch(vehicle)

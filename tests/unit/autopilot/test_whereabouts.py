@@ -1,4 +1,4 @@
-"""What is believed of what the autopilot says of time and place."""
+"""Accepted and rejected values of the autopilot's time and place."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def test_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is to be typed starts just this one: with the file that was named, or the service where there is one."""
+    """The advice starts this daemon: with the named file, or the service where there is one."""
     file = tmp_path / "my c.toml"
     file.write_text(CONFIG.format(tmp_path / "none.sock"), encoding="utf-8")
     assert cli.main(["-c", str(file), "align", "zero", "--json"]) == 3

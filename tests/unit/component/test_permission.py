@@ -1,4 +1,4 @@
-"""Who may ask component 191 for something: `mavlink.allow`."""
+"""Senders that component 191 obeys: `mavlink.allow`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ground stations speak: of every text in the code that is said at NOTICE or worse, the line that is heard.
+"""Spoken texts of ground stations: the first line of every text of NOTICE or worse.
 
 That it is one line, and good news without figures, holds for whatever is filled in: test_statustext.py.
 """
@@ -47,7 +47,7 @@ def _said_in(function: ast.AST) -> Iterator[tuple[Severity, str]]:
 
 
 def unheard(severity: Severity, template: str) -> str | None:
-    """What is wrong with the line that is heard; None where all is well."""
+    """Fault of the spoken line; None if it is good."""
     filled = re.sub(rf"{FILLED}(?= (mg|deg))", "2.5", template).replace(FILLED, "fc")
     line = as_lines(severity, to_ascii(filled))[0][1]
     if len(line.split()) < 2:

@@ -20,7 +20,7 @@ from tests.support.messages import FILLED, all_messages
 
 
 def said(ground: Ground) -> list[tuple[int, str]]:
-    """What is on the wire: severity and text, by the letter of the message's definition."""
+    """Severity and text on the wire, by the letter of the message's definition."""
     found = []
     for raw in ground.raw:
         assert raw[0] == 0xFD
@@ -82,7 +82,7 @@ def test_every_text_of_the_code_is_cut_between_words_wherever_it_is_shown(field:
 
 
 def begins(text: str, shown: str, most: int) -> bool:
-    """Whether what is shown are the first words of a text; of a word that is longer than a line, its beginning."""
+    """Whether `shown` is the first words of a text; of a word longer than a line, its beginning."""
     words, first = ([word.rstrip(":;,") for word in each.split()] for each in (text, shown))
     return words[: len(first)] == first or any(len(word) > most for word in words)
 

@@ -124,7 +124,7 @@ def test_the_notes_are_what_the_guide_says_and_short_and_shrill_enough(tune: Tun
 
 
 def test_the_simulated_buzzer_reads_notes_as_the_firmwares_do() -> None:
-    """By hand: at T120 a quarter takes 0.5 s, of which 7/8 sound; the A of O4 is 1760 Hz in both firmwares."""
+    """Worked out by hand: at T120 a quarter takes 0.5 s, of which 7/8 sound; A of O4 is 1760 Hz in both firmwares."""
     notes = notes_of("T120O4A4P4ML<A8.")
     assert [note.frequency_hz for note in notes] == pytest.approx([1760.0, 0.0, 0.0, 880.0])
     assert [note.seconds for note in notes] == pytest.approx([0.4375, 0.0625, 0.5, 0.375])

@@ -1,4 +1,4 @@
-"""How well a device is known where nobody says, and what is probably not meant."""
+"""Default sigmas of devices, and suspicious configurations."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def record(outcome: Outcome | None) -> ImuRecord:
 def test_what_is_subtracted(
     imu: Imu, outcome: Outcome | None, gyro: tuple[float, ...], accel: tuple[float, ...]
 ) -> None:
-    """Of a serial IMU the whole bias; of a stream what is left in it, which a write has taken away."""
+    """Serial IMU: the whole bias; stream: the residual after a write."""
     found = settings_of(imu, record(outcome), HERE, 0.0)
     assert found is not None
     assert (found.gyro_bias_rad_s, found.accel_bias_m_s2) == (gyro, accel)

@@ -1,4 +1,4 @@
-"""What the system has against a port, read from made-up trees; and what is said about it."""
+"""Conflicts of the system with a port, read from made-up trees; and their texts."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from companion.daemon.offsets.plan import ImuPlan
 from companion.estimation.means.windows import ImuWindow
 
 NOISE_RAD_S = 1e-4
-"""Of a second's mean."""
+"""Noise of a second's mean."""
 STEP_RAD_S = 2e-5
 
 
@@ -35,7 +35,7 @@ def calibration() -> ImuCalibration:
 
 
 def window(seconds: Any, offset: Any) -> ImuWindow:
-    """What a window of second means tells: (n, 3) in rad/s; sigma from their own scatter."""
+    """Window of second means (n, 3) in rad/s; sigma from their own scatter."""
     mean = seconds.mean(axis=0) - offset
     sigma = seconds.std(axis=0, ddof=1) / np.sqrt(len(seconds))
     return ImuWindow(

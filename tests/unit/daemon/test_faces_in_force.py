@@ -1,4 +1,4 @@
-"""What was measured on all sides, used later: under other offsets, on another day, on another sensor."""
+"""A six-position calibration used later: under other offsets, on another day, on another sensor."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ HOST, UP_S = this_boot(), 5000.0
 
 
 def running(at_s: float = UP_S) -> Running:
-    """Of the sensor that started at 0."""
+    """Calibration of the sensor that started at 0."""
     return Running(host=HOST, started_s=0.0, up_s=at_s)
 
 
@@ -69,7 +69,7 @@ def record(when: Running | None) -> FacesRecord:
 
 
 class There(ActiveSixPosition):
-    """Of a daemon that hears for how long the sensor has been on."""
+    """Active six-position calibration of a daemon that knows how long the sensor has been on."""
 
     def running(self, name: str) -> Running | None:
         return running()

@@ -55,7 +55,7 @@ def compare(rate_rad_s: float, clock: float, late_s: Callable[[int], float], dri
 @pytest.mark.parametrize("clock", [1.0, 0.989, 1.011], ids=["as ours", "slower", "faster"])
 @pytest.mark.parametrize("late_s", [lambda _k: 0.0, lambda k: 0.06 * (k % 3)], ids=["at once", "late at times"])
 def test_a_turn_is_the_same_to_both_whatever_the_autopilots_clock(clock: float, late_s: Callable[[int], float]) -> None:
-    """Who pairs what was said at 12:00:00 with a heading of 12:00:01 sees a heading that strays in every turn."""
+    """Pairing a heading of 12:00:00 with one of 12:00:01 would show a drift in every turn."""
     difference = compare(math.radians(40.0), clock, late_s)
     assert not difference.straying.is_too_far
     assert abs(difference.heading_rad) < math.radians(3.0)

@@ -46,7 +46,7 @@ def raises(error: BaseException) -> Block:
 
 
 async def wordless(ledger: Ledger) -> None:
-    """Nobody says how it ended."""
+    """Ignore the end of the transaction."""
 
 
 async def done_and_then(ledger: Ledger) -> None:
@@ -64,7 +64,7 @@ class Disk:
 
     def __init__(self) -> None:
         self.refuses: set[str] = set()
-        """Of "write" and "clear"."""
+        """Operations that fail: "write", "clear"."""
 
     async def offload(self, function: Callable[..., Any], *arguments: Any) -> Any:
         await asyncio.sleep(0)

@@ -1,4 +1,4 @@
-"""Who has changed the autopilot's offsets: values are compared, whatever the parameters are called."""
+"""Changes of the autopilot's offsets by others: values are compared, whatever the parameters' names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which IMU a PX4 slot acts on, and offsets that may not be in use: seen and put right around a write."""
+"""The IMU of a PX4 slot, and offsets that may not be in use: found and corrected around a write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What keeps ground stations from the companion, in words."""
+"""Obstacles between ground stations and the companion."""
 
 from __future__ import annotations
 

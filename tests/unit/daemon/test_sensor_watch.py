@@ -35,8 +35,8 @@ class Bench:
         self.said: list[tuple[Severity, str]] = []
         self.offset: Vector | None = (0.0, 0.0, 0.0)
         self.turned = np.eye(3)
-        """From its own axes to the vehicle's, as the autopilot believes it to be mounted."""
-        """What the autopilot takes off its accelerometer; None: not known, its samples do not come."""
+        """Sensor axes to vehicle axes, by the autopilot's configured mounting."""
+        """Offset that the autopilot subtracts from its accelerometer; None: unknown, its samples do not come."""
         collector, sensor = self.one.collector, self.one.sensor
         self.one.watch = SensorWatch(
             [sensor], collector, self.offsets_of,

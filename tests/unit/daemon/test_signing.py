@@ -62,7 +62,7 @@ class Board:
 
     @contextlib.asynccontextmanager
     async def daemon(self, *, killed: bool = False) -> AsyncIterator[LinkSigning]:
-        """Its signing, running; `killed`: without an orderly end."""
+        """Run its signing; `killed`: without an orderly end."""
         text = GOOD.replace("[[imu]]", f'signing_key_file = "{self.folder}/k"\n[[imu]]', 1)
         config = parse(f'{text}[storage]\ndirectory = "{self.folder}"\n', "x.toml")
         vehicle = cast("Vehicle", SimpleNamespace(alive=False, component_id=1, system_id=None))

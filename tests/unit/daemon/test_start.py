@@ -1,4 +1,4 @@
-"""What a start costs, without a clock: what is imported up to the first heartbeat; and one that is broken off."""
+"""Cost of a start without a clock: imports up to the first heartbeat; an interrupted start."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def on_spot(headings_deg: list[float], slope_deg: tuple[float, float]) -> list[F
 
 
 class World:
-    """What the sensors really are, and what they read of an attitude, from the simulator's own formulas."""
+    """True sensors, and their readings of an attitude, from the simulator's own formulas."""
 
     def __init__(self, law: Law = "slope", mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self.law, self.mounting_deg = law, mounting_deg

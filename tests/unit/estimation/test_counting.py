@@ -133,7 +133,7 @@ def test_a_second_copy_of_a_sample_does_not_count_and_a_device_that_began_anew_t
 def test_clocks_that_disagree_on_the_pace_are_in_the_sigma_or_tell_nothing(
     pace: float, sigma_rad: float | None
 ) -> None:
-    """As those of a simulated firmware on a busy computer; a clock that stands still is none."""
+    """Clocks of a simulated firmware on a busy computer; a clock that stands still is invalid."""
     counter = TurnCounter()
     for k in range(1000):
         counter.add(sample(k / 100.0, 700.0 + pace * k / 100.0, [0.0, 0.0, 0.1]))

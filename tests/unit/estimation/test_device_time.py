@@ -90,7 +90,7 @@ def test_a_host_that_stalls_for_60_ms_loses_nothing_and_moves_no_sample_to_anoth
 
 
 def biases(fed: Fed) -> set[float]:
-    """Which of the two biases are in the seconds that are kept: of each second the lowest and highest x rate."""
+    """Biases found in the kept seconds, by the lowest and highest x rate of each second."""
     found = set()
     for batch in fed.batches:
         low, high = batch.low[0], batch.high[0]

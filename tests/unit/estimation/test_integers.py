@@ -50,7 +50,7 @@ def white(rng: np.random.Generator, mean: Floats, sigma: float, seconds: int, ra
 def filtered(
     rng: np.random.Generator, mean: Floats, sigma: float, seconds: int, rate_hz: int, cutoff_hz: float
 ) -> Floats:
-    """As behind an autopilot's low-pass: neighbouring readings are alike."""
+    """Noise behind an autopilot's low-pass: neighbouring readings are alike."""
     keep = math.exp(-2.0 * math.pi * cutoff_hz / rate_hz)
     noise = rng.normal(size=((seconds + 1) * rate_hz, 6))
     state = np.zeros(6)

@@ -33,7 +33,7 @@ def expected(value: Array, sigma: float, **others: Any) -> Prediction:
 def imus(
     accels: Sequence[Array], shared: Shared, *, gyros: Sequence[Array] | None = None, own: float = 0.05 * MG
 ) -> list[ImuSolution]:
-    """Whose own noise is all white, so that the best weights are those of the plain equations."""
+    """Solutions with white noise only, so that the best weights are those of the plain equations."""
     stat = np.array([20.0 * DEG_H] * 3 + [own] * 3)
     return [
         imu_solution(

@@ -76,7 +76,7 @@ def test_headings_follow_the_optical_ones_at_every_tilt() -> None:
 
 
 def undisturbed() -> LocalEarth:
-    """What the field is where the trials were made, from the first rest of the undisturbed one."""
+    """Field at the place of the trials, from the first rest of the undisturbed one."""
     field, _, up = trial(UNDISTURBED).rest(first=True)
     found = MagneticField(
         0.0, inclination_rad(field, up) / DEG, float(np.linalg.norm(field)), 0.0, 0.2, 138e-5, compass_use="good"

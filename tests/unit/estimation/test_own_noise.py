@@ -33,7 +33,7 @@ STEPS = np.repeat([0.05 * DEG, 1.0 * MG], 3)
 
 
 def verdicts(t_s: Floats, readings: Floats) -> list[bool]:
-    """Of a gate that nobody told anything, second by second."""
+    """Verdicts of a gate without a profile, second by second."""
     gate = ImuGate("own", UNKNOWN)
     found = []
     for batch in seconds_of(t_s, readings):
@@ -125,7 +125,7 @@ def test_rocking_is_never_learned_as_noise(
     ),
 )
 def test_rocking_that_is_taken_for_still_is_in_sigma(white: tuple[float, float], rms_deg_s: float, hz: float) -> None:
-    """What nobody can tell from noise within a second may move the mean; then gravity says so, or sigma does."""
+    """Rocking that looks like noise within a second may move the mean; then gravity shows it, or sigma covers it."""
     t_s, readings = filtered(150, RATE_HZ, white, 5.0, 1, 21)
     readings += rocking(t_s, rms_deg_s, hz)
     readings[:, 0] += EARTH_RAD_S  # on the equator, heading north
@@ -165,7 +165,7 @@ def gusts(t_s: Floats, seed: int, low_hz: float, high_hz: float, rms_deg_s: floa
 @pytest.mark.parametrize("rms_deg_s", [0.05, 0.1, 0.2])
 @pytest.mark.parametrize(("low_hz", "high_hz"), [(0.02, 0.5), (0.05, 1.0), (0.1, 2.0), (0.05, 3.0)])
 def test_gusts_about_one_axis_are_never_learned(low_hz: float, high_hz: float, rms_deg_s: float) -> None:
-    """As flat and as steady as noise; but noise has no favourite axis."""
+    """Gusts as flat and steady as noise; but noise has no favourite axis."""
     t_s, readings = filtered(150, 100, ICM42688P, 1e6, 1, 22)
     readings += gusts(t_s, 23, low_hz, high_hz, rms_deg_s, 1)
     own = OwnNoise()

@@ -1,4 +1,4 @@
-"""Which stand is asked for, and which is taken: a pilot's turns and tilts, in figures worked out by hand."""
+"""Requested and accepted stands: a pilot's turns and tilts, in figures worked out by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From earlier calibrations to what today's bias should be: against scipy's own figures and simulated truth."""
+"""Prediction of today's bias from earlier calibrations, against scipy's own figures and simulated truth."""
 
 from __future__ import annotations
 

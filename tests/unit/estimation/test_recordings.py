@@ -188,7 +188,7 @@ def window_start(played: Played) -> float:
 
 @pytest.mark.parametrize("until_s", [30.0, 40.0, 50.0])
 def test_px4_predicts_the_next_seconds_within_its_sigma(until_s: float) -> None:
-    """What a user relies on: the bias said at `until_s` against the mean of the next 15 s."""
+    """The estimate at `until_s` predicts the mean of the next 15 s."""
     recording = px4()
     past = recording.t_s < until_s
     played = Played(Recording(recording.t_s[past], recording.gyro[past], recording.accel[past]), horizon_s=15.0)

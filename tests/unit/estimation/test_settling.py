@@ -53,11 +53,11 @@ class Seen:
     windows: list[tuple[float, Window]] = field(default_factory=list)
     """Whenever there was one, and when."""
     words: list[str | None] = field(default_factory=list)
-    """What it waited for, twenty times a second."""
+    """Reasons for waiting, twenty times a second."""
     pitch_deg: float = 0.0
 
     def error_deg(self, at: int = 0) -> float:
-        """Of the pitch from a window's tilt."""
+        """Error of the pitch from a window's tilt."""
         tilt = self.windows[at][1].tilt
         assert tilt is not None
         return abs(math.degrees(attitude_from_readings("slope", tilt.x_deg, tilt.y_deg)[0]) - self.pitch_deg)

@@ -150,7 +150,7 @@ def test_the_boards_tilt_is_found_on_a_slope() -> None:
 
 
 def test_the_orientation_of_a_turned_board_is_taken_off() -> None:
-    """What an autopilot sends is in the aircraft's axes; `faces` is of the sensor's."""
+    """The autopilot sends in the aircraft's axes; `faces` is in the sensor's."""
     orientation = rotation_matrix("ROTATION_YAW_90")
     known = held((0.0, 0.0, 0.0))
     level = solved(on_spot((1.0, 1.0), QUARTERS)).imus[0]

@@ -33,14 +33,14 @@ GYRO_BIAS = np.array([300.0, -200.0, 100.0]) * DEG_H
 
 
 class Later(NamedTuple):
-    """How it stands, later, and what is said of it."""
+    """Later pose, and texts about it."""
 
     pose: Pose
     solution: Solution
 
 
 class Wandering(Sensor):
-    """Its bias walks on the simulator's path; the board sits turned by 90 deg in the aircraft."""
+    """A sensor whose bias walks on the simulator's path; the board is turned by 90 deg in the aircraft."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(seed)

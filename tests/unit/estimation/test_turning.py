@@ -1,4 +1,4 @@
-"""What turns under a standing aircraft: who says so, what is waited for, and what is left in sigma."""
+"""Turns under a standing aircraft: detection, waiting, and the rest in sigma."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Stand:
             self.feed.heading = lambda t: (self.heading(t) + 0.1 * self.noise.standard_normal()) % 360.0
 
     def add(self, rate_deg_s: tuple[float, float, float], *names: str) -> None:
-        """From now on the gyros read more."""
+        """Add a bias to the gyros from now on."""
         more = np.array([*rate_deg_s, 0.0, 0.0, 0.0]) * DEG
         self.feed.change = lambda name, _t, rows: rows + more if not names or name in names else rows
 
@@ -51,13 +51,13 @@ class Stand:
         self.add((0.0, 0.0, rate_deg_s))
 
     def warnings(self) -> tuple[str, ...]:
-        """Those of a calibration now."""
+        """Warnings of a calibration now."""
         model = CompassModel(magnetic=False, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0)
         window = self.collector.window(self.feed.now_s)
         return solve(window, local_earth(Whereabouts(45.0)), None, model, What.GYROS).warnings
 
     def says(self, seconds: float) -> str:
-        """What is in the way after so long."""
+        """Obstacle after so long."""
         self.feed.run(seconds)
         return self.feed.waiting_for() or ""
 

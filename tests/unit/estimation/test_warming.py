@@ -1,4 +1,4 @@
-"""What a warm-up may do unseen: thermometers, age, the window's own slope; against ramps that were put in."""
+"""Unseen effect of a warm-up: thermometers, age, the window's own slope; against known ramps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said against sensors: faults that were put in, and nothing where there are none."""
+"""Findings about sensors: injected faults, and none where there are none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What parts of a model have in common: against the figures that the draws were made with."""
+"""Common parameters of the parts of a model, against those of the draws."""
 
 from __future__ import annotations
 

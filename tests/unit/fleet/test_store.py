@@ -1,4 +1,4 @@
-"""What the collector takes, refuses and asks for: against the contract's schemas and the payloads themselves."""
+"""Accepted, refused and requested items of the collector, against the contract's schemas and the payloads."""
 
 from __future__ import annotations
 

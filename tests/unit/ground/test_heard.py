@@ -1,4 +1,4 @@
-"""What the ground makes of what it hears: who is there, its texts, and what to say when nobody is."""
+"""Interpretation of traffic on the ground: stations, texts, and the advice when nothing is heard."""
 
 from __future__ import annotations
 

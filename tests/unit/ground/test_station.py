@@ -1,4 +1,4 @@
-"""What people on the ground are told, whatever becomes of their request: the real component, and no MAVSDK."""
+"""Answers to people on the ground for every end of a request: the real component, and no MAVSDK."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What we ship for ground stations, against what each demands of such a file (autopilots 7.3)."""
+"""Files for ground stations, against the demands of each (autopilots 7.3)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_every_action_goes_to_the_companion_and_is_understood(action: dict[str, 
 
 
 class _MissionPlanner:
-    """What Mission Planner gives to scripts, where ours uses it: `MAV.doCommand(byte, byte, MAV_CMD, 7 x float)`."""
+    """Mission Planner's script interface, as far as ours uses it: `MAV.doCommand(byte, byte, MAV_CMD, 7 x float)`."""
 
     sysidcurrent = 7
 

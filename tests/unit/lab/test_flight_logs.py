@@ -231,7 +231,7 @@ def test_another_file_is_one_line(
 def test_what_a_failed_imu_reads_is_left_aside(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As real ArduPilots log a gyro that hangs: the same rates again and again, and GH 0."""
+    """Real ArduPilots log a gyro that hangs like this: the same rates repeated, and GH 0."""
     told: list[tuple[str, tuple[Any, ...]]] = []
     hangs: tuple[Any, ...] = ()
     for name, values in messages(flown, parameters()):

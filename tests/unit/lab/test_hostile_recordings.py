@@ -54,7 +54,7 @@ def filled(size: int) -> bytes:
 
 
 def frame_of(size: int, *, said: bool) -> bytes:
-    """So many zeros, packed without having them in memory."""
+    """Pack so many zeros without having them in memory."""
     packer = zstandard.ZstdCompressor(write_content_size=said).compressobj(size=size if said else -1)
     piece = bytes(MB)
     return b"".join(packer.compress(piece) for _ in range(size // MB)) + packer.flush()

@@ -1,4 +1,4 @@
-"""From recordings at rest to a profile that keeps its word: seconds, stretches, drifts, and the next minute."""
+"""From recordings at rest to an honest profile: seconds, stretches, drifts, and the next minute."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def test_a_profile_comes_back_as_it_was(tmp_path: Path) -> None:
 
 
 def changed(**changes: Any) -> Callable[[bytes], bytes]:
-    """As another version, or somebody by hand, would have it."""
+    """Change the file as another version, or a person, would."""
     return lambda data: sealed(json.dumps(json.loads(unsealed(data)) | changes).encode())
 
 

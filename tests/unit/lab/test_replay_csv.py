@@ -1,4 +1,4 @@
-"""Somebody's own log of an IMU at rest against the truth of a simulated one, and one clear line for every mistake."""
+"""A user's own log of an IMU at rest against the truth of a simulated one; one clear line for every mistake."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def by_hand(text: str, columns: int) -> list[list[float | None]]:
 
 @pytest.mark.parametrize("separator", [",", ";"])
 def test_every_line_is_read_however_it_is_written(tmp_path: Path, separator: str) -> None:
-    """What comes out is what stands there."""
+    """The values are those in the file."""
     rng = np.random.default_rng(3)
     lines = [GOOD.strip().replace(",", separator) + separator + "temperature_degc"]
     for number in range(3000):

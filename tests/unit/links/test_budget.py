@@ -1,4 +1,4 @@
-"""How much a port may bring: the bucket, on made-up times."""
+"""Limit of a port's rate: the bucket, on made-up times."""
 
 from __future__ import annotations
 

@@ -579,7 +579,7 @@ def test_an_address_that_cannot_be_is_reported_and_does_not_end_the_link(url: st
 
 
 def test_explanations_name_the_mode_of_a_device() -> None:
-    """The same words without root: a file that is there, and a refusal that is made up."""
+    """Texts without root: an existing file, and a made-up refusal."""
     said = serial_port.explain("/dev/null", 9600, PermissionError(13, "Permission denied"))
     mode = stat.S_IMODE(os.stat("/dev/null").st_mode)
     assert said.startswith("/dev/null: permission denied; user ")

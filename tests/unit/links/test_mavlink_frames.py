@@ -46,7 +46,7 @@ def frame(kind: Any, dice: random.Random, size: int | None = None) -> bytes:
 
 
 def everything(message: Any) -> str:
-    """All that a message holds; as text, for NaN is not NaN."""
+    """Content of a message as text, for NaN is not NaN."""
     return repr({**vars(message), "_header": vars(message.get_header())})
 
 

@@ -1,4 +1,4 @@
-"""Which ports there are, read from a made-up Raspberry Pi with an FTDI, two CH340 and a flight controller."""
+"""List of ports, read from a made-up Raspberry Pi with an FTDI, two CH340 and a flight controller."""
 
 from __future__ import annotations
 

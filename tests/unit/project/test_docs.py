@@ -106,7 +106,7 @@ def understood(command: str) -> str:
 
 
 def sim_parser(words: list[str]) -> argparse.ArgumentParser:
-    """Of `python -m sim`, as sim/__main__.py chooses it."""
+    """Parser of `python -m sim`, chosen as in sim/__main__.py."""
     from sim import rest, serve
     from sim.flying import cli as flying
     from sim.sitl import cli as firmware

@@ -72,12 +72,12 @@ SHOWN = [shown for path in (GUIDE, TROUBLE, ALSO) for messages, _ in rows(path) 
 
 @pytest.fixture(scope="module")
 def said() -> list[Message]:
-    """All that the code can say."""
+    """All messages of the code."""
     return all_messages()
 
 
 def is_explained(message: Message, rows_shown: list[str]) -> bool:
-    """Whether a row shows words of the message, or the message with what it is put together with."""
+    """Whether a row shows words of the message, or of a message it is composed with."""
     return any(message.has(shown) or message.is_in(shown) for shown in rows_shown)
 
 

@@ -1,4 +1,4 @@
-"""What is handed out: the wheel, and what the Debian package and the BlueOS extension are made from.
+"""Distribution: the wheel, and the sources of the Debian package and the BlueOS extension.
 
 The Debian package itself is built and tried out in a clean root by `make deb-test`. An image is built nowhere here: its
 Dockerfile is read by a parser of others, and its labels are held against what BlueOS expects of them.

@@ -30,7 +30,7 @@ def lock(name: str) -> list[str]:
 
 
 def pins(lines: list[str]) -> dict[str, list[tuple[str, Requirement]]]:
-    """By canonical name: each version with the requirement that pins it."""
+    """Pinned versions by canonical name, each with its requirement."""
     found: dict[str, list[tuple[str, Requirement]]] = {}
     for line in lines:
         requirement = Requirement(line.split(" --hash=")[0].strip())
@@ -41,7 +41,7 @@ def pins(lines: list[str]) -> dict[str, list[tuple[str, Requirement]]]:
 
 
 def wanted(name: str) -> list[Requirement]:
-    """What pyproject.toml (or the .in file) asks for, with the extras of our own resolved."""
+    """Requirements of pyproject.toml (or the .in file), with our own extras resolved."""
     if (FOLDER / f"{name}.in").is_file():
         return [Requirement(line) for line in lines_of((FOLDER / f"{name}.in").read_text(encoding="utf-8"))]
     declared = [*RUNTIME, *EXTRAS.get(name, ())]
@@ -53,7 +53,7 @@ def wanted(name: str) -> list[Requirement]:
 
 
 def out_of_step(requirements: list[Requirement], lines: list[str]) -> list[str]:
-    """What is declared and not pinned within its range."""
+    """Declared requirements that are not pinned within their range."""
     locked = pins(lines)
     return [
         str(requirement)

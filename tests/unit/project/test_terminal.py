@@ -1,4 +1,4 @@
-"""What comes from outside is shown, and moves no cursor: every command, with hostile names and texts in all places."""
+"""External text is shown and moves no cursor: every command, with hostile names and texts in all places."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ Object = dict[str, Any]
 EVIL = "\x1b[2J\x1b]0;owned\x07\n\r\x08\x00\x9b31m\x7f\x85\u202e\u200b\u2028"
 SHOWN = r"\x1b[2J\x1b]0;owned\x07\n\r\x08\x00\x9b31m\x7f\x85\u202e\u200b\u2028"
 BYTE = "\udcff"
-"""How a name's byte that is no UTF-8 comes to us."""
+"""Byte of a name that is not UTF-8, as Python decodes it."""
 CONFIG = '[mavlink]\nurl = "udpout:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n'
 LOOKED_UP = ("kind", "verdict", "tone", "heading_from")
-"""Whose words are among ours: the program chooses by them."""
+"""Keys whose values the program itself looks up."""
 
 
 def poisoned(value: Any, key: str = "") -> Any:
-    """The same with EVIL before every text and in every name that is no key of ours."""
+    """Put EVIL before every text and into every name that is not a key of ours."""
     if isinstance(value, str):
         return value if key in LOOKED_UP else EVIL + value
     if isinstance(value, list):
@@ -55,7 +55,7 @@ def poisoned(value: Any, key: str = "") -> Any:
 
 
 def clean(words: str) -> str:
-    """What was printed, which no terminal obeys."""
+    """Output, checked to contain nothing that a terminal obeys."""
     bad = {letter for letter in words if not letter.isprintable() and letter != "\n"}
     assert not bad, f"{bad} in {words!r}"
     return words
@@ -63,7 +63,7 @@ def clean(words: str) -> str:
 
 @pytest.fixture(scope="module")
 def replies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Object]:
-    """What a daemon answers, by command."""
+    """Answers of a daemon by command."""
     found: dict[str, Object] = {}
 
     async def asked() -> None:

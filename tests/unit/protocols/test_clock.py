@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 def mapped(stream: Reads, wraps_s: float | None = None) -> tuple[Floats, DeviceClock]:
-    """What a clock makes of a stream; NaN where it cannot tell."""
+    """Times that a clock gives to a stream; NaN where it gives none."""
     clock = DeviceClock(wraps_s)
     pairs = zip(stream.device_s.tolist(), stream.arrival_s.tolist(), strict=True)
     found = [clock.host_s(device_s, arrival_s) for device_s, arrival_s in pairs]
@@ -28,7 +28,7 @@ def mapped(stream: Reads, wraps_s: float | None = None) -> tuple[Floats, DeviceC
 
 
 def deviation_ms(stream: Reads, after_s: float = 10.0) -> Floats:
-    """Of the mapped times from the truth and their common delay, which nobody can see from one end."""
+    """Deviation of the mapped times from the truth and their common delay, which one end cannot see."""
     times, clock = mapped(stream)
     assert clock.breaks == 0
     late = ((times - stream.taken_s) * 1e3)[stream.taken_s > stream.taken_s[0] + after_s]

@@ -1,4 +1,4 @@
-"""What is said to silent devices, with simulated ones that answer as the manuals say; and what is never said."""
+"""Requests to silent devices, with simulated ones that answer as in the manuals; forbidden requests."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def bytes_of(frame: dict[str, Any]) -> bytes:
 
 
 def as_decoded(samples: list[Sample]) -> dict[str, Any]:
-    """What the samples say, in the document's words."""
+    """Content of the samples in the document's terms."""
     said: dict[str, Any] = {}
     for sample in samples:
         match sample:
@@ -56,7 +56,7 @@ def as_decoded(samples: list[Sample]) -> dict[str, Any]:
 
 
 def as_documented(frame: dict[str, Any]) -> dict[str, Any]:
-    """What of the document's words a sample can say: one heading of a sentence, to the north that is right for it."""
+    """Document's values that a sample can hold: one heading per sentence, relative to the right north."""
     unused = {"yaw_pitch_roll_deg"} | ({"mag_gauss"} if KINDS[frame["device"]] == "imu" else set())
     decoded = {key: value for key, value in frame["decoded"].items() if key not in unused}
     if "sensor_heading_deg" in decoded:  # HDG: from its magnetic heading the rest follows
@@ -75,7 +75,7 @@ def test_the_document_has_frames_of_all_families_but_our_own() -> None:
 
 
 TOGETHER = [frame for frame in FRAMES if frame["device"] == "witmotion"]
-"""Its frames are believed only in company: see below."""
+"""Frames accepted only together: see below."""
 MESSAGES = [f for f in FRAMES if "frame_id" in f["decoded"] or list(f["decoded"]) == ["yaw_pitch_roll_deg"]]
 """Right, but no measurements."""
 

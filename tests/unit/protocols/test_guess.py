@@ -1,4 +1,4 @@
-"""Who speaks? Bytes of every simulated device are recognised, and nothing else is."""
+"""Recognition of devices: bytes of every simulated one are recognised, and nothing else is."""
 
 from __future__ import annotations
 

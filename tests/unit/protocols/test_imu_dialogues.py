@@ -1,4 +1,4 @@
-"""What is said to silent IMUs, and that simulated ones understand it."""
+"""Requests to silent IMUs, understood by simulated ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ALL = [MipDialogue, VectorNavDialogue, XsensDialogue]
 
 
 def asked(dialogue: WakeDialogue, from_s: float, to_s: float) -> list[tuple[float, bytes]]:
-    """What is said, asked every 20 ms."""
+    """Requests, polled every 20 ms."""
     times = [from_s + 0.02 * step for step in range(round((to_s - from_s) / 0.02) + 1)]
     return [(t_s, said) for t_s in times if (said := dialogue.due(t_s))]
 

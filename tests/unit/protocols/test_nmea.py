@@ -190,7 +190,7 @@ def test_ccd_beside_a_better_heading_still_gives_its_tilt() -> None:
 
 
 def test_against_two_other_packages() -> None:
-    """The same lines through pynmea2 and pynmeagps; both leave the deviation to their user."""
+    """Lines through pynmea2 and pynmeagps; both leave the deviation to their user."""
     for n in range(0, 3600, 7):
         deviation = (n % 50) / 10
         line = sentence(f"HCHDG,{n / 10:.1f},{deviation},{'EW'[n % 2]},3.5,W")

@@ -1,4 +1,4 @@
-"""What each role of one device takes."""
+"""Samples for each role of one device."""
 
 from __future__ import annotations
 

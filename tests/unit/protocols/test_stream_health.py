@@ -1,4 +1,4 @@
-"""What a stream tells of itself, at times that a test makes up."""
+"""Health of a stream, on made-up times."""
 
 from __future__ import annotations
 

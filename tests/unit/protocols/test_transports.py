@@ -32,7 +32,7 @@ COUNT = 400
 
 @dataclass(frozen=True)
 class Device:
-    """What a device sends as its n-th frame, and the value by which its sample is known again."""
+    """A device's n-th frame, and the value that identifies its sample."""
 
     kind: Kind
     name: str
@@ -41,7 +41,7 @@ class Device:
     bytes_after_end: int = 0
     crc: bool = False
     held: int = 0
-    """How many of the last frames wait for another one to follow."""
+    """Number of last frames that wait for the next one."""
 
 
 def ymr(n: int) -> bytes:

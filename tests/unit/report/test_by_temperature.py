@@ -51,7 +51,7 @@ class Drawn:
 
     @property
     def unit(self) -> float:
-        """What a tenth of a unit of the picture is worth, with the ticks' own tenths."""
+        """Value of a tenth of a unit of the picture, with the ticks' own tenths."""
         return 0.4 * abs(self._up[0])
 
     def paths(self, class_: str) -> list[list[tuple[float, float]]]:
@@ -67,7 +67,7 @@ class Drawn:
 
 
 def plots(imu: ByTemperature) -> Iterator[list[Drawn]]:
-    """Of each triad the three axes; the ticks of the temperature stand below the third."""
+    """Yield the three axes of each triad; the ticks of the temperature stand below the third."""
     root = ElementTree.fromstring(biases_by_temperature([imu]))  # noqa: S314 - our own
     for figure in root.iter("figure"):
         svgs = list(figure.iter("svg"))

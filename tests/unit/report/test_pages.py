@@ -1,4 +1,4 @@
-"""What stands on the pages, read by an independent parser."""
+"""Content of the pages, read by an independent parser."""
 
 from __future__ import annotations
 

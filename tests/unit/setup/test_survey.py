@@ -1,4 +1,4 @@
-"""What was heard where, and what that says of a configuration that is there already."""
+"""Result of listening, compared with an existing configuration."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_the_simulated_noise_is_what_it_is_called_by_an_independent_package() ->
 
 
 def test_a_stand_hides_nothing_from_the_estimator() -> None:
-    """Of a sensor without noise on its back, upside down, anywhere, the solution is the bias to rounding."""
+    """A sensor without noise on its back, upside down, anywhere: the solution is the bias to rounding."""
     for number, posture in enumerate(POSTURES):
         standing = stand("white_only", posture, sites()[number % 4], (6, number))
         taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=noise_profile("icm42688p"))

@@ -142,7 +142,7 @@ def test_changes_that_nobody_asked_for() -> None:
 
 
 def test_px4_says_by_its_flags_which_heading_it_uses() -> None:
-    """As `listener` prints them; without either heading nothing is said."""
+    """Flags as `listener` prints them; without either heading there is no event."""
 
     def printed(own_us: int, **flags: bool) -> str:
         lines = [f"    {name}: {on}" for name, on in flags.items()]

@@ -1,4 +1,4 @@
-"""Which offset a PX4 works with, whatever its parameters say (autopilots 4.1, 4.2, 9.2, 9.3.2)."""
+"""Offset in use in a PX4, against its parameters (autopilots 4.1, 4.2, 9.2, 9.3.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What PX4 writes by itself (autopilots 4.3, 9.2, 9.3.2)."""
+"""PX4's own writes (autopilots 4.3, 9.2, 9.3.2)."""
 
 from __future__ import annotations
 

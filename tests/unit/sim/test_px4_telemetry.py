@@ -1,4 +1,4 @@
-"""What the PX4 double sends, how often and to whom (autopilots 4.5, 5.1, 5.4, 9.2, 9.3.2)."""
+"""Streams of the PX4 double: content, rate and receivers (autopilots 4.5, 5.1, 5.4, 9.2, 9.3.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a swaying aircraft's telemetry is too large by, though it comes late."""
+"""Excess of a swaying aircraft's delayed telemetry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must survive a power cut: whole or not at all, whatever step fails."""
+"""Files after a power cut: whole or absent, whatever step fails."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.real_clock
 
 @pytest.fixture(autouse=True)
 def no_fault_in_it(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """Whatever visitors do, the server itself meets nothing that it did not expect."""
+    """The server logs no unexpected fault, whatever visitors do."""
     yield
     assert not [record for record in caplog.records if record.exc_info]
 
