@@ -41,8 +41,6 @@ nothing but "disarmed" (docs/security.md)."""
 
 @dataclasses.dataclass
 class Outcome:
-    """Outcome of a cell."""
-
     fault: str
     phase: Phase
     seed: int

@@ -17,12 +17,11 @@ class WallClock:
         self.shift_s = 0.0
 
     def set_to(self, unix_s: float) -> None:
-        """Set the clock."""
         self.shift_s = unix_s - _real_time()
 
     @contextlib.contextmanager
     def worn(self) -> Iterator[None]:
-        """Take the place of the real one."""
+        """Replace the real clock."""
         clock = self
 
         class Shifted(datetime.datetime):

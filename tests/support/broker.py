@@ -137,7 +137,6 @@ class Broker:
         return self._process.pid
 
     def kill(self) -> None:
-        """Kill as a power cut does."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -235,13 +234,11 @@ class Peer:
         return [heard.json for heard in self.heard if heard.topic == f"{base}/response/{command}"]
 
     def forget(self) -> None:
-        """Drop everything heard so far."""
         self.heard.clear()
 
 
 @contextlib.asynccontextmanager
 async def peer(one: Broker) -> AsyncIterator[Peer]:
-    """A connected peer."""
     client = aiomqtt.Client(
         "127.0.0.1",
         one.port,

@@ -39,8 +39,6 @@ def find() -> str | None:
 
 
 class Tab:
-    """One page of the browser."""
-
     def __init__(self, browser: Browser, session: str, target: str) -> None:
         self._browser, self._session, self._target = browser, session, target
 
@@ -116,8 +114,6 @@ _SEEN: Final = "document.querySelector('#head').innerText + ' | ' + document.que
 
 
 class Browser:
-    """One browser process."""
-
     def __init__(self, reader: asyncio.StreamReader, to_browser: int) -> None:
         self._reader, self._to_browser = reader, to_browser
         self._numbers = itertools.count(1)

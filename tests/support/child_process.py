@@ -19,17 +19,14 @@ class Work:
         self.manner, self.log = os.environ["COMPANION_TEST_CHILD"], Path(settings.config.storage.path, "log")
 
     def note(self, words: str) -> None:
-        """Add a line to the log."""
         with self.log.open("a", encoding="utf-8") as log:
             log.write(words + "\n")
 
     def hoard(self) -> None:
-        """Fill the memory."""
         hoard = bytearray(1_000_000_000)
         self.note(f"has {len(hoard)} bytes")
 
     async def run(self) -> None:
-        """Work until cancelled."""
         self.note(f"started {os.getpid()}")
         try:
             match self.manner:
@@ -52,7 +49,6 @@ class Work:
             raise
 
     def status(self) -> Object:
-        """Return a status."""
         return {"good": True, "summary": "works"}
 
 

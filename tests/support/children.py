@@ -39,11 +39,9 @@ class InProcess(Child):
             yield {"kind": "error", "reason": str(error)}
 
     def status(self) -> Object:
-        """Return the work's status."""
         return self.work.status()
 
     async def run(self) -> None:
-        """Work until cancelled."""
         await self.work.run()
 
 

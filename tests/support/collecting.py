@@ -41,7 +41,7 @@ class CollectorProcess:
             self._process = subprocess.Popen(command, stdout=log, stderr=log)
 
     async def at_work(self) -> None:
-        """Until it hears the aircraft."""
+        """Wait until it hears the aircraft."""
         async with asyncio.timeout(60.0):
             while " into " not in self.log.read_text():
                 assert self._process.poll() is None, self.log.read_text()
@@ -56,14 +56,13 @@ class CollectorProcess:
         self._process.wait()
 
     def stop(self) -> int:
-        """In order; its exit code."""
+        """Stop it in order; return its exit code."""
         self._process.send_signal(signal.SIGTERM)
         return self._process.wait(60.0)
 
 
 @contextlib.asynccontextmanager
 async def telling(fleet: Sequence[Aircraft], one: Broker) -> AsyncIterator[None]:
-    """Aircraft at the broker."""
     tasks = [asyncio.create_task(each.run("127.0.0.1", one.port)) for each in fleet]
     try:
         yield

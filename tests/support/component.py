@@ -85,7 +85,6 @@ class Ground:
         return [result for result in self.acks(command) if result != IN_PROGRESS]
 
     def texts(self) -> list[str]:
-        """Received texts, chunks joined."""
         found: list[str] = []
         for _, message in self.received:
             if isinstance(message, mavlink.MAVLink_statustext_message):

@@ -23,7 +23,6 @@ class Block(NamedTuple):
 
 
 def blocks(path: Path) -> list[Block]:
-    """All blocks of code, in order."""
     found: list[Block] = []
     language: str | None = None
     lines: list[str] = []

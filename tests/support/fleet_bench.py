@@ -31,8 +31,6 @@ _TICK_S: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 class Place(NamedTuple):
-    """Place where collectors work."""
-
     folder: Path
     one: Broker
     postgres: Postgres

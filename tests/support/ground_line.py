@@ -31,7 +31,6 @@ class Said(NamedTuple):
 
     @property
     def json(self) -> Any:
-        """The one JSON object on stdout."""
         return json.loads(self.out)
 
 
@@ -57,7 +56,6 @@ class GroundLine(NamedTuple):
 
 
 async def ground(*words: str) -> asyncio.subprocess.Process:
-    """Start `companion ground ...`."""
     return await asyncio.create_subprocess_exec(
         sys.executable, "-m", "companion", "ground", *words,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
@@ -73,7 +71,6 @@ async def _end(started: list[asyncio.subprocess.Process]) -> None:
 
 
 async def finish(process: asyncio.subprocess.Process, within_s: float = 150.0) -> Said:
-    """Wait for its end."""
     async with asyncio.timeout(within_s):
         out, err = await process.communicate()
     assert process.returncode is not None

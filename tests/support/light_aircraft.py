@@ -37,8 +37,6 @@ class Confirmed(NamedTuple):
 
 
 class Light(asyncio.Protocol):
-    """The connection of one aircraft."""
-
     def __init__(self, one: Aircraft, fleet: Fleet) -> None:
         self.one, self._fleet = one, fleet
         self._name = one.id.encode()
@@ -210,7 +208,6 @@ class Fleet:
             repeating.cancel()
 
     async def _repeat(self) -> None:
-        """Repeat unconfirmed items."""
         while True:
             await asyncio.sleep(1.0)
             before_s = time.monotonic() - AGAIN_S

@@ -37,12 +37,11 @@ class NotifySocket:
         self._socket.close()
 
     def environment(self, watchdog_s: float | None = None) -> dict[str, str]:
-        """The variables of a service."""
         watchdog = {} if watchdog_s is None else {"WATCHDOG_USEC": str(round(watchdog_s * 1e6))}
         return {"NOTIFY_SOCKET": self.address, **watchdog}
 
     def times(self, key: str, value: str = "1") -> list[float]:
-        """When an assignment came."""
+        """Times of an assignment."""
         return [t_s for t_s, message in self.messages if message.get(key) == value]
 
     @property

@@ -53,7 +53,7 @@ class Postgres:
         subprocess.run(command, check=True, capture_output=True, user=_USER, cwd=folder)
 
     def start(self) -> None:
-        """Until it answers."""
+        """Start and wait until it answers."""
         settings = {"port": f"{self.port}", "listen_addresses": "127.0.0.1", "unix_socket_directories": ""}
         settings |= self._settings
         options = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
@@ -85,7 +85,7 @@ class Postgres:
         return f"postgresql://fleet@127.0.0.1:{self.port}/{name}"
 
     def create(self, name: str) -> str:
-        """The address of a new database."""
+        """Create a database; return its address."""
         with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
             connection.execute(f'CREATE DATABASE "{name}"'.encode())
         return self.url(name)
@@ -108,7 +108,6 @@ class Postgres:
 
 @contextlib.contextmanager
 def postgres() -> Iterator[Postgres]:
-    """A running server."""
     with tempfile.TemporaryDirectory(prefix="companion-pg-") as folder:
         one = Postgres(Path(folder))
         try:

@@ -98,7 +98,6 @@ class PX4Stage:
         return [(e.param_id, e.error) for e in self.companion.all(mavlink.MAVLink_param_error_message)]
 
     def acks(self, command: int, station: Station | None = None) -> list[int]:
-        """Results of COMMAND_ACKs."""
         found = (station or self.companion).all(mavlink.MAVLink_command_ack_message)
         return [ack.result for ack in found if ack.command == command]
 

@@ -51,7 +51,6 @@ class Wire:
         other.attach(_Way(self, one))
 
     def unplug(self) -> None:
-        """Take both ends off the wire."""
         for end in self._ends:
             end.attach(None)
 

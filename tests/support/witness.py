@@ -32,5 +32,4 @@ class Witness:
         return [message for t_s, message in self.heard if isinstance(message, kind) and t_s > since_s]
 
     def times(self, kind: type[mavlink.MAVLink_message], since_s: float = 0.0) -> list[float]:
-        """When they came."""
         return [t_s for t_s, message in self.heard if isinstance(message, kind) and t_s > since_s]
