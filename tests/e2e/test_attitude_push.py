@@ -124,6 +124,14 @@ async def test_nothing_is_pushed_before_a_calibration_or_without_a_compass(tmp_p
         assert not flying.witness.of(Vision)
 
 
+async def test_the_push_stays_ended_while_the_daemon_finishes_a_write(tmp_path: Path) -> None:
+    async with flight(tmp_path) as flying:
+        flying.attitude.close()
+        sent = len(flying.witness.of(Vision))
+        await flying.sleep(12.0)
+        assert len(flying.witness.of(Vision)) == sent
+
+
 async def test_a_silent_imu_stops_the_push_at_once_and_says_so(tmp_path: Path) -> None:
     """In flight a second of silence is the end until the next landing; a short one is bridged."""
 

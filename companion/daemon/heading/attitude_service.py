@@ -175,6 +175,7 @@ class AttitudeService:
         self._warned: str | None = None
         self._runs = core.only_listening is None
         self._started_s = math.inf
+        self._closed = False
         if self._autopilot_imu is not None:
             take = self._guarded(self._on_imu)
             self._autopilot_imu.on_counting.add(lambda sample: take((sample,), sample.t_s))
@@ -240,7 +241,8 @@ class AttitudeService:
             while True:
                 self.turns += 1
                 try:
-                    await self._turn(loop.time())
+                    if not self._closed:  # else a write that takes its time would let the push begin again
+                        await self._turn(loop.time())
                 except Exception:
                     # A doubtful attitude must not be pushed to an EKF in flight.
                     logger.exception("attitude met a fault of the program")
@@ -265,6 +267,7 @@ class AttitudeService:
         self._tell(now_s)
 
     def close(self) -> None:
+        self._closed = True
         self.health.stop("the companion ends")
         self.fallback.close(asyncio.get_running_loop().time())
 
