@@ -25,12 +25,11 @@ GoOn = Callable[[str], None]
 """Called now and then with words for progress; raises `JobCancelledError`."""
 
 
-class JobCancelledError(Exception): ...
+class JobCancelledError(Exception):
+    """Raised inside a job at the next safe point after somebody cancelled it."""
 
 
 class Job:
-    """Raised inside a job at the next safe point after somebody cancelled it."""
-
     """One request, as its requesters see it; `finished` is done exactly once."""
 
     def __init__(

@@ -43,12 +43,11 @@ Row = dict[str, Any]
 Rows = dict[str, list[Row]]
 
 
-class NotTakenError(Exception): ...
+class NotTakenError(Exception):
+    """A payload breaks the contract; the message is one line with the reason."""
 
 
 class Hello(msgspec.Struct, frozen=True):
-    """A payload breaks the contract; the message is one line with the reason."""
-
     """Range of the items that an aircraft keeps."""
 
     format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]

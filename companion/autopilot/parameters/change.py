@@ -61,16 +61,15 @@ class Parameters(abc.ABC):
     async def read(self, name: str) -> float: ...
 
     @abc.abstractmethod
-    async def read_optional(self, name: str) -> float | None: ...
+    async def read_optional(self, name: str) -> float | None:
+        """Read one parameter; None: the autopilot does not have it."""
 
     @abc.abstractmethod
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]: ...
 
     @abc.abstractmethod
     async def ensure_same_boot(self, boots: int, words: str) -> None:
-        """None: not known yet."""
-        """Read one; None: there is no such parameter."""
-        """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
+        """Ask for the time since boot; raise AutopilotRebootedError with `words` if `boots` has changed."""
 
     async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
         """Read three numbers within limits, such as `SCALES`; raise AutopilotError where one is outside."""

@@ -128,11 +128,11 @@ class PoseTask(abc.ABC):
     """Figure that is still unknown after the last pose; then nothing is written or kept."""
 
     @abc.abstractmethod
-    def wish(self, state: SessionState) -> Wish | None: ...
+    def wish(self, state: SessionState) -> Wish | None:
+        """Return the pose wanted next; None: there are enough."""
 
     @abc.abstractmethod
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
-        """Return the pose wanted next; None: there are enough."""
         """Return the pose of a new window, and why it is not the one asked for, if so."""
 
     @abc.abstractmethod

@@ -34,9 +34,9 @@ class Bench:
         self.resets: list[str] = []
         self.said: list[tuple[Severity, str]] = []
         self.offset: Vector | None = (0.0, 0.0, 0.0)
+        """Offset that the autopilot subtracts from its accelerometer; None: unknown, its samples do not come."""
         self.turned = np.eye(3)
         """Sensor axes to vehicle axes, by the autopilot's configured mounting."""
-        """Offset that the autopilot subtracts from its accelerometer; None: unknown, its samples do not come."""
         collector, sensor = self.one.collector, self.one.sensor
         self.one.watch = SensorWatch(
             [sensor], collector, self.offsets_of,
