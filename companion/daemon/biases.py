@@ -174,6 +174,7 @@ class BiasMemory:
         )
 
     def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float) -> prior.ExpectedImu:
+        """Predict the biases of one IMU for this window from its history and its curve."""
         name = imu.name
         record = self._alignment.record if self._alignment.unused is None else None
         aligned = () if record is None else record.imus

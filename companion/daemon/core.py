@@ -97,7 +97,7 @@ class Core:
     def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
         self.config, self.offload = config, offload
         self.only_listening = only_listening
-        """Reason to start nothing although requests arrive: a check listens and must change nothing."""
+        """Reason given for refusing every job in check mode, which must change nothing; None in normal operation."""
         system_id = config.vehicle.system_id
         self.link = link or MavlinkLink(system_id=system_id or 1, component_id=config.mavlink.component_id)
         self.vehicle = Vehicle(self.link, system_id=system_id, is_carried=self._is_carried)
@@ -148,7 +148,7 @@ class Core:
 
 
 class Subsystem:
-    """A part of the daemon, for the service."""
+    """Base class of a part of the daemon: its state, status, commands and tasks for the service."""
 
     def load(self) -> None:
         """Load stored data before anything runs; blocking."""

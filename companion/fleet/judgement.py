@@ -53,7 +53,7 @@ _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
 _TOGETHER_WITHIN_POWER_UPS: Final = 10
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
-"""Least sizes of findings, by kind, for the word "replace"."""
+"""Size of a finding, by kind, from which the advice is `replace` instead of `watch`."""
 
 
 class PartHistory(NamedTuple):

@@ -24,7 +24,7 @@ from companion.physics.statistics import MAD_TO_SIGMA
 LEAST_POWER_UPS: Final = 8
 LEAST_PARTS: Final = 4
 WANDER_LAG: Final = 30
-"""Power-ups between the two levels that tell the wander."""
+"""Lag, in power-ups, between two biases whose difference gives the random walk from power-up to power-up."""
 _POWER_UPS_PER_TEMPERATURE_TERM: Final = 24
 _OUTLIER_SIGMAS: Final = 3.0
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))

@@ -109,7 +109,7 @@ class MqttProcess:
             await self._publish_as(Topics(self._base()))
 
     async def _publish_as(self, topics: Topics) -> None:
-        """Serve under a base topic until the vehicle has another one."""
+        """Publish, and handle requests, under one base topic until the vehicle's base topic changes."""
 
         def respond(command: str, response: Object) -> None:
             droppable = response["state"] == "refused" or "repeated" in response

@@ -103,7 +103,7 @@ class RecordingFile:
         return 0 if self._file is None else int(self._file.tell())
 
     def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
-        """Add messages, finish the chunk and sync it; the beginning comes before the first."""
+        """Append messages, finish the chunk and sync it to disk. The first call writes `beginning` first."""
         if self._file is None:
             return
         try:

@@ -46,7 +46,7 @@ class Question:
 
 
 class Draft:
-    """A configuration file and its wanted content; a new one is the sample, whose values nobody has chosen."""
+    """Text of a configuration file under edit, and the values to save; a new text is the sample, with defaults only."""
 
     def __init__(self, text: str, *, is_new: bool) -> None:
         self.text, self.is_new = text, is_new

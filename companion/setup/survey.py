@@ -72,7 +72,7 @@ async def listen_udp(port: int) -> HeardUdp:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Everything heard on every port."""
+    """Result of the set-up scan: devices heard on each serial and UDP port, or why it was not scanned."""
 
     serial: dict[str, Heard | str]
     udp: dict[int, HeardUdp | str]

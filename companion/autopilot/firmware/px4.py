@@ -61,7 +61,7 @@ _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
 _MAYBE_INTERNAL_BUSES: Final = (1, 2)  # I2C and SPI: a fact of the board, which PX4 keeps in CAL_*_ROT
 _PX4_ONLY_DEG: Final = {38: (90.0, 68.0, 293.0)}
-"""Number 38: both firmwares' drivers know better angles, but PX4 turns calibrated data by these."""
+"""Rotation 38: roll, pitch, yaw in degrees that PX4 applies to calibrated data. Drivers use more exact angles."""
 
 _EV_YAW: Final = 1 << 3  # of EKF2_EV_CTRL
 _MAGNETOMETER: Final = 1 << 10  # of EKF2_SENS_EN

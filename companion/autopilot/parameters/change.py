@@ -178,12 +178,12 @@ class PendingChange:
     """One parameter of a write, and its state."""
 
     change: Change
-    sent: bool = False
+    sent: bool = False  # a PARAM_SET left: the autopilot may have the new value
     confirmed: bool = False  # it answered with a value of ours: another one found later is somebody else's
     is_far: bool = False
     read_back: float | None = None
     outcome: Outcome = "failed"
-    left: bool = False
+    left: bool = False  # the old value is not known to be restored
 
 
 PendingVector = tuple[PendingChange, list[PendingChange]]  # the axis with a far value, and the others

@@ -76,7 +76,7 @@ def attitude_messages(
 
 
 class TimesyncResponder:
-    """Answers the latched autopilot, with the clock that stamps what we send."""
+    """Answers TIMESYNC requests of the latched autopilot, with the clock that stamps our messages."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0

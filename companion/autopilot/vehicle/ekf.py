@@ -144,7 +144,7 @@ _MAGNETOMETER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
 
 
 class OwnCompass:
-    """Health of the magnetometer and its agreement with the yaw; `wanted`: request the messages all the time."""
+    """Health of the autopilot's own magnetometer, and its agreement with the estimator's yaw."""
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._has_compass_s = self._agrees_s = -math.inf

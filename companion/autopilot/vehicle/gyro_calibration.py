@@ -51,7 +51,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
 
 
 async def read_active_tcal(parameters: ParameterClient, values: Mapping[str, float]) -> list[str]:
-    """Read which temperature calibrations are on: there the gyro calibration changes what an offset means."""
+    """Return the names of the active temperature calibrations; with one on, gyro calibration changes its meaning."""
     switches = [names.tcal_enable for names in _present(values)]
     return [name for name, value in (await parameters.read_many(switches, optional=True)).items() if value]
 

@@ -73,7 +73,8 @@ class ParameterWriter:
         self._vehicle = vehicle
         self._lock = asyncio.Lock()
         self._boots = 0
-        self._give_up_s = self._deadline_s = 0.0
+        self._give_up_s = 0.0  # until then wait for a known arm state
+        self._deadline_s = 0.0  # of a restore
 
     async def apply(self, changes: Sequence[Change], probe: FarProbe | None = None) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
@@ -190,6 +191,7 @@ class ParameterWriter:
             raise _Failure("not as believed", "; ".join(wrong))
 
     async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
+        """Write the far value and wait until it is in use; return why it is not, if so."""
         verify = None if probe is None else probe(item.change.parameter)
         await self._write(item, item.change.far)
         item.is_far = True
@@ -245,6 +247,7 @@ class ParameterWriter:
     # --- back
 
     async def _fail(self, items: list[PendingChange], failure: _Failure | AutopilotError) -> None:
+        """Find out what happened to the autopilot, restore the old values, and raise WriteFailedError."""
         reason = str(failure)
         kind = failure.kind if isinstance(failure, _Failure) else kind_of(failure, self._vehicle, self._boots)
         if not self._vehicle.alive and any(item.sent for item in items):
@@ -263,6 +266,7 @@ class ParameterWriter:
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
     async def _put_back(self, items: list[PendingChange], *, leave_foreign: bool) -> None:
+        """Restore old values in reverse order, a vector with a far value by way of it, until the deadline."""
         touched = [item for item in reversed(items) if item.sent]
         for item in touched:
             item.outcome, item.left, item.read_back = "failed", True, None  # until known better

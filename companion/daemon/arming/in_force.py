@@ -55,6 +55,8 @@ SETTLED_EVERY_S: Final = 5  # Interval of checks of the output without a finding
 
 @dataclasses.dataclass(slots=True)
 class _TriadState:
+    """Gyros or accelerometers of one IMU: `held` is the active calibration, or why there is none."""
+
     held: Held | Why = Why.NEVER
     shelved: Held | None = None
     """State before a restart that kept the offsets; restored once a window agrees."""
@@ -230,6 +232,7 @@ class ActiveCalibration:
             state.present = None
 
     async def measure(self, now_s: float) -> bool:
+        """Check the present output when due; return whether it was."""
         second = math.floor(now_s)  # the collector's seconds end with the clock's
         settled = self.measured and self._worth_since_s is None and not self.findings(now_s)
         if second == self._looked_s or (settled and second - self._looked_s < SETTLED_EVERY_S):

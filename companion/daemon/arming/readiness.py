@@ -208,6 +208,7 @@ class Readiness:
         return state, "; ".join(filter(None, (words, held_back, "calibrate to write it")))
 
     def _state(self, now_s: float) -> tuple[ArmedState, str]:
+        """Judge the offsets alone, without the gate's other reasons (still, connected, ...)."""
         in_force = self.in_force
         if against := next((one.against for one in self._reasons(now_s) if one.against), None):
             return "uncalibrated", against

@@ -205,6 +205,7 @@ class CalibrationRun(Job):
             core.say(Severity.WARNING, f"Held back: {kept}; calibrate on request to write it all the same")
 
     async def _make_plan(self) -> None:
+        """Compute new offsets of every IMU that the autopilot uses, and the rivals to switch off."""
         assert self.solution is not None
         core, rivalry, slots = self._core, self._offsets.rivalry, self._offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}

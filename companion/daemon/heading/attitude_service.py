@@ -188,7 +188,7 @@ class AttitudeService:
     # --- what arrives
 
     def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
-        """Contain a fault: it must cost neither the calibration its samples nor the autopilot a true heading."""
+        """Wrap a sample callback: after an exception stop the push, forget the estimate, and let calibration go on."""
 
         def guarded(samples: Sequence[Sample], read_s: float) -> None:
             try:

@@ -100,7 +100,7 @@ class StandingAttitude:
     t_s: float
     body_from_ned: Matrix
     covariance: Matrix
-    """(3, 3) in NED, rad^2."""
+    """Covariance of the attitude error, (3, 3), NED, rad^2."""
     heading_known: bool
     local: LocalEarth
 

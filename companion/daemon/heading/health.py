@@ -57,7 +57,7 @@ FADES_S: Final = 4.0
 """Time in which the sum fades: a drift of 1.25 deg/s goes unnoticed, and the compass corrects it."""
 STRAYS_SIGMAS: Final = 3.0  # Allowed turn in sigmas of the heading: the compass may correct a poorly known one
 SCALES: Final = 0.01
-"""Share of a turn by which two gyros may differ."""
+"""Tolerated difference between the scale factors of two gyros, as a fraction of the angle turned."""
 LATE_S: Final = 0.03  # Usual difference of the two times
 LONGEST_STEP_S: Final = 0.25
 """Longest step that is compared: it hides a turn to and fro."""
@@ -105,7 +105,7 @@ class Difference:
         self._carrier = carrier
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
-        """Possible error of the times, as no message had the shortest delay."""
+        """Growth of the clock offset since the last message with the shortest delay, s; bounds the timing error."""
         self.theirs: tuple[float, Quaternion] | None = None
         """The autopilot's last attitude: time on our clock, and body to NED."""
         self.latest: tuple[float, float] | None = None

@@ -40,7 +40,7 @@ LOOK_LONGER_S: Final = 30.0
 TELEMETRY_S: Final = 2.0
 """Time after a write in which the telemetry may seem to be missing."""
 TELEMETRY: Final = "waiting for the telemetry"
-"""Progress shown until then: the step of the new offsets itself looks like a movement."""
+"""Progress text until the write has settled and `TELEMETRY_S` has passed: the offset step looks like movement."""
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[EffectVerdict]]  # Verdicts by IMU

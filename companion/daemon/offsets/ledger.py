@@ -116,6 +116,7 @@ class Ledger:
             self._leave_to_recovery()
 
     def _leave_to_recovery(self) -> None:
+        """Keep the journal open: `Recovery` restores its values once the autopilot is disarmed."""
         if self._open is not None:
             self._orphaned.set()
 

@@ -156,6 +156,7 @@ class Px4Writes:
     # --- the probe
 
     def watch(self, parameter: str) -> Callable[[], Awaitable[str | None]]:
+        """Keep the means until now, as a `FarProbe`."""
         step = self._steps.get(parameter)
         if step is not None:
             now_s = asyncio.get_running_loop().time()

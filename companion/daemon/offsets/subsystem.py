@@ -143,6 +143,7 @@ class Offsets(Subsystem):
                 raise AutopilotError(await self._roll_back(made, imus, str(error), note)) from error
 
     async def _roll_back(self, made: Sequence[Change], imus: Collection[AutopilotImu], reason: str, note: Note) -> str:
+        """Restore the old values; return the reason and the outcome."""
         left: Sequence[str] = ()
         end = "will be once disarmed"
         with contextlib.suppress(NotDisarmedError):

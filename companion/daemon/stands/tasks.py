@@ -82,7 +82,10 @@ class SpotTask(PoseTask):
         )
 
     def _make_stands(self, state: SessionState, names: Sequence[str], north_deg: float = 0.0) -> None:
-        """Make the stands of these IMUs; `north_deg` is the poses' north from the true one."""
+        """Build the stands of the named IMUs.
+
+        `north_deg`: from the poses' north to true north, added to each heading.
+        """
         stands = []
         for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
             imus, tilt = {imu.name: imu for imu in window.imus}, window.tilt

@@ -75,7 +75,7 @@ class RollingCollector:
         self._now_s = -math.inf
         self._restarts = 0
         self.on_second: list[Callable[[], object]] = []
-        """Called when every source has closed a second, from within the call that closed it: only take note."""
+        """Callbacks for every second closed by all sources; they run inside that call, so they only take note."""
         for imu in imus:
             self.set_imu(imu)
 

@@ -44,8 +44,10 @@ LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
 _KEPT_SHOWN: Final = 4  # Seconds that wait for the gradienter's readings
 _FALLS: Final = 2.5
-"""Power of the time with which the white part of a variance falls: a slope's through waves falls with the third, a
-sensor's own white noise with the first."""
+"""Assumed exponent of the white part's decay with the length of a window, to predict the length that suffices.
+
+A compromise: 3 for a slope through waves, 1 for a sensor's white noise.
+"""
 _IN_MINUTES_S: Final = 90.0
 
 

@@ -51,7 +51,7 @@ _GRAVITY_M_S2: Final = 9.8
 
 
 TriadVariances = tuple[float, float]
-"""Largest variance of the axes of a triad, and the part of it that more seconds take away."""
+"""Largest variance among the axes of a triad, and its white part, which longer averaging reduces."""
 
 
 DeckFound = tuple[Window, Sequence[TriadVariances]]

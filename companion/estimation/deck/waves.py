@@ -121,7 +121,7 @@ class Level(msgspec.Struct, frozen=True):
 
 
 class Fluid:
-    """The gradienter's reading of one IMU's specific force."""
+    """Model of the gradienter's lag: the reading that it would show for the specific force at one IMU."""
 
     def __init__(self, model: GradienterModel) -> None:
         self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
@@ -129,7 +129,7 @@ class Fluid:
         self._shown = (0.0, 0.0)
 
     def follow(self, times_s: Floats, forces_m_s2: Floats) -> Floats:
-        """Return readings (n, 2) after the lag, for forces (n, 3) in the vehicle's axes; exact for an even change."""
+        """Return lagged readings (n, 2) for specific forces (n, 3), vehicle FRD; exact if these change linearly."""
         felt = readings_from_up(self._law, forces_m_s2 @ self._turn)
         if self.lag_s <= 0.0:
             return felt

@@ -98,7 +98,7 @@ class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean on the circle of the compass' heading in [0, 360); sigma is statistical."""
+    """Circular mean of the compass heading over a window, degrees in [0, 360); `sigma_deg` is statistical only."""
 
     heading_deg: float
     sigma_deg: float

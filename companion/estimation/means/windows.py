@@ -66,7 +66,7 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def steps(self) -> Floats | None:
-        """Steps (6,) of a stream of integers, whose seconds keep their counts; None for floats."""
+        """Quantisation step per axis, (6,), of an integer stream; None for floats."""
         return np.repeat([self.gyro_step_rad_s, self.accel_step_m_s2], 3) if self.gyro_step_rad_s else None
 
 

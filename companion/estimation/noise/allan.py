@@ -103,7 +103,7 @@ def phi(ratio: Floats | float) -> Floats:
 def floor_variance(
     flicker: Floats | float, walk: Floats | float, mean_s: Floats | float, horizon_s: Floats | float
 ) -> Floats:
-    """Return V(T, H) without its white part, which alone averaging reduces."""
+    """Return V(T, H) without its white noise, the only term that averaging reduces."""
     mean_s = np.asarray(mean_s, dtype=np.float64)
     return np.asarray(
         np.square(flicker) / math.pi * phi(horizon_s / mean_s) + np.square(walk) * (mean_s + horizon_s) / 3.0

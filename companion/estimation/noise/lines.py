@@ -178,7 +178,7 @@ def slope_limit(count: int) -> float:
 
 
 class Slope(msgspec.Struct, frozen=True):
-    """Lines through (m, c) values; each (c,)."""
+    """Straight lines fitted to c columns of m values: slope, variance, white noise about the line; each (c,)."""
 
     per_s: Floats
     variance: Floats

@@ -61,7 +61,7 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     heading_bound_deg: float | None
-    """Exceeded by the heading's error in one case of twenty; None: no field, or no place; 180: the field shows none."""
+    """95 % bound of the heading error, degrees; None: field or position unknown; 180: the field gives no heading."""
     heading_from: Literal["device", "field"]
     field_gauss: float | None
     field_expected_gauss: float | None  # Field and inclination of the Earth by WMM2025

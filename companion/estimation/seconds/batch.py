@@ -238,7 +238,7 @@ class BatchSource:
         self.restarts = 0  # Number of times that the clock went back and everything was dropped
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
-        """Filter of a second's temperature."""
+        """Plausibility check of a second's temperature: takes slot and degC, returns the temperature, or None."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
         """Called with every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()

@@ -56,7 +56,7 @@ _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """Prior sigma of each coefficient, in kelvins of the slope of parts."""
 _SLOWED_K_S: Final = 0.25 / 60.0  # Least slowing of a warm-up that tells where it ends
 _TAU_SIGMA: Final = 0.05
-"""Least sigma of tau as a share of it: boards have more than one time constant."""
+"""Lower bound of the relative sigma of tau: one time constant does not fully describe a board."""
 _WARM_AFTER: Final = 5.0  # Time constants after which a board is warm
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0

@@ -141,6 +141,7 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> Imu
 def _witnesses(
     imus: Sequence[ImuSolution], shared: Shared, expected: Sequence[ExpectedImu], *, today: bool
 ) -> list[Witness]:
+    """Pair each prediction with its measurement."""
     found = []
     for triad, (k, imu) in itertools.product(TRIADS, enumerate(imus)):
         known = (expected[k].today if today else expected[k].earlier).get(triad)
@@ -158,6 +159,7 @@ def _witnesses(
 
 
 def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: bool) -> Solution:
+    """Combine measurements and predictions by the equations at the top; also return the shift of all biases, (6 n,)."""
     shared, count = solution.shared, len(solution.imus)
     if not used:
         return solution

@@ -293,6 +293,7 @@ def _estimate(
     tipped: Array,
     powered_s: float,
 ) -> ImuSolution:
+    """Subtract the Earth's rate and gravity from the means of one IMU; covariances of the sensor, and in common."""
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
         gyro = np.array(imu.gyro_rad_s) - _earth_seen(imu, truth, local) - tipped
@@ -322,6 +323,7 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
+    """Return the Earth's rate in the gyro means: all of it, or the part left by the turning."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)

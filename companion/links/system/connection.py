@@ -154,7 +154,7 @@ class Budget:
         return min(self._left + gained, self._burst_bytes)
 
     def spend(self, count: int, now_s: float) -> bool:
-        """Remove `count`; False where the bucket held less: it is empty then."""
+        """Withdraw `count`; if the bucket holds less, empty it and return False."""
         self._left, self._t_s = self.left(now_s) - count, now_s
         if self._left >= 0.0:
             return True

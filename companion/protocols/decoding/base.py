@@ -179,7 +179,7 @@ GYRO_LIMIT_RAD_S = 100.0  # 5730 deg/s; the widest ranges sold are 4000 deg/s
 ACCEL_LIMIT_M_S2 = 2000.0  # 204 g; the widest range of a part with a gyro in it is 200 g
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Limit for an IMU, in kelvin or tenths too: `estimation/seconds/thermometer.py` names what cannot be degC."""
+"""Limit for an IMU, in kelvin or tenths too: `estimation/collector/intake.py:Thermometer` names what cannot be degC."""
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:

@@ -26,7 +26,7 @@ class Dialogue(ABC):
 
     @abstractmethod
     def heard(self, data: bytes, samples: int, t_s: float) -> None:
-        """Note bytes and the number of samples that they completed; called after decoding."""
+        """Record received bytes and the number of samples decoded from them; call after decoding."""
 
     @abstractmethod
     def due(self, t_s: float) -> bytes:

@@ -50,7 +50,7 @@ _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -> tuple[struct.Struct, dict[str, int]]:
-    """Return the values of a normal mode datagram without its CRC, and the places of its parts among them."""
+    """Return the struct format of a STIM300 datagram without its CRC, and the index of each block in its values."""
     code, count = ">x" + _VECTOR, 7
     places: dict[str, int] = {}
     for name, present in (("accel", accel), ("inclination", inclination)):
