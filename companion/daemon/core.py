@@ -65,10 +65,12 @@ class RepeatedRead:
         self._vehicle, self._read, self._retry_s = vehicle, read, retry_s
         self._due = asyncio.Event()
         self._due.set()
+        self._pause_s = 0.0
         vehicle.on_event.add(self._on_event)
 
-    def again(self) -> None:
-        """Read once more, as something has changed."""
+    def again(self, pause_s: float = 0.0) -> None:
+        """Read once more, as something has changed; `pause_s`: least time until the read after it."""
+        self._pause_s = max(self._pause_s, pause_s)
         self._due.set()
 
     async def run(self) -> None:
@@ -84,7 +86,8 @@ class RepeatedRead:
                 self._due.set()
                 await asyncio.sleep(self._retry_s)
             else:
-                await asyncio.sleep(REREAD_EVERY_S)
+                pause_s, self._pause_s = self._pause_s, 0.0
+                await asyncio.sleep(pause_s)
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("found", "rebooted"):

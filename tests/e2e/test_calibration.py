@@ -93,7 +93,8 @@ async def test_after_a_minute_of_rest_the_result_is_there_at_once_and_nothing_is
         await asyncio.sleep(60.0)
         result, record = await calibrated(rig)
         assert result.outcome == "done"
-        assert record.duration_s < 1.0
+        # Nothing is measured any more: 17 parameters are read, and an ArduPilot takes up to 95 ms for each.
+        assert record.duration_s < 17 * 0.1
         assert record.imus[0].samples > 2000
         assert record.imus[0].written == {}
         assert rig.double.writes == []

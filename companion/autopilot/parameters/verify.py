@@ -104,8 +104,9 @@ def judge(seen: Observation) -> EffectVerdict:
     allowed = seen.tolerance + SIGMAS * np.asarray(seen.after_sigma) + seen.resolution
     for axis, value, limit in zip("xyz", residual, allowed, strict=True):
         if not abs(value) <= limit:  # NaN is outside too
-            words = f"is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g}"
-            problems.append(f"after the write {axis} {words} ({family})")
+            problems.append(
+                f"after the write {axis} is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g} ({family})"
+            )
     hidden = [name for name, step in zip(axes, expected, strict=True) if axes[name] == "too small to see" and step]
     return EffectVerdict(
         axes=axes,

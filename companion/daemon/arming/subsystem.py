@@ -17,7 +17,7 @@ from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core, Handler, RepeatedRead, Subsystem, Task
+from companion.daemon.core import REREAD_EVERY_S, Core, Handler, RepeatedRead, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import StorageError
@@ -112,7 +112,7 @@ class GateSetup:
 
     def _on_parameter(self, name: str, _value: float) -> None:
         if self.known and name in self._vehicle.kind.gate_parameters:
-            self.reading.again()
+            self.reading.again(REREAD_EVERY_S)
 
 
 class Arming(Subsystem):

@@ -22,7 +22,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.component.service import JobResult
 from companion.config.sections import Imu
 from companion.configured import models
-from companion.daemon.core import Core, RepeatedRead
+from companion.daemon.core import REREAD_EVERY_S, Core, RepeatedRead
 from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError
 from companion.estimation.records.validity import Why
@@ -197,7 +197,7 @@ class AutopilotImu:
             watched = {rival.parameter for rival in self._vehicle.kind.rivals}
             if name not in watched or active.get(name, 0) == value:
                 return  # else what is in force is the same, but not what will become of it
-        self.reading.again()
+        self.reading.again(REREAD_EVERY_S)
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
