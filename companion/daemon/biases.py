@@ -38,21 +38,16 @@ from companion.storage.records import BiasStore, KnownImu, this_boot
 
 logger = logging.getLogger(__name__)
 
-LOOK_K: Final = 1.0
-"""Temperatures nearer than this count as equal."""
-WRITE_EVERY_S: Final = 60.0
-"""Least time between writes of still windows to the disk."""
+LOOK_K: Final = 1.0  # temperatures nearer than this count as equal
+WRITE_EVERY_S: Final = 60.0  # least time between writes of still windows to the disk
 _MUCH_BETTER: Final = 0.7
 """Share of its sigma below which a still window replaces another one of the same temperature."""
-
-
-_IN_WORDS: Final = {
+_IN_WORDS: Final = {  # of the keys of an identity
     "system": "vehicle",
     "gyro": "gyro (device id)",
     "accel": "accelerometer (device id)",
     "scale": "accelerometer scale",
 }
-"""Words for keys of the identity, where the key is not plain."""
 
 
 class BiasMemory:
@@ -65,8 +60,7 @@ class BiasMemory:
         self._sources = {imu.name: imu for imu in core.config.imu}
         self._host = this_boot() or os.urandom(8).hex()
         self._curves: dict[tuple[str, Triad], Curve | None] = {}
-        self._settling: dict[str, tuple[float, float] | None] = {}
-        """Time constant of the warm-up of each IMU's board and one sigma, s."""
+        self._settling: dict[str, tuple[float, float] | None] = {}  # warm-up of each board, and one sigma, s
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
@@ -75,7 +69,6 @@ class BiasMemory:
         self._written_s = -math.inf
 
     def load(self) -> None:
-        """Load the stored biases; blocking."""
         self._known = self._store.read()
         self.follow()
 
