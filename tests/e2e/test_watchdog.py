@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from pathlib import Path
 
 from companion.component.service import Refusal
@@ -29,8 +30,9 @@ def test_nobody_is_accused_who_works(tmp_path: Path) -> None:
             looking = asyncio.create_task(look())
             await asyncio.sleep(20.0)
             for _ in range(2):
-                job = running.service.calibrating.manager.start_calibration(What.BOTH, "test")
-                assert not isinstance(job, Refusal)
+                start = functools.partial(running.service.calibrating.manager.start_calibration, What.BOTH, "test")
+                while isinstance(job := start(), Refusal):  # of three heartbeats in a row all may be lost
+                    await asyncio.sleep(1.0)
                 await job.finished
                 rig.wire.cut = True
                 await asyncio.sleep(40.0)

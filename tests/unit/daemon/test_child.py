@@ -88,8 +88,8 @@ def test_a_child_that_fails_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, manner: str, reason: str
 ) -> None:
     monkeypatch.setenv("COMPANION_TEST_CHILD", manner)
-    monkeypatch.setattr(daemon_side, "SILENT_S", 1.0)
-    monkeypatch.setattr(daemon_side, "FIRST_REPORT_S", 1.0 if manner == "hang" else 60.0)
+    for limit in ("SILENT_S", "FIRST_REPORT_S"):
+        monkeypatch.setattr(daemon_side, limit, 1.0 if manner == "hang" else 60.0)
     reasons: set[str] = set()
 
     def started_again(child: Child) -> bool:
