@@ -119,8 +119,6 @@ def pytest_collection_finish() -> None:
 
 
 class _Running:
-    """The test that runs now."""
-
     on_virtual_time = False
 
 
@@ -131,7 +129,8 @@ def _refuse_process(event: str, _arguments: object) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    sys.addaudithook(_refuse_process)
+    if config.getoption("quick"):  # in all tests it costs 7 % of the time
+        sys.addaudithook(_refuse_process)
     if not hasattr(config, "workerinput"):
         config.stash[OUTSIDE] = Outside()
 

@@ -14,6 +14,7 @@ from companion.estimation.means.windows import ImuInput, estimate
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.lab.profile import Rest, fit_profile, rests, seconds_at_rest, seconds_of
+from tests.support.extent import extent
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
 from tests.support.recordings import Recording, px4, shared, xio, xsens_counts
 
@@ -209,18 +210,21 @@ def made_session(
     return (np.arange(seconds), means), batches
 
 
+WANDERS = {
+    "bounded in 30 s": ((0.34, 0.03, 0.0), (0.3, 30.0), 0),  # near the limit: it takes every window to tell
+    "bounded in 100 s": ((0.34, 0.03, 0.0), (0.5, 100.0), 120),
+    "little white noise": ((0.05, 0.01, 0.0), (0.5, 100.0), 120),
+    "flicker and 300 s": ((0.34, 0.1, 0.0), (0.5, 300.0), 120),
+    "a walk": ((0.34, 0.1, 0.02), (0.0, 1.0), 120),
+    "flicker": ((0.34, 0.2, 0.0), (0.0, 1.0), 120),
+}
+A_SLICE = ["bounded in 100 s", "little white noise", "a walk"]
+
+
 @pytest.mark.parametrize(
     ("figures", "bounded", "every_s"),
-    [
-        # Near the limit: it takes every window to tell.
-        ((0.34, 0.03, 0.0), (0.3, 30.0), 0),
-        ((0.34, 0.03, 0.0), (0.5, 100.0), 120),
-        ((0.05, 0.01, 0.0), (0.5, 100.0), 120),
-        ((0.34, 0.1, 0.0), (0.5, 300.0), 120),
-        ((0.34, 0.1, 0.02), (0.0, 1.0), 120),
-        ((0.34, 0.2, 0.0), (0.0, 1.0), 120),
-    ],
-    ids=["bounded in 30 s", "bounded in 100 s", "little white noise", "flicker and 300 s", "a walk", "flicker"],
+    extent(whole=list(WANDERS.values()), a_slice=[WANDERS[name] for name in A_SLICE]),
+    ids=extent(whole=list(WANDERS), a_slice=A_SLICE),
 )
 def test_a_wander_costs_what_it_does_in_the_next_minutes(
     figures: tuple[float, float, float], bounded: tuple[float, float], every_s: int
