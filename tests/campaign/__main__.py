@@ -26,7 +26,6 @@ def _play(cell: tuple[str, Phase, int]) -> Outcome:
 
 
 def play(cells: list[tuple[str, Phase, int]], jobs: int) -> Iterator[Outcome]:
-    """Yield the outcomes, in any order."""
     if jobs == 1 or len(cells) == 1:
         yield from map(_play, cells)
         return

@@ -21,7 +21,6 @@ class WallClock:
 
     @contextlib.contextmanager
     def worn(self) -> Iterator[None]:
-        """Replace the real clock."""
         clock = self
 
         class Shifted(datetime.datetime):

@@ -267,7 +267,6 @@ async def control_crowd(scene: Scene) -> None:
 
 
 async def control_deaf(scene: Scene) -> None:
-    """Asks for everything and reads nothing."""
     writers = []
     for request in (b'{"command": "monitor"}\n',) * 3 + (b'{"command": "history"}\n', b'{"command": "status"}\n'):
         reader, writer = await _control(scene)

@@ -20,7 +20,6 @@ Mangle = Callable[[list[Frame]], bytes]
 
 
 def mangled(name: str, make: Callable[[Scene], Mangle]) -> tuple[Act, Act]:
-    """Change the bytes of a device."""
 
     async def strike(scene: Scene) -> None:
         scene.stage.mangle[name] = make(scene)
@@ -61,7 +60,6 @@ def wrong_speed(name: str) -> Callable[[Scene], Mangle]:
 
 
 def damaged(scene: Scene) -> Mangle:
-    """A second reader steals bytes."""
 
     def mangle(frames: list[Frame]) -> bytes:
         data = b"".join(frame.data for frame in frames)
@@ -84,7 +82,6 @@ def stuck_imu(scene: Scene) -> Mangle:
 
 
 def spiky_imu(scene: Scene) -> Mangle:
-    """Now and then a value that cannot be."""
 
     def mangle(frames: list[Frame]) -> bytes:
         out = b""

@@ -21,7 +21,6 @@ WRITES = "writing"
 
 
 def wire(**what: Any) -> tuple[Act, Act]:
-    """Fields of the wire, and back."""
 
     async def strike(scene: Scene) -> None:
         scene.notes["wire"] = {name: getattr(scene.stage.wire, name) for name in what}
@@ -52,7 +51,6 @@ def switched(**what: Any) -> tuple[Act, Act]:
 
 
 def every(period_s: float, do: Any) -> tuple[Act, Act]:
-    """Repeat an action."""
 
     async def strike(scene: Scene) -> None:
         async def work() -> None:
@@ -204,7 +202,6 @@ def _second(scene: Scene) -> None:
 
 
 async def change_id(scene: Scene) -> None:
-    """Set SYSID_THISMAV and restart."""
     _set_id(scene, 7)
 
 

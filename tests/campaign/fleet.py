@@ -72,7 +72,6 @@ class Scene:
                 one.live(NOW + off, 1, days)
 
     def start(self) -> CollectorProcess:
-        """One collector more."""
         self._started += 1
         self.collectors.append(CollectorProcess(self.folder, f"collector-{self._started}", self.broker, self.database))
         return self.collectors[-1]
@@ -95,7 +94,6 @@ class Scene:
 
 
 async def broker_killed(scene: Scene) -> None:
-    """It keeps nothing, and comes back wiped."""
     for _ in range(3):
         await scene.a_while()
         scene.broker.kill()
@@ -105,7 +103,6 @@ async def broker_killed(scene: Scene) -> None:
 
 
 async def collector_killed(scene: Scene) -> None:
-    """One of two, at any instant."""
     scene.start()
     for _ in range(3):
         await scene.collectors[0].at_work()
@@ -117,7 +114,6 @@ async def collector_killed(scene: Scene) -> None:
 
 
 async def database_killed(scene: Scene) -> None:
-    """The server ends as in a power cut."""
     if scene.server is None:
         raise NotApplicableError("a file is not killed")
     for _ in range(2):

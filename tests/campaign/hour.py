@@ -79,7 +79,6 @@ def _make_room_for_names() -> None:
 
 
 def run_hour(seed: int, minutes: float = 60.0) -> Hour:
-    """Simulate it."""
     _make_room_for_names()
     variant = VARIANTS[seed % len(VARIANTS)]
     hour = Hour(seed, variant.name)

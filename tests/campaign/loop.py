@@ -31,7 +31,6 @@ class CampaignLoop(VirtualTimeLoop):
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
-        """Call at once; the future is done."""
         future: asyncio.Future[Any] = self.create_future()
         try:
             future.set_result(func(*args))
@@ -56,11 +55,9 @@ def _owned(loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asynci
 
 
 def tasks_of(owner: str) -> list[asyncio.Task[Any]]:
-    """Running tasks of an owner."""
     return [task for task in asyncio.all_tasks() if _owners.get(task) == owner]
 
 
 def run_on_campaign_loop(main: Coroutine[Any, Any, T]) -> T:
-    """Run `main` to its end."""
     with asyncio.Runner(loop_factory=CampaignLoop) as runner:
         return runner.run(main)

@@ -84,11 +84,9 @@ class Stranger:
         return data
 
     def say(self, message: Packet) -> None:
-        """To the companion."""
         self._wire().inject(self.pack(message))
 
     def beat(self, *, kind: int = mavlink.MAV_TYPE_QUADROTOR, autopilot: int = 3, armed: bool = False) -> None:
-        """A heartbeat."""
         self.say(mavlink.MAVLink_heartbeat_message(kind, autopilot, 128 if armed else 0, 0, 4, 3))
 
 

@@ -199,7 +199,6 @@ class Stage(Rig):
     # --- the daemon's life
 
     def start(self) -> None:
-        """A new daemon on the present folder."""
         self.incarnation += 1
         if self.incarnation > 1:
             self.text = re.sub(r'directory = ".*"', f'directory = "{self.store}"', self.text)
@@ -239,7 +238,6 @@ class Stage(Rig):
             await self.service.serve(mavlink=False)
 
     async def stop(self) -> None:
-        """In order, as SIGTERM does."""
         if self._work is not None:
             self._work.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -282,7 +280,6 @@ class Stage(Rig):
     # --- looking at it
 
     def census(self) -> Census:
-        """Count the living daemon's objects."""
         handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.core.vehicle.on_event)
         return Census(len(tasks_of(self.owner)), handlers, len(os.listdir("/proc/self/fd")))
 

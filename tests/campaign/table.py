@@ -18,7 +18,6 @@ _DESCRIBED: Final = ("autopilot", "intruder")
 
 
 def as_text(outcomes: Sequence[Outcome], seed: int) -> str:
-    """For the terminal."""
     by = {(outcome.fault, outcome.phase): outcome for outcome in outcomes}
     phases = [phase for phase in PHASES if any(outcome.phase == phase for outcome in outcomes)]
     width = max(len(name) for name, _ in by)
@@ -32,7 +31,6 @@ def as_text(outcomes: Sequence[Outcome], seed: int) -> str:
 
 
 def summary(outcomes: Sequence[Outcome], seed: int) -> str:
-    """Count the outcomes of each kind."""
     verdicts = [outcome.verdict for outcome in outcomes]
     faults = len({outcome.fault for outcome in outcomes})
     return (
@@ -42,7 +40,6 @@ def summary(outcomes: Sequence[Outcome], seed: int) -> str:
 
 
 def as_json(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Everything."""
     return [{**dataclasses.asdict(outcome), "verdict": outcome.verdict} for outcome in outcomes]
 
 

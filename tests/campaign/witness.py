@@ -152,7 +152,6 @@ WATCHED = {
 
 
 def same(one: float, other: float) -> bool:
-    """Equal as float32."""
     return bool(np.float32(one) == np.float32(other))
 
 

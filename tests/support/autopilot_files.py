@@ -73,5 +73,4 @@ def write_ulog(path: Path, topics: Mapping[tuple[str, int], tuple[Floats, Floats
 
 
 def ulog_message(kind: bytes, body: bytes) -> bytes:
-    """With its head."""
     return struct.pack("<Hc", len(body), kind) + body

@@ -74,11 +74,9 @@ class Machine:
         return code, out.decode(), error.decode()
 
     async def write(self, path: str, text: str) -> None:
-        """Put a file there."""
         await self.run("install", "-D", "-m", "644", "/dev/stdin", path, stdin=text)
 
     async def show(self, unit: str, *names: str) -> dict[str, str]:
-        """Properties of a unit."""
         _, out, _ = await self.run("systemctl", "show", unit, *(f"--property={name}" for name in names))
         return dict(line.partition("=")[::2] for line in out.splitlines())
 

@@ -143,7 +143,6 @@ class Broker:
             self._process = None
 
     def section(self, **more: object) -> str:
-        """The section [mqtt] that reaches it."""
         keys: dict[str, object] = {"host": "127.0.0.1", "port": self.port, "tls": self.tls}
         if self.tls:
             keys["ca_file"] = str(self.ca_file)
@@ -159,7 +158,6 @@ class Broker:
 async def broker(
     folder: Path, kind: Kind = BEST, *, users: bool = False, tls: bool = False, more: str = ""
 ) -> AsyncIterator[Broker]:
-    """A running broker."""
     one = Broker(folder, kind, users=users, tls=tls, more=more)
     try:
         yield await one.start()
@@ -230,7 +228,6 @@ class Peer:
         return (await self.until(f"{base}/response/{command}", fits, within_s)).json
 
     def responses(self, base: str, command: str) -> list[Any]:
-        """All responses to a command so far."""
         return [heard.json for heard in self.heard if heard.topic == f"{base}/response/{command}"]
 
     def forget(self) -> None:

@@ -86,7 +86,6 @@ class Tab:
         return box[0], box[1]
 
     async def touch(self, selector: str) -> None:
-        """Put a finger on it."""
         x, y = await self.middle(selector)
         await self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
 
@@ -96,7 +95,6 @@ class Tab:
         await self.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[{"x": x + x_px, "y": y}])
 
     async def lift(self) -> None:
-        """Take the finger away."""
         await self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     async def mouse(self, selector: str, kind: str) -> None:
@@ -105,7 +103,6 @@ class Tab:
         await self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     async def picture(self, path: Path) -> None:
-        """Save a PNG of what is seen."""
         reply = await self.call("Page.captureScreenshot", format="png")
         path.write_bytes(base64.b64decode(reply["data"]))  # noqa: ASYNC240 - a local file
 

@@ -31,7 +31,6 @@ def tilt_frame(number: int) -> bytes:
 
 
 def compass_frame(number: int) -> bytes:
-    """An HMR3300 whose last digit moves."""
     return f"12{number % 3}.4, 18.{number % 10}, -0.5\r\n".encode()
 
 

@@ -56,7 +56,6 @@ class CollectorProcess:
         self._process.wait()
 
     def stop(self) -> int:
-        """Stop it in order; return its exit code."""
         self._process.send_signal(signal.SIGTERM)
         return self._process.wait(60.0)
 

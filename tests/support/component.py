@@ -70,7 +70,6 @@ class Ground:
         self.send(command_message(command, *params, target=target, confirmation=confirmation, int_=int_))
 
     def acks(self, command: int | None = None) -> list[int]:
-        """The results of all COMMAND_ACKs to us."""
         return [ack.result for ack in self.ack_messages() if command in (None, ack.command)]
 
     def ack_messages(self) -> list[mavlink.MAVLink_command_ack_message]:

@@ -77,7 +77,6 @@ class Collector:
         self._publish(f"fleet/{aircraft}/{what}", payload)
 
     def of(self, aircraft: str) -> list[Any]:
-        """Items of an aircraft, by number."""
         return [item for (of, _, _), item in sorted(self.database.items()) if of == aircraft]
 
     def kinds(self, aircraft: str = HERON) -> list[str]:

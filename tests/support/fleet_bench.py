@@ -60,7 +60,6 @@ class Sessions:
         self._record["imus"] = [{**imu, "held_back": []} for imu in self._record["imus"]]
 
     def add(self, one: Aircraft, at: datetime.datetime) -> list[int]:
-        """Add a session and return its sequences."""
         told = one.calibrate(at)
         item = msgspec.json.decode(one.told[told])
         for number, imu in enumerate(item["body"]["imus"]):

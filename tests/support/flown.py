@@ -21,7 +21,6 @@ EARTH_RAD_S = 7.292115e-5
 
 
 def gravity() -> float:
-    """Somigliana, and 3.086e-6 m/s^2 a metre."""
     s2 = np.sin(np.radians(LATITUDE_DEG)) ** 2
     surface = 9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999013 * s2)
     return float(surface - 3.086e-6 * HEIGHT_M)
@@ -141,7 +140,6 @@ def dataflash(path: Path, messages: Iterable[tuple[str, tuple[Any, ...]]]) -> Pa
 
 
 def parameters(**others: float) -> dict[str, float]:
-    """Parameters of IMU 1 and of the motors."""
     found = {"AHRS_ORIENTATION": 0.0, "INS_GYR_ID": 2752772.0, "INS_ACC_ID": 2753028.0, "INS_USE": 1.0}
     for axis in "XYZ":
         found |= {f"INS_GYROFFS_{axis}": 0.001, f"INS_ACCOFFS_{axis}": 0.02, f"INS_ACCSCAL_{axis}": 1.0}

@@ -48,7 +48,6 @@ class GroundLine(NamedTuple):
         return await finish(await self.start(command, *words, chosen=chosen), within_s)
 
     async def start(self, command: str, *words: str, chosen: bool = True) -> asyncio.subprocess.Process:
-        """Start a command without waiting for it."""
         system = ("--system", "1") if chosen else ()
         process = await ground(command, "--url", f"udpout:127.0.0.1:{self.port}", *system, *words)
         self.started.append(process)

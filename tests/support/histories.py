@@ -188,7 +188,6 @@ def _measured(bias: Array, sigma: float) -> MeasuredBias:
 
 
 def _triad(dice: random.Random, scale: float) -> MeasuredBias:
-    """In all the digits that are kept."""
 
     def axes(sigma: float) -> Vector:
         x, y, z = (round(dice.uniform(0.1, 1.0) * sigma, 9) for _ in "xyz")

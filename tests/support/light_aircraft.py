@@ -54,7 +54,6 @@ class Light(asyncio.Protocol):
         self._write(0x10, head + _text(b"light-" + self._name))
 
     def tell(self, sequences: Iterable[int]) -> None:
-        """Hello, and these items."""
         now_s = time.monotonic()
         self._publish(b"hello", self.one.hello, retain=True)
         for sequence in sequences:
@@ -62,7 +61,6 @@ class Light(asyncio.Protocol):
             self._publish(b"item", self.one.told[sequence])
 
     def again(self, sequences: Iterable[int]) -> None:
-        """Items that have been told before."""
         now_s = time.monotonic()
         for sequence in sequences:
             self.under_way[sequence] = self.under_way.get(sequence, (now_s, now_s))[0], now_s
@@ -141,7 +139,6 @@ class Fleet:
         self._arriving = asyncio.Semaphore(CONNECTING)
 
     def arrived(self) -> None:
-        """One more is at the broker, and hears."""
         self._arriving.release()
 
     @contextlib.asynccontextmanager

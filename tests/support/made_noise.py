@@ -54,7 +54,6 @@ def adis16405(seconds: int, rate_hz: int, seed: int) -> tuple[Floats, Floats]:
 
 
 def write_csv(path: Path, t_s: Floats, readings: Floats) -> Path:
-    """In the columns of docs/recording.md."""
     head = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
     rows = np.column_stack([t_s, readings])
     np.savetxt(path, rows, fmt=["%.6f", *["%.9g"] * 6], delimiter=",", header=head, comments="")

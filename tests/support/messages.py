@@ -159,7 +159,6 @@ def _counts(template: str, callers: list[str]) -> bool:
 
 
 def in_source(source: str, where: str) -> list[Message]:
-    """All messages of one Python file."""
     tree = ast.parse(source)
     parents = _parents(tree)
     found = []

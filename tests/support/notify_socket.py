@@ -41,7 +41,6 @@ class NotifySocket:
         return {"NOTIFY_SOCKET": self.address, **watchdog}
 
     def times(self, key: str, value: str = "1") -> list[float]:
-        """Times of an assignment."""
         return [t_s for t_s, message in self.messages if message.get(key) == value]
 
     @property

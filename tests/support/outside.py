@@ -61,5 +61,4 @@ class Outside:
         return self.left
 
     def close(self) -> None:
-        """Remove the home folder that was lent."""
         shutil.rmtree(self._lent, ignore_errors=True)

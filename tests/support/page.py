@@ -107,7 +107,6 @@ class Visit:
         return Viewer(reader, writer)
 
     async def refusal(self, query: str = "") -> str:
-        """Why one more viewer finds no room."""
         answer = await self.ask("GET", f"/events{query}")
         kind, _, data = answer.body.decode().partition("\ndata: ")
         assert kind == "event: refused"
@@ -140,7 +139,6 @@ class Viewer:
         return fields.get("event", "message"), json.loads(fields["data"])
 
     async def begin(self) -> Any:
-        """The first event, which welcomes."""
         assert (await self.head()).status == 200
         kind, hello = await self.event()
         assert kind == "hello"

@@ -85,7 +85,6 @@ class Postgres:
         return f"postgresql://fleet@127.0.0.1:{self.port}/{name}"
 
     def create(self, name: str) -> str:
-        """Create a database; return its address."""
         with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
             connection.execute(f'CREATE DATABASE "{name}"'.encode())
         return self.url(name)

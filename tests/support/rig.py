@@ -206,13 +206,11 @@ class Rig:
 
     @property
     def double(self) -> ArduPilotDouble:
-        """The ArduPilot of the default rig."""
         assert isinstance(self.autopilot, ArduPilotDouble)
         return self.autopilot
 
     @property
     def px4(self) -> PX4Double:
-        """The PX4 of a rig with `firmware="px4"`."""
         assert isinstance(self.autopilot, PX4Double)
         return self.autopilot
 

@@ -52,7 +52,6 @@ def imu(name: str = "fc", profile: NoiseProfile | None = None, **more: object) -
 
 
 def noise(rng: np.random.Generator, size: int, gyro: float = GYRO_NOISE, accel: float = ACCEL_NOISE) -> Floats:
-    """(size, 6) readings at rest."""
     return np.concatenate([BIAS + rng.normal(0.0, gyro, (size, 3)), FORCE + rng.normal(0.0, accel, (size, 3))], axis=1)
 
 

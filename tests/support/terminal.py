@@ -72,7 +72,6 @@ class Terminal:
         return self.screen[before : found.end()]
 
     def types(self, words: str) -> None:
-        """Type; a line needs its Enter."""
         os.write(self._master, words.encode())
 
     async def answer(self, question: str, words: str = "") -> None:
@@ -81,7 +80,6 @@ class Terminal:
         self.types(f"{words}\n")
 
     async def ended(self) -> int:
-        """Wait for the end; its exit code."""
         async with asyncio.timeout(WITHIN_S):
             return await self._process.wait()
 

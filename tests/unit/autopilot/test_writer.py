@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 from collections.abc import AsyncIterator
 
 import pytest
@@ -10,6 +11,7 @@ from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
 from tests.support.wire import Wire
@@ -283,3 +285,17 @@ async def test_undo_is_all_or_nothing() -> None:
         with pytest.raises(WriteFailedError, match="INS_GYROFFS_Y"):
             await writer.undo(CHANGES)
         assert autopilot.parameters == rounded(AFTER) | {Y: 0.5}
+
+
+async def test_an_autopilot_that_fails_while_a_far_value_is_checked_has_its_old_values_again() -> None:
+    """A far value that stays would crash the aircraft."""
+    autopilot = ScriptedAutopilot(parameters=BEFORE)
+
+    async def check() -> str | None:
+        raise AutopilotError("no answer")
+
+    async with aboard(autopilot) as (writer, _, _):
+        far = [dataclasses.replace(CHANGES[2], via=0.1)]
+        with pytest.raises(WriteFailedError, match="no answer"):
+            await writer.apply([*CHANGES[:2], *far], lambda _: check)
+        assert autopilot.parameters == rounded(BEFORE)

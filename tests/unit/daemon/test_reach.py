@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.daemon.core import RepeatedRead
 from companion.daemon.devices.subsystem import Reach
+from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.events import Listeners
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.scripted_px4 import ScriptedPx4
 from tests.support.virtual_time import run_virtual
@@ -71,3 +75,32 @@ def test_ardupilot_needs_nothing_but_our_heartbeat() -> None:
     assert good
     assert "none heard" in words
     assert "set not to forward" in words
+
+
+async def test_it_reads_after_each_start_on_request_and_again_after_a_failure() -> None:
+    loop, reads, fails = asyncio.get_running_loop(), list[float](), [False]
+    vehicle: Any = SimpleNamespace(found=asyncio.Event(), on_event=Listeners())
+
+    async def read() -> None:
+        reads.append(round(loop.time(), 3))
+        if fails[0]:
+            raise AutopilotError("no answer")
+
+    reading = RepeatedRead(vehicle, read, 3.0)
+    running = asyncio.create_task(reading.run())
+    await asyncio.sleep(10.0)
+    assert reads == []  # nobody is there to be asked
+    began_s = loop.time()
+    vehicle.found.set()
+    await asyncio.sleep(1.0)
+    fails[0] = True
+    vehicle.on_event.tell("rebooted")
+    await asyncio.sleep(7.0)
+    fails[0] = False
+    await asyncio.sleep(10.0)
+    for _ in range(3):  # a change that anybody may announce is read at once, and then every half second
+        reading.again(0.5)
+        await asyncio.sleep(0.1)
+    await asyncio.sleep(5.0)
+    running.cancel()
+    assert [round(each - began_s, 1) for each in reads] == [0.0, 1.0, 4.0, 7.0, 10.0, 18.0, 18.5]
