@@ -23,6 +23,8 @@ def contradictions(rig: Rig) -> list[str]:
         found.append(f"{headline} beside {arming['verdict']}, {arming['words']}")
     if "no heartbeat" in f"{headline['reason']} {arming['words']}" and vehicle["armed"] == "disarmed":
         found.append(f"{headline}, {arming['words']} above {vehicle['summary']}")
+    if "its offsets" in arming["words"] and arming["state"] != "uncalibrated":
+        found.append(f"{arming['state']} while offsets are unknown: {arming['words']}")
     return found
 
 
