@@ -10,7 +10,7 @@ WAITING ?= 6
 # Where it is set, every process of every test compiles the whole program anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo quick test long check format bench accuracy campaign pictures deb deb-test lock sbom audit clean
+.PHONY: help demo quick test long check format bench accuracy campaign pictures messages deb deb-test lock sbom audit clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about two minutes)'
@@ -23,6 +23,7 @@ help:
 	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about ten minutes on two cores)'
 	@echo 'make campaign  every fault in every phase of a calibration (about 6 minutes on two cores)'
 	@echo 'make pictures  those of the documents, from real runs (needs Chromium; about three minutes)'
+	@echo 'make messages  docs/messages.md from the catalogue in companion/messages'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
 	@echo 'make lock    requirements/*.txt anew: every dependency with its hashes (UPGRADE=1: the newest; needs the network)'
@@ -85,6 +86,9 @@ campaign: $(VENV)/.dev
 
 # Some of them alone: PICTURES='demo page report'.
 PICTURES ?=
+
+messages: $(VENV)/.run
+	@$(BIN)/python packaging/messages.py > docs/messages.md
 
 pictures: $(VENV)/.dev
 	@$(BIN)/python -m tests.pictures $(PICTURES)

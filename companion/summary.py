@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Final, Literal
 
+from companion import messages
 from companion.formats import Object
 
 _HEARTBEAT_S: Final = 2.0  # an older heartbeat is a lost link
 
 
-StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str]
-"""One part that the companion is connected to, or one warning: verdict, name and words."""
+StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str, str]
+"""One part that the companion is connected to, or one warning: verdict, name, words, and the remedy if there is one."""
 
 
 def headline(status: Object) -> str:
@@ -26,21 +27,25 @@ def rows(status: Object) -> list[StatusRow]:
         found.append(_row(signing["good"], f"signing ({signing['mode']})", signing["summary"]))
     found += [_row(device["good"], device["name"], device["summary"] + _counts(device)) for device in status["devices"]]
     if not status["ground_stations"]["good"]:
-        found.append(("wrong", "ground stations", status["ground_stations"]["summary"]))
+        found.append(_wrong("ground stations", status["ground_stations"]["summary"]))
     found += [
         _row(one["good"], name, one["summary"]) for name in ("mqtt", "fleet") if (one := status[name]) is not None
     ]
     if recording["fault"] is not None:
-        found.append(("wrong", "recordings", f"none at present: {recording['fault']}"))
+        found.append(_wrong("recordings", f"none at present: {recording['fault']}"))
     if gate is not None and gate["problem"]:
-        found.append(("wrong", "arming", gate["problem"]))
+        found.append(_wrong("arming", gate["problem"]))
     if status["automatic"]["stopped"]:
-        found.append(("wrong", "by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
-    return [*found, *(("warning", "warning", words) for words in status["warnings"])]
+        found.append(_wrong("by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
+    return [*found, *(("warning", "warning", words, messages.remedy(words)) for words in status["warnings"])]
 
 
 def _row(good: bool, name: str, words: str) -> StatusRow:  # noqa: FBT001 - the first column
-    return "ok" if good else "wrong", name, words
+    return ("ok", name, words, "") if good else _wrong(name, words)
+
+
+def _wrong(name: str, words: str) -> StatusRow:
+    return "wrong", name, words, messages.remedy(words)
 
 
 def _counts(device: Object) -> str:

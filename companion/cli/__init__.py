@@ -26,6 +26,7 @@ from companion.cli.terminal import (
     how_to_start,
     print_json,
     print_lines,
+    print_remedy,
 )
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
 from companion.links.system.process import OneLineFormatter
@@ -59,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
     print_lines(f"companion: {reason}", error=True)
+    print_remedy(reason)
     if options.json:
         print_json({"state": state, "reason": reason})
 

@@ -11,6 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
+from companion import messages
 from companion.cli import show
 from companion.cli.terminal import (
     DONE,
@@ -85,6 +88,9 @@ def add_commands(add: AddCommand) -> None:
     option("record", nargs="?", type=within(1, 1e9, int), metavar="NUMBER", help="default: the latest")
     option("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
     option("--storage", type=Path, metavar="DIR", help="folder with records/ (default: as in the configuration)")
+    words = "explain a message: what causes it, what to do"
+    option = add("explain", explain, words).add_argument
+    option("words", nargs="+", metavar="WORDS", help="the message or a part of it, its identifier, or what it is about")
     add("web-token", web_token, "where the page is, and the token that its buttons need")
 
 
@@ -169,6 +175,15 @@ async def lua(options: argparse.Namespace) -> int:
     for number, step in enumerate(INSTALLATION, 1):
         print_lines(f"{number}. {step}", error=True)
     return DONE
+
+
+async def explain(options: argparse.Namespace) -> int:
+    found = messages.search(" ".join(options.words))
+    lines = show.explained_lines(found)
+    reason = "" if found else "no message is like this; docs/messages.md lists all of them"
+    entries = [{"id": name, **msgspec.to_builtins(entry)} for name, entry in found]
+    answer = {"state": "done" if found else "failed", "reason": reason, "messages": entries}
+    return conclude(options, answer, lines or [reason], good=bool(found))
 
 
 async def web_token(options: argparse.Namespace) -> int:

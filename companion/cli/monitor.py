@@ -84,7 +84,7 @@ class _Lines:
         headline = summary.headline(status)
         tenths = (status["progress"] or 0) // 10
         lines: dict[tuple[object, ...], str] = {(_FIGURES.sub("", headline), tenths): headline}
-        for _, name, words in summary.rows(status):
+        for _, name, words, _ in summary.rows(status):
             line = f"{name}: {words}"
             lines[(_FIGURES.sub("", line),)] = line
         self._print(lines | {(line,): line for line in show.end_lines(status)})

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from companion import summary
+from companion import messages, summary
 from companion.estimation.records.flight_record import Flight, figure
 from companion.estimation.records.record import Magnetic, outcome_word
 from companion.formats import Object
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from companion.links.serial.ports import SerialPort
 
 
+REMEDY = "-> "  # Beginning of a line that says what to do about the one before
 _BAR = 40
 _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
@@ -98,7 +99,8 @@ def status_lines(status: Object) -> list[str]:
         lines.append(f"recordings: {recording['lost']} messages lost so far, the disk is too slow")
     if (file := recording["file"]) is not None:
         lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")
-    lines += [f"{name}: {words}" for _, name, words in summary.rows(status)]
+    for _, name, words, remedy in summary.rows(status):
+        lines += [f"{name}: {words}", *([f"  {REMEDY}{remedy}"] if remedy else [])]
     refused = status["vehicle"]["refused"].items()
     lines += [f"not allowed to ask: {sender} ({count} times)" for sender, count in refused]
     lines += _reading_lines(status)
@@ -111,6 +113,15 @@ def status_lines(status: Object) -> list[str]:
     if status["undoable"]:
         lines.append(undo_line(status["undoable"]))
     return lines if last is None else [*lines, *_magnetic_lines(last.get("magnetic")), *last.get("when_warm", [])]
+
+
+def explained_lines(found: Sequence[tuple[str, messages.Entry]]) -> list[str]:
+    lines: list[str] = []
+    for name, entry in found:
+        lines += ["", f"{name}: {' | '.join(entry.patterns)}"] if lines else [f"{name}: {' | '.join(entry.patterns)}"]
+        lines += [f"  why: {entry.cause}"] if entry.cause else []
+        lines += [f"  {REMEDY}{entry.advice() or messages.KINDS[entry.do]}"]
+    return lines
 
 
 def undo_line(steps: Sequence[Object]) -> str:
@@ -186,7 +197,8 @@ def _held_back(imu: Object, triad: str) -> str:
 
 
 def finding_lines(findings: Sequence[CheckLine]) -> list[str]:
-    return _judged([(finding.verdict, finding.name, finding.words) for finding in findings])
+    found = [(one.verdict, one.name, one.words, "" if one.remedy else messages.remedy(one.words)) for one in findings]
+    return _judged(found)
 
 
 def problems(findings: Sequence[CheckLine]) -> str:
@@ -197,9 +209,14 @@ def failures(steps: Sequence[InstallStep]) -> str:
     return "; ".join(f"{step.what}: {step.words}" for step in steps if step.outcome == "failed")
 
 
-def _judged(rows: Sequence[tuple[str, str, str]]) -> list[str]:
-    width = max(len(name) for _, name, _ in rows)
-    return [f"{verdict:7}  {name if name != verdict else '':{width}}  {words}" for verdict, name, words in rows]
+def _judged(rows: Sequence[tuple[str, str, str, str]]) -> list[str]:
+    width = max(len(name) for _, name, _, _ in rows)
+    lines = []
+    for verdict, name, words, remedy in rows:
+        lines.append(f"{verdict:7}  {name if name != verdict else '':{width}}  {words}")
+        if remedy and verdict != "ok":
+            lines.append(f"{'':{width + 11}}{REMEDY}{remedy}")
+    return lines
 
 
 def history_lines(

@@ -42,6 +42,7 @@ NOT_FOR_PEOPLE = {
 }  # fmt: skip
 
 ELSEWHERE = {
+    "companion/messages": "titles of the catalogue",
     "companion/config": "every line names file, key, what was found and what is allowed; one row tells so",
     "companion/commands.py": "help of the command line, and of a field what was found and what is allowed",
     "companion/installation": "printed by commands that are run at home, with what to do",

@@ -308,8 +308,8 @@ class Supervisor:
             status = self._service.status()
             rows = [row for row in summary.rows(status) if row[1] != "autopilot"]
             parts = [summary.headline(status), str(status["vehicle"]["summary"])]
-            parts += [f"{name}: {words}" for verdict, name, words in rows if verdict == "wrong"]
-            if good := [name for verdict, name, _ in rows if verdict == "ok"]:
+            parts += [f"{name}: {words}" for verdict, name, words, _ in rows if verdict == "wrong"]
+            if good := [name for verdict, name, _, _ in rows if verdict == "ok"]:
                 parts.append(f"{', '.join(good)} good")
             return "; ".join([*notes, *parts])
         except Exception:

@@ -152,15 +152,16 @@ function byHand(found) {
     return make("p", `${one.what}, ${utc(one.measured_at)}: ${one.state === "failed" ? "failed: " : ""}${one.reason}` + (written && end ? `; ${end}` : ""), "note");
   }));
 }
-function link(good, name, words) {
+function link(good, name, words, remedy) {
   const row = make("div", undefined, good ? "link" : "link bad"), text = make("div");
   text.append(make("b", name + " "), document.createTextNode(words));
+  if (remedy) text.append(make("p", remedy, "note"));
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
 // The rows are the companion's own summary, as the command line shows it.
 function links(status) {
-  $("links").replaceChildren(...status.rows.map(([verdict, name, words]) => link(verdict === "ok", name, words)));
+  $("links").replaceChildren(...status.rows.map(([verdict, name, words, remedy]) => link(verdict === "ok", name, words, remedy)));
 }
 async function records() {
   let found;

@@ -23,7 +23,7 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
         "warnings": ["the compass wanders"],
     }
     assert headline(status) == "READY: calibrated 5 s ago"
-    assert rows(status) == [
+    assert [row[:3] for row in rows(status)] == [
         ("wrong", "autopilot", "ArduPilot, disarmed"),
         ("ok", "imu", "200 Hz; bad frames: 4; reconnected: 2"),
         ("wrong", "compass", "silent for 3 s"),

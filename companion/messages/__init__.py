@@ -1,0 +1,149 @@
+"""The catalogue of messages to people: their words, what causes each, and what to do.
+
+The TOML files beside this module hold one table for each message, by identifier:
+
+- `text`: the words, with named fields (`"IMU {imu} moves {rate} deg/s"`), which `message` fills in. The caller formats
+  them: a field has no format of its own, so that no text of the catalogue can fail;
+- `also`: words of other texts that mean the same, of the arming script, the log or the autopilot; `…` is any value;
+- `do`: the kind of remedy, a key of `KINDS`;
+- `cause`, `remedy`: one or two sentences, no remedy where there is nothing to do; `see`: a page of the documents, such
+  as `"arming.md#the-gate"`.
+
+docs/messages.md is made from it (`make messages`).
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from importlib.resources import files
+from typing import Final, Literal, get_args
+
+import msgspec
+
+Kind = Literal["act", "wait", "retry", "hardware", "setting", "check", "nothing", "report"]
+
+KINDS: Final[Mapping[Kind, str]] = {
+    "act": "Act at once",
+    "wait": "Hold still, or wait",
+    "retry": "Remove the reason, then ask again",
+    "hardware": "Check power, wires and sensors",
+    "setting": "Change a setting or a file",
+    "check": "Check before flight",
+    "nothing": "Nothing to do",
+    "report": "Report a fault of the program",
+}
+ANY: Final = "…"
+_CERTAIN_LETTERS: Final = 8  # Fewest letters of a pattern that identify a message in a longer line
+_SIMILAR: Final = 0.8  # Least ratio of `difflib` at which a word counts as misspelt
+_LEAST_SCORE: Final = 0.4  # Least share of the searched words' weight that an entry must hold
+_WORD: Final = re.compile(r"[a-z][a-z_]+")
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One message of the catalogue."""
+
+    do: Kind
+    cause: str = ""
+    remedy: str = ""
+    text: str = ""
+    also: tuple[str, ...] = ()
+    see: str = ""
+
+    @property
+    def patterns(self) -> tuple[str, ...]:
+        """Return the texts with `…` in the place of each value."""
+        return (*([re.sub(r"\{[^}]*\}", ANY, self.text)] if self.text else []), *self.also)
+
+    def advice(self) -> str:
+        return f"{self.remedy} (docs/{self.see})" if self.see else self.remedy
+
+
+@functools.cache
+def catalogue() -> dict[str, Entry]:
+    """Load all messages by identifier; raise ValueError where an identifier stands twice."""
+    found: dict[str, Entry] = {}
+    for path in sorted(files(__name__).iterdir(), key=lambda each: each.name):
+        if path.name.endswith(".toml"):
+            part = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), dict[str, Entry])
+            if twice := found.keys() & part.keys():
+                raise ValueError(f"{path.name}: found {', '.join(sorted(twice))} again; allowed: each once")
+            found |= part
+    return found
+
+
+def message(identifier: str, **fields: object) -> str:
+    """Return the text of a message with its fields filled in."""
+    return catalogue()[identifier].text.format_map(fields)
+
+
+def explain(line: str) -> tuple[str, Entry] | None:
+    """Return the message that a line shows, the most specific one if it shows several."""
+    shown = [(letters, identifier) for letters, identifier, pattern in _patterns() if pattern.search(line)]
+    return (found := max(shown)[1], catalogue()[found]) if shown else None
+
+
+def remedy(line: str) -> str:
+    """Return what to do about a line, or nothing where the catalogue does not know it."""
+    return "" if (found := explain(line)) is None else found[1].advice()
+
+
+def search(words: str, most: int = 3) -> list[tuple[str, Entry]]:
+    """List the messages that words are about, the best first: an identifier, a line, or words in any order."""
+    if words in catalogue():
+        return [(words, catalogue()[words])]
+    exact, index = explain(words), _index()
+    weights = _weights()
+    wanted = {_known(word, weights) for word in _words(words)}
+    whole = sum(weights.get(word, 1.0) for word in wanted) or math.inf
+    scores = {name: sum(weights[word] for word in wanted & has) / whole for name, has in index.items()}
+    best = sorted((name for name, score in scores.items() if score >= _LEAST_SCORE), key=lambda name: -scores[name])
+    names = dict.fromkeys([*([exact[0]] if exact else []), *best])
+    return [(name, catalogue()[name]) for name in list(names)[:most]]
+
+
+@functools.cache
+def _patterns() -> list[tuple[int, str, re.Pattern[str]]]:
+    """List the patterns that identify a message, with their number of letters."""
+    found = []
+    for identifier, entry in catalogue().items():
+        for pattern in entry.patterns:
+            parts = [part.strip() for part in pattern.split(ANY)]
+            if (letters := sum(map(len, parts))) >= _CERTAIN_LETTERS:
+                found.append((letters, identifier, re.compile(".*?".join(map(re.escape, parts)), re.IGNORECASE)))
+    return found
+
+
+def _words(text: str) -> Iterable[str]:
+    return _WORD.findall(text.lower())
+
+
+@functools.cache
+def _index() -> dict[str, frozenset[str]]:
+    return {
+        name: frozenset(_words(" ".join((name.replace("_", " "), *entry.patterns, entry.cause))))
+        for name, entry in catalogue().items()
+    }
+
+
+@functools.cache
+def _weights() -> dict[str, float]:
+    """Weight each word by its rarity."""
+    counts = Counter(word for words in _index().values() for word in words)
+    return {word: math.log(1.0 + len(_index()) / count) for word, count in counts.items()}
+
+
+def _known(word: str, weights: Mapping[str, float]) -> str:
+    """Return the word of the catalogue that is meant by a misspelt or cut one."""
+    if word in weights:
+        return word
+    whole = [known for known in weights if len(word) > 3 and known.startswith(word)]
+    return next(iter(whole or difflib.get_close_matches(word, weights, 1, _SIMILAR)), word)
+
+
+assert set(KINDS) == set(get_args(Kind))

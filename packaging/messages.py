@@ -1,0 +1,38 @@
+"""Print docs/messages.md, made from the catalogue of messages (`make messages`)."""
+
+from __future__ import annotations
+
+import sys
+from typing import Final
+
+from companion.messages import KINDS, Entry, catalogue
+
+_HEAD: Final = """\
+# Messages: what the companion says, and what to do
+
+Type `companion explain WORDS` with some words of the line, or search this page for them. `…` is a name or a number.
+`status`, `check`, `calibrate --wait` and the page of the companion show the remedy under the message.
+
+A line often has a speaker and a reason: in `Not armed: hold still 6 s` look up the part behind the colon. The ground
+station gets STATUSTEXT lines of at most 50 characters; one that begins with `... ` continues the line before.
+"""
+
+
+def page() -> str:
+    """Return the whole document, sorted by what the pilot has to do."""
+    parts = [_HEAD]
+    for kind, title in KINDS.items():
+        rows = [_row(entry) for entry in catalogue().values() if entry.do == kind]
+        parts.append(f"\n## {title}\n\n| message | cause and remedy |\n|---|---|\n" + "".join(rows))
+    return "".join(parts)
+
+
+def _row(entry: Entry) -> str:
+    shown = ", ".join(f"`{pattern}`" for pattern in entry.patterns)
+    words = " ".join(part for part in (entry.cause, entry.remedy) if part)
+    more = f" [More]({entry.see})" if entry.see else ""
+    return f"| {shown} | {words}{more} |\n".replace("messages.md#", "#")
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())
