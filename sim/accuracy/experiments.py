@@ -124,7 +124,8 @@ class FloorRun:
     """Errors of the two horizontal accelerometers in the longest span (references, draws, 2)."""
 
 
-def floors(part: str, seed: int, number: int) -> FloorRun:
+def floors(part: str, seed: int, number: int) -> FloorRun | None:
+    """Measure one stand; None where chance looked like motion, so that the pilot would have to wait longer."""
     posture = POSTURES[number % len(POSTURES)]
     site = sites()[number // len(POSTURES) % len(sites())]
     standing = stand(
@@ -132,7 +133,10 @@ def floors(part: str, seed: int, number: int) -> FloorRun:
     )  # fmt: skip
     taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=noise_profile(part))
     times, rows = samples(standing, SPANS_S[-1])
-    windows = collected(standing, taken, times, rows, SPANS_S)
+    try:
+        windows = collected(standing, taken, times, rows, SPANS_S)
+    except CalibrationRefusedError:
+        return None
     references = References.drawn(FIELD_TILT_DEG, FIELD_HEADING_DEG, standing.random)
     ideal, error, sigma, plain, plain_sigma = [], [], [], [], []
     truth = np.zeros(6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import product
 from typing import Final
@@ -63,11 +64,12 @@ def report(
     if {"floors", "tilt"} & set(only):
         each = max(runs // 5, len(POSTURES))
         progress(f"flicker and walk: {each} stands of each of {len(FLOORED)} parts")
-        flat = many(floors, [*product(FLOORED, [seed], range(each))], jobs)
-        parts = {part: flat[each * index : each * (index + 1)] for index, part in enumerate(FLOORED)}
-        for name, make in (("floors", _floors), ("tilt", _tilt)):
-            if name in only:
-                found[name] = make(parts)
+        work = [*product(FLOORED, [seed], range(each))]
+        parts: dict[str, list[FloorRun]] = {part: [] for part in FLOORED}
+        for (part, *_), run in zip(work, many(floors, work, jobs), strict=True):
+            parts[part] += [] if run is None else [run]
+        found |= {"floors": _floors(parts, len(work))} if "floors" in only else {}
+        found |= {"tilt": _tilt(parts)} if "tilt" in only else {}
     if "warm-up" in only:
         each = max(runs // 100, 1)
         progress(f"warm-up: {each} stands of each of {len(warmup.WARMING)} parts in {len(warmup.cases())} cases")
@@ -143,7 +145,7 @@ def _upright(runs: list[FloorRun]) -> list[FloorRun]:
     return [run for run in runs if run.posture in UPRIGHT]
 
 
-def _floors(parts: dict[str, list[FloorRun]]) -> Section:
+def _floors(parts: dict[str, list[FloorRun]], stands: int) -> Section:
     lines = [
         f"rms error against the mean bias of the next {NEXT_S:.0f} s, and over sqrt V(T, {NEXT_S:.0f} s)",
         "",
@@ -175,8 +177,10 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
         f"Coverage: all axes, {_REFERENCES}, gravity 30 mGal off.",
         "The plain mean takes the Earth for at rest and its sigma for s / sqrt(n).",
     ]
-    count = len(next(iter(parts.values())))
-    return Section(f"Parts with flicker and walk ({count} stands each)", lines, claims)
+    refused = stands - sum(map(len, parts.values()))
+    rate = Figure(refused / stands, math.sqrt(max(refused, 1)) / stands)
+    claims.append(Claim("stands refused as moving", "of 1,000", rate.times(1000.0), 2.0))
+    return Section(f"Parts with flicker and walk ({stands // len(parts)} stands each)", lines, claims)
 
 
 def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
