@@ -20,6 +20,9 @@ from companion.autopilot.parameters.change import FirmwareName
 from companion.links.mavlink.link import MavlinkLink, Message
 
 _COPY_S: Final = 0.5
+_TWICE_S: Final = 0.1
+"""Pause after a refusal. A request that two routes brought twice is answered twice: the second refusal must not
+answer the next request."""
 MAX_WAITING: Final = 16  # commands of one kind; the newest beyond is dropped and answered None at once
 
 
@@ -42,6 +45,7 @@ class Commands:
         self._queues: dict[int, deque[_Request]] = {}
         self._in_flight: dict[int, _Request] = {}
         self._timers: dict[int, asyncio.TimerHandle] = {}
+        """By command that is in flight, or was refused just now."""
         self._last_ack = (0, 0, 0, -math.inf)
         link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 
@@ -79,7 +83,7 @@ class Commands:
     def _next(self, command: int) -> None:
         queue = self._queues.get(command)
         target = self._target()
-        while queue and command not in self._in_flight:
+        while queue and command not in self._timers:
             request = queue.popleft()
             parameters, _, answer = request
             if answer.done():  # whoever waited has gone
@@ -103,6 +107,13 @@ class Commands:
         _, _, answer = self._in_flight.pop(command)
         self.results["no answer" if result is None else result_name(result)] += 1
         _settle(answer, result)
+        if result in (None, mavlink.MAV_RESULT_ACCEPTED):
+            self._next(command)
+        else:
+            self._timers[command] = asyncio.get_running_loop().call_later(_TWICE_S, self._go_on, command)
+
+    def _go_on(self, command: int) -> None:
+        del self._timers[command]
         self._next(command)
 
     def _on_ack(self, message: mavlink.MAVLink_command_ack_message, t_s: float) -> None:

@@ -18,10 +18,12 @@ class Peer:
         self.sent: list[mavlink.MAVLink_message] = []
         self._link = link
         self._codec = mavlink.MAVLink(None)
+        self._answers = 0
         link.attach(lambda data: self.sent.extend(self._codec.parse_buffer(data) or ()))
 
     def ack(self, command: int, result: int, *, who: tuple[int, int] = (1, 1), to: tuple[int, int] = (0, 0)) -> None:
         codec = mavlink.MAVLink(None, srcSystem=who[0], srcComponent=who[1])
+        codec.seq = self._answers = self._answers + 1
         message = mavlink.MAVLink_command_ack_message(command, result, 0, 0, *to)
         self._link.receive(message.pack(codec), asyncio.get_running_loop().time())
 
@@ -57,6 +59,21 @@ async def test_one_of_a_kind_is_in_flight_and_silence_lets_the_next_go() -> None
     peer.ack(SET_INTERVAL, mavlink.MAV_RESULT_DENIED)
     assert await second == mavlink.MAV_RESULT_DENIED
     assert await other is None
+
+
+async def test_a_request_that_was_brought_and_refused_twice_does_not_refuse_the_next_one() -> None:
+    link = MavlinkLink()
+    peer = Peer(link)
+    commands = Commands(link, lambda: (1, 1))
+    first, second = commands.send(SET_INTERVAL, 105), commands.send(SET_INTERVAL, 26)
+    for _ in range(2):
+        peer.ack(SET_INTERVAL, mavlink.MAV_RESULT_DENIED)
+        await asyncio.sleep(0.01)
+    assert await first == mavlink.MAV_RESULT_DENIED
+    await asyncio.sleep(0.1)
+    assert len(peer.sent) == 2
+    peer.ack(SET_INTERVAL, mavlink.MAV_RESULT_ACCEPTED)
+    assert await second == mavlink.MAV_RESULT_ACCEPTED
 
 
 async def test_in_progress_starts_the_time_anew() -> None:
