@@ -34,6 +34,7 @@ from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
+from companion.messages import message
 from companion.recording import files, messages
 from companion.recording.files import Beginning, RecordingFile, Ring
 from companion.recording.messages import ImuState, KeyFilter, Measured, Message, RawOutput, Solved, Tape
@@ -51,9 +52,6 @@ MOST_BYTES: Final = 4 << 30, 1 << 30
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 INTERNAL: Final = "internal error; the log has the details"
-HOW_TO_INSTALL: Final = (
-    "recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
-)
 
 
 def _coarse(where: Whereabouts) -> tuple[object, ...]:
@@ -87,7 +85,7 @@ class Recorder(Subsystem):
         if megabytes != 0 and files.is_available():
             self._ring = Ring(self._folder, (DEFAULT_MB if megabytes is None else megabytes) << 20)
         elif megabytes:
-            self.fault = HOW_TO_INSTALL
+            self.fault = message("recording_not_installed")
         self._ring_again_s = 0.0
         self._offset_ns: int | None = None
         self._config_json = msgspec.json.encode(config)
@@ -210,7 +208,7 @@ class Recorder(Subsystem):
                 self._offset_ns = time.time_ns() - round(now_s * 1e9)
             if tape.lost:
                 level = logging.WARNING if tape.lost == tape.lost_in_all else logging.DEBUG  # once is enough
-                logger.log(level, "recordings: the disk is too slow, %d messages lost; begun anew", tape.lost)
+                logger.log(level, "recordings: %s", message("disk_too_slow", lost=tape.lost))
                 self._begin()
             since_s, states, batch = tape.drain(now_s)
             beginning = Beginning(since_s, self._offset_ns, self._config_json, states)
@@ -256,13 +254,13 @@ class Recorder(Subsystem):
             await self._end(recording, str(error), state="failed")
             return
         if recording.until_s is not None and _now_s() >= recording.until_s:
-            await self._end(recording, "recorded as long as was asked for")
+            await self._end(recording, "the requested time is over")
             return
         state = "done" if recording.until_s is None else "failed"
         if recording.file.bytes_written >= recording.most_bytes:
-            await self._end(recording, f"ended at {recording.most_bytes >> 30} GB, its size limit", state)
+            await self._end(recording, f"size limit of {recording.most_bytes >> 30} GB reached", state)
         elif shortage is not None:
-            await self._end(recording, f"ended with {shortage}", state)
+            await self._end(recording, shortage, state)
 
     # --- on request
 
@@ -295,11 +293,10 @@ class Recorder(Subsystem):
 
     async def _start(self, name: str | None, seconds: float | None) -> _OnRequest:
         if not files.is_available():
-            raise StorageError(HOW_TO_INSTALL)
+            raise StorageError(message("recording_not_installed"))
         async with self._flushing:
             if self._on_request is not None:
-                path = self._on_request.file.path
-                raise StorageError(f"already recording to {path}; end it with: companion record --stop")
+                raise StorageError(message("recording_runs_already", path=self._on_request.file.path))
             path = Path(name) if name is not None else await self._offload(files.unused_path, self._folder)
             file, now_s = await self._offload(files.create_on_request, path), _now_s()
             ended: asyncio.Future[Object] = asyncio.get_running_loop().create_future()
@@ -320,7 +317,8 @@ class Recorder(Subsystem):
             await self._in_thread(recording.file.close)
         except StorageError as error:
             why, state = str(error), "failed"
-        logger.log(logging.INFO if state == "done" else logging.WARNING, "recording ended: %s", why)
+        level = logging.INFO if state == "done" else logging.WARNING
+        logger.log(level, "%s", message("recording_ended", reason=why))
         recording.ended.set_result(
             {
                 "state": state,

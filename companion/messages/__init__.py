@@ -21,7 +21,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.resources import files
+from pathlib import Path
 from typing import Final, Literal, get_args
 
 import msgspec
@@ -68,12 +68,11 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 def catalogue() -> dict[str, Entry]:
     """Load all messages by identifier; raise ValueError where an identifier stands twice."""
     found: dict[str, Entry] = {}
-    for path in sorted(files(__name__).iterdir(), key=lambda each: each.name):
-        if path.name.endswith(".toml"):
-            part = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), dict[str, Entry])
-            if twice := found.keys() & part.keys():
-                raise ValueError(f"{path.name}: found {', '.join(sorted(twice))} again; allowed: each once")
-            found |= part
+    for path in sorted(Path(__file__).parent.glob("*.toml")):
+        part = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), dict[str, Entry])
+        if twice := found.keys() & part.keys():
+            raise ValueError(f"{path.name}: found {', '.join(sorted(twice))} again; allowed: each once")
+        found |= part
     return found
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from companion.config.sections import Parity
+from companion.messages import message
 from companion.protocols.registry import DEVICES, Kind, main_kind
 
 COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
@@ -87,7 +88,7 @@ def strangers(data: bytes) -> str | None:
     if _MODEM.search(data):
         return "AT commands, as ModemManager sends them"
     if is_mavlink(data):
-        return "MAVLink: an autopilot or its radio, which belongs into [mavlink]"
+        return message("mavlink_on_the_port", speaker="an autopilot or its radio")
     return None
 
 

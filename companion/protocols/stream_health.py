@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from companion.messages import message
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.guess import likeliest, plain_share, strangers
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
@@ -115,14 +116,15 @@ class StreamHealth:
 
     def _without_samples(self, now_s: float, lately: _Counts) -> Trouble:
         if self.last_byte_s is None or now_s - self.last_byte_s >= SILENT_AFTER_S:
-            return Trouble(SILENT, "silent (power? wiring? told to stop?)")
+            return Trouble(SILENT, message("sensor_silent"))
         if (valueless := _valueless(lately)) is not None:
             return valueless
         if now_s - self._guessed_s >= GUESS_EVERY_S and len(self._tail) >= TAIL_BYTES // 8:
             self._guessed_s, self._guess = now_s, self._guesses()
         rejected = _named(self._decoder.rejected) or "none begun"
         guess = self._guess or "wrong baud or protocol?"
-        return Trouble("undecodable", f"bytes come, but no {self._protocol} frames ({rejected}); {guess}")
+        words = message("no_frames", protocol=self._protocol, rejected=rejected, guess=guess)
+        return Trouble("undecodable", words)
 
     def _guesses(self) -> str:
         found = likeliest(self._tail)
@@ -141,7 +143,7 @@ class StreamHealth:
             return None
         if not isinstance(self._reading[0], tuple):
             return None  # no IMU: a still gradienter or compass repeats its digits
-        words = f"stuck: {self._same + 1} equal readings; switch its power off and on"
+        words = message("sensor_stuck", evidence=f"{self._same + 1} equal readings")
         return Trouble("stuck", words, implausible=True)
 
     def _lately(self, now_s: float) -> _Counts:
@@ -169,10 +171,9 @@ def _valueless(lately: _Counts) -> Trouble | None:
     accepted, rejected = lately
     least = _DAMAGED_SHARE * max(accepted, 1)
     if (count := rejected["non-finite"]) and count >= least:
-        words = f"NaN in {count} whole frames: the device has no valid reading; switch its power off and on"
-        return Trouble("non-finite", words)
+        return Trouble("non-finite", message("readings_are_nan", count=count))
     if (count := rejected["over range"]) and count >= least:
-        return Trouble("over range", f"{count} readings are over range: level it")
+        return Trouble("over range", message("readings_over_range", count=count))
     return None
 
 
@@ -183,5 +184,4 @@ def _damaged(lately: _Counts) -> Trouble | None:
     if damaged < _DAMAGED_FRAMES or damaged < _DAMAGED_SHARE * (accepted + damaged):
         return None
     percent = 100 * damaged // (accepted + damaged)
-    words = f"{percent} % of its frames are damaged ({_named(damage)}): a second reader? wire, ground, levels?"
-    return Trouble("damaged", words)
+    return Trouble("damaged", message("frames_damaged", percent=percent, damage=_named(damage)))

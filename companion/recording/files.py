@@ -18,6 +18,7 @@ from typing import IO, Any, Final
 
 from companion import __version__
 from companion.errors import StorageError
+from companion.messages import message
 from companion.recording import messages
 from companion.recording.messages import Message, Start
 
@@ -71,6 +72,11 @@ def is_available() -> bool:
     return find_spec("mcap") is not None and find_spec("zstandard") is not None
 
 
+def _failed(path: Path, step: str, reason: OSError | str) -> StorageError:
+    words = reason if isinstance(reason, str) else reason.strerror or reason
+    return StorageError(message("recording_fails", path=path, step=step, reason=words))
+
+
 class RecordingFile:
     """One MCAP file in the making."""
 
@@ -83,11 +89,11 @@ class RecordingFile:
         try:
             self._file = open_new(path)
         except FileExistsError:
-            raise StorageError(f"{path}: exists already; nothing is overwritten") from None
+            raise _failed(path, "created", "exists already") from None
         except FileNotFoundError:
-            raise StorageError(f"{path}: there is no folder {path.parent}; make it, or name another") from None
+            raise _failed(path, "created", f"there is no folder {path.parent}") from None
         except OSError as error:
-            raise StorageError(f"{path}: cannot be created by the companion: {error.strerror or error}") from None
+            raise _failed(path, "created", error) from None
         # Without an index of messages: it would hold as many entries as the file has messages.
         self._writer: Any = Writer(
             self._file,
@@ -111,13 +117,13 @@ class RecordingFile:
                 raise OSError(errno.ENOSPC, f"less than {RESERVE_BYTES >> 20} MB free on the disk")
             if self._begun is None:
                 self._begin(beginning, Start(continues=continues))
-            for message in batch:
-                self._add(*message)
+            for recorded in batch:
+                self._add(*recorded)
             self._writer.flush()
             self._sync()
         except OSError as error:
             self._abandon()
-            raise StorageError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            raise _failed(self.path, "written", error) from error
         except BaseException:
             self._abandon()
             raise
@@ -129,7 +135,7 @@ class RecordingFile:
             self._writer.finish()
             self._sync()
         except OSError as error:
-            raise StorageError(f"{self.path}: cannot be finished: {error.strerror or error}") from error
+            raise _failed(self.path, "finished", error) from error
         finally:
             self._abandon()
 
@@ -142,8 +148,8 @@ class RecordingFile:
         self._writer.add_metadata(messages.METADATA, table)
         self._writer.add_attachment(started_ns, started_ns, messages.CONFIG, "application/json", beginning.config)
         self._add(messages.START, beginning.t_s, messages.encode(start))
-        for message in beginning.states:
-            self._add(*message)
+        for state in beginning.states:
+            self._add(*state)
 
     def _ns(self, t_s: float) -> int:
         """Return UTC in nanoseconds of a time on the daemon's clock; a replay subtracts the same whole offset."""
@@ -180,13 +186,13 @@ def unused_path(folder: Path) -> Path:
         folder.mkdir(FOLDER_MODE, exist_ok=True)
         numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
     except OSError as error:
-        raise StorageError(f"{folder}: {error.strerror or error}") from error
+        raise _failed(folder, "created", error) from error
     return folder / f"kept-{max(numbers, default=0) + 1:03d}.mcap"
 
 
 def create_on_request(path: Path) -> RecordingFile:
     if (shortage := disk_shortage(path.parent)) is not None:
-        raise StorageError(f"{path}: not recorded, with {shortage}; make room")
+        raise _failed(path, "created", shortage)
     return RecordingFile(path)
 
 
@@ -224,7 +230,7 @@ class Ring:
             with contextlib.suppress(StorageError):
                 self.close()
             self._continues = False
-            raise StorageError(f"{self.folder}: {error.strerror or error}") from error
+            raise _failed(self.folder, "written", error) from error
 
     def close(self) -> None:
         current, self._current = self._current, None

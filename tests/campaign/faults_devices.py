@@ -342,7 +342,7 @@ def faults() -> list[Fault]:
             drowned,
             dry,
             lasts_s=(4.0, 7.0),
-            names=r"floods us",
+            names=r"sends more than",
             excused=STILLNESS,
         ),
         Fault(

@@ -184,7 +184,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             assert not (tmp_path / "control.sock").exists()
             gone = await companion("-c", config, "status", "--json")
             assert gone.code == NO_DAEMON
-            assert "no daemon answers" in gone.json["reason"]
+            assert "the companion is not running" in gone.json["reason"]
             assert gone.err.count("\n") == 1
 
     asyncio.run(main())

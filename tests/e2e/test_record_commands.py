@@ -53,7 +53,7 @@ def test_record_calibrate_pull_the_plug_replay(tmp_path: Path) -> None:
             assert told["lost"] == 0
             again = await companion("-c", config, "record", str(mine))
             assert again.code == FAILED
-            assert "exists already; nothing is overwritten" in again.err
+            assert "recording cannot be created: exists already" in again.err
             nothing = await companion("-c", config, "record", "--stop")
             assert nothing.code == FAILED
             assert "nothing is being recorded" in nothing.err

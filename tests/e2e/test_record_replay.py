@@ -300,7 +300,10 @@ def test_recording_on_request(tmp_path: Path) -> None:
             # With a length, so that one that is not refused ends.
             for refused, words in (
                 ({"file": str(path), "seconds": 5.0}, "exists already"),
-                ({"file": str(absent), "seconds": 5.0}, f"{absent}: there is no folder {absent.parent}; make it"),
+                (
+                    {"file": str(absent), "seconds": 5.0},
+                    f"{absent}: recording cannot be created: there is no folder {absent.parent}",
+                ),
             ):
                 with pytest.raises(StorageError, match=words):
                     await asked(rig, **refused)
@@ -327,13 +330,15 @@ def test_a_recording_leaves_a_tenth_of_the_disk_free(
             assert not running.done()
             free = 9 << 30
             ended = (await running)[-1]
-            with pytest.raises(StorageError, match=r"other\.mcap: not recorded, with less than 10 % of the disk free"):
+            with pytest.raises(
+                StorageError, match=r"other\.mcap: recording cannot be created: less than 10 % of the disk"
+            ):
                 await asked(rig, file=str(tmp_path / "other.mcap"), seconds=5.0)
         assert not (tmp_path / "other.mcap").exists()
         return ended
 
     ended = run_virtual(main())
-    reason = "ended with less than 10 % of the disk free (9.7 of 107.4 GB)"
+    reason = "less than 10 % of the disk free (9.7 of 107.4 GB)"
     assert (ended["state"], ended["reason"]) == (state, reason)
     assert replay([tmp_path / "mine.mcap"]).cut_short is None
 

@@ -76,7 +76,7 @@ def test_an_announced_offset_that_is_not_in_force_disturbs_nothing(
             assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
 
     run_virtual(main())
-    assert "INS_GYROFFS_X = 0.3 was announced and is not in force" in caplog.text
+    assert "INS_GYROFFS_X = 0.3 was announced but is not active" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError
 from companion.estimation.records.validity import Why
 from companion.links.system.events import Listeners
+from companion.messages import message
 from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ class AutopilotImu:
         self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
         """Calibration that the autopilot subtracts, as read; None while unknown."""
-        self.problem = "not read yet"
+        self.problem = message("offsets_not_read", why="start")
         self.failures = 0
         self.upsets = 0
         self.upset = ""
@@ -109,7 +110,7 @@ class AutopilotImu:
     async def refresh(self) -> bool:
         """Read the offsets; False, with samples voided, where they differ. Raise AutopilotError if unreadable."""
         assumed, announced, self._announced = self.calibration, self._announced, None
-        why = "the autopilot's offsets were read anew" if announced is None else f"{announced[0]} was changed"
+        why = "offsets read again" if announced is None else f"{announced[0]} was changed"
         try:
             fresh = await read_calibration(self._parameters, self.instance, self._slots)
         except AutopilotError:
@@ -128,11 +129,12 @@ class AutopilotImu:
         holds = assumed is not None and assumed.corrects_like(fresh)
         if announced is not None:
             name, value, t_s = announced
-            words = "%s: somebody set %s to %.6g; measuring afresh"
+            change = f"{name} = {value:.6g}"
             if holds:
-                words = "%s: %s = %.6g was announced and is not in force"
+                logger.warning("%s", message("announced_value_not_active", imu=self.name, change=change))
                 holds = now_s - t_s <= CONFIRMED_WITHIN_S
-            logger.warning(words, self.name, name, value)
+            else:
+                logger.warning("%s", message("offsets_changed_by_others", imu=self.name, change=f": {change}"))
         if not holds:
             if assumed is not None:
                 self.upsets, self.upset = self.upsets + 1, why
@@ -176,7 +178,7 @@ class AutopilotImu:
 
     def _invalidate(self, why: str) -> None:
         self.calibration = None
-        self.problem = f"reading its offsets again ({why})"
+        self.problem = message("offsets_not_read", why=why)
         self._collector.reset(why, self.name)
         self.on_change.tell()
         self.reading.again()
@@ -220,7 +222,7 @@ class AutopilotImu:
             "name": self.name,
             "kind": "autopilot imu",
             "good": not problem,
-            "summary": problem or f"autopilot IMU {self.instance}, {kind.name if kind else 'no message'}",
+            "summary": problem or f"autopilot IMU {self.instance}, {kind.name if kind else 'no samples'}",
             "frames": self.stream.samples,
         }
 
@@ -288,7 +290,7 @@ class OffsetWatch:
                 self._lost(name, Why.FAILED if failed else Why.REPLACED)
             elif changed:
                 self.foreign = f"{name} was changed"
-                logger.warning("imu %s: somebody else changed its offsets; they are left alone", name)
+                logger.warning("%s", message("offsets_changed_by_others", imu=name, change=""))
                 self._lost(name, Why.CHANGED)
             elif restarted:
                 self._lost(name, Why.REBOOTED)

@@ -14,6 +14,7 @@ import numpy as np
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.sensors import SerialSensor
 from companion.estimation.collector.rolling import RollingCollector
+from companion.messages import message
 from companion.physics.frames import Array
 from companion.protocols.stream_health import Trouble
 
@@ -122,13 +123,13 @@ class SensorWatch:
         seen = self._seen(max(near_s, since_s - BEFORE_S), last_s) if "compass" in sensor.kinds else []
         turned_deg = min((abs(sum(turn_deg for *_, turn_deg in each)) for each in seen), default=0.0)
         if turned_deg > TURNED_DEG:
-            how = f"turned by {turned_deg:.0f} deg"
+            moved = f"turned by {turned_deg:.0f} deg"
         elif tilted_deg > TILTED_DEG and "gradienter" in sensor.kinds:
-            how = f"tilted by {tilted_deg:.0f} deg"
+            moved = f"tilted by {tilted_deg:.0f} deg"
         else:
             return None
-        words = f"stuck: the same reading for {last_s - since_s:.0f} s while the aircraft {how}"
-        return Trouble("stuck", f"{words}; switch its power off and on", implausible=True)
+        evidence = f"the same reading for {last_s - since_s:.0f} s while the aircraft {moved}"
+        return Trouble("stuck", message("sensor_stuck", evidence=evidence), implausible=True)
 
     def implausible(self) -> str | None:
         return next((words for plausible, words in self._troubles() if not plausible), None)

@@ -13,9 +13,10 @@ from typing import Final
 from companion.configured.models import Role, SerialDevice, parts_of
 from companion.daemon.core import Offload
 from companion.links.serial.bytestream import ByteLink
-from companion.links.serial.ports import find_holders
+from companion.links.serial.ports import find_holders, in_use
 from companion.links.system.connection import BYTES_PER_S, Budget
 from companion.links.system.events import Listeners
+from companion.messages import message
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.decoding.clock import LATE
 from companion.protocols.registry import Kind
@@ -76,7 +77,7 @@ class SensorHealth:
         if (breaks := self._decoder.times.clock.breaks) != self._breaks:
             self.counts[RESTARTED] += breaks - self._breaks
             self._breaks = breaks
-            self._warn(Trouble(RESTARTED, "the device restarted, or its clock jumped; measuring afresh"), now_s)
+            self._warn(Trouble(RESTARTED, message("device_restarted")), now_s)
         found = self.trouble(now_s)
         if found is not None and found.key == FLOOD:
             # The bytes thrown away have damaged its frames; two calls fall into FLOOD_S.
@@ -115,8 +116,7 @@ class SensorHealth:
 def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
     if budget is None or budget.exceeded_s is None or now_s - budget.exceeded_s >= FLOOD_S:
         return None
-    most = f"{BYTES_PER_S / 1e3:.0f} kB/s"
-    return Trouble(FLOOD, f"floods us (above {most}); the surplus is thrown away: another device, or a loop-back?")
+    return Trouble(FLOOD, message("port_flooded", most=f"{BYTES_PER_S / 1e3:.0f}"))
 
 
 class SensorRole:
@@ -143,14 +143,15 @@ class SensorRole:
         if self._last_s is not None and now_s - self._last_s < SILENT_AFTER_S:
             return None
         if self.kind == "compass" and (north := sensor.other_north) is not None:
-            return f'{port}: its headings are {north}, compass.reference is another; set reference = "{north}"'
-        return f"{port}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
+            return message("compass_reference_wrong", port=port, north=north)
+        return message("frames_without", port=port, protocol=sensor.protocol, wanted=_WANTED[self.kind])
 
     def status(self) -> dict[str, object]:
         sensor, now_s = self._sensor, asyncio.get_running_loop().time()
         trouble, words = sensor.health.trouble(now_s), sensor.text
         problem = self._problem(now_s) if trouble is None else trouble.words
-        summary = problem or f"{sensor.protocol} on {sensor.link.settings.url}, {self._rate_hz:.0f} frames/s"
+        rate, port = f"{self._rate_hz:.0f}", sensor.link.settings.url
+        summary = problem or message("sensor_state", protocol=sensor.protocol, port=port, rate=rate)
         if problem is None and sensor.health.counts:
             summary += f"; so far {', '.join(f'{count} {key}' for key, count in sensor.health.counts.items())}"
         others = [role.name for role in sensor.roles if role is not self]
@@ -173,7 +174,7 @@ class SensorRole:
             "counts": dict(sensor.health.counts),
             "protocol": sensor.protocol,
             "speaks": sensor.health.stream.speaks,
-            "port": sensor.link.settings.url,
+            "port": port,
         }
 
 
@@ -269,7 +270,8 @@ class SerialSensor:
         holders = () if port.is_tcp else await self._offload(find_holders, port.url)
         if opening != self._openings:
             return
-        self._held_by = ", ".join(f"{other.name} {other.pid}" for other in holders if other.pid != os.getpid())
+        others = [other for other in holders if other.pid != os.getpid()]
+        self._held_by = in_use(port.url, others) if others else ""
         self._alone = not self._held_by
         self._look_at_s = asyncio.get_running_loop().time() + (LOOK_AGAIN_S if self._alone else HELD_AGAIN_S)
         if self._held_by:
@@ -292,5 +294,5 @@ class SerialSensor:
     @property
     def text(self) -> str:
         if self._held_by:
-            return f"nothing is said to it: {self._held_by} has the port open too"
+            return self._held_by
         return self.dialogue.words if self.dialogue is not None else ""

@@ -17,6 +17,7 @@ from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EARLIEST_S, TICKS_PER_S, Reason, Signing, read_key, ticks_of, uptime_s
+from companion.messages import message
 from companion.storage.records import SIGNING_FILE, SigningTime, signing_time_in, this_boot
 
 logger = logging.getLogger(__name__)
@@ -36,7 +37,7 @@ AHEAD_OF_CLOCK_S: Final = 86400.0
 
 _COUNTED: Final[tuple[Reason, ...]] = ("other key", "unsigned", "old")
 _FAULTS: Final = {
-    "wants ours": "the autopilot wants signatures: give the companion its key (signing_key_file)",
+    "required": "the autopilot wants signatures: give the companion its key (signing_key_file)",
     "other key": "the autopilot signs with another key: give both the same one",
     "unsigned": "the autopilot does not sign on this link: give it the companion's key",
     "old": "the autopilot's signatures are old, not believed: wait some seconds, or restart it",
@@ -45,7 +46,7 @@ _FAULTS: Final = {
 _SENDERS: Final[dict[Reason, str]] = {
     "unsigned": "does not sign",
     "other key": "signs with another key",
-    "old": "sends what is older than before",
+    "old": "repeats old messages",
 }
 
 
@@ -113,16 +114,16 @@ class LinkSigning:
             signing.key = read_key(path)
         except LinkError as error:
             if str(error) != self.trouble:
-                logger.warning("mavlink: no signing: %s", error)
+                logger.warning("mavlink: %s", error)
             self.trouble = str(error)
             return
         self.trouble = ""
         signing.doubted.clear()
-        logger.info("mavlink: what is sent is signed, what comes unsigned is %s", self._fate)
+        logger.info("mavlink: sent messages are signed, unsigned ones are %s", self._fate)
 
     @property
     def _fate(self) -> str:
-        return "dropped" if self.mode == "require" else "taken all the same"
+        return "dropped" if self.mode == "require" else "accepted"
 
     async def _reserve(self, signing: Signing, ahead_s: float) -> None:
         now = signing.clock.now()
@@ -132,7 +133,7 @@ class LinkSigning:
             self._write_failed = False
         except StorageError as error:
             level = logging.DEBUG if self._write_failed else logging.WARNING
-            logger.log(level, "mavlink signing: after a restart its time may go back: %s", error)
+            logger.log(level, "%s", message("signing_time_not_saved", reason=error))
             self._write_failed = True
 
     def _is_autopilot(self, system: int, component: int) -> bool:
@@ -150,11 +151,11 @@ class LinkSigning:
         if reason in self._named:
             return
         self._named.add(reason)
-        words = _SENDERS[reason]
-        logger.warning("mavlink: %d/%d %s: its messages are %s", system, component, words, self._fate)
+        sender = f"{system}/{component}"
+        words = message("sender_not_verified", sender=sender, fault=_SENDERS[reason], fate=self._fate)
+        logger.warning("%s", words)
         if self.mode == "require":
-            text = f"Somebody {words}, and is ignored: system {system}, component {component}"
-            self._say(Severity.WARNING, text, Weight.NEWS)
+            self._say(Severity.WARNING, words, Weight.NEWS)
 
     def _on_timesync(self, message: mavlink.MAVLink_timesync_message, _t_s: float) -> None:
         if message.tc1 and message.ts1 == self._asked and self._vehicle.sent(message):
@@ -169,9 +170,8 @@ class LinkSigning:
             logger.warning("mavlink: %s", found)
             self._say(Severity.WARNING, found, Weight.NEWS)
         elif self.signing is not None or self._vehicle.alive:
-            words = "Autopilot answers again" if self.signing is None else "Autopilot's signatures are right again"
-            logger.info("mavlink: %s", words)
-            self._say(Severity.NOTICE, words, Weight.NEWS)
+            logger.info("mavlink: %s", message("signing_fault_over"))
+            self._say(Severity.NOTICE, message("signing_fault_over"), Weight.NEWS)
 
     def _refused_by_autopilot(self, now_s: float) -> str | None:
         if not self._vehicle.alive or not self._vehicle.signs:
@@ -179,7 +179,7 @@ class LinkSigning:
         elif now_s >= self._ask_s:
             self._asked, self._unanswered = round(now_s * 1e9), self._unanswered + 1
             self._link.send(mavlink.MAVLink_timesync_message(0, self._asked))
-        return _FAULTS["wants ours"] if self._unanswered > UNANSWERED else None
+        return _FAULTS["required"] if self._unanswered > UNANSWERED else None
 
     def _refuses(self, signing: Signing, now_s: float) -> str | None:
         if self._verified:
@@ -207,7 +207,8 @@ class LinkSigning:
         if not self._refused or self._vehicle.alive:
             return None
         found = max(_COUNTED, key=lambda reason: self._refused[reason])
-        return f"{self._refused[found]} messages dropped: {_fault_of(self.signing, found)}"
+        fault = _fault_of(self.signing, found)
+        return message("autopilot_messages_dropped", count=self._refused[found], fault=fault)
 
     def status(self) -> dict[str, Any] | None:
         if self.signing is None and self.warning is None:

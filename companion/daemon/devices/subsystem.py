@@ -32,6 +32,7 @@ from companion.estimation.stillness.plausible import misplaced
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.events import Listeners
+from companion.messages import message
 from companion.physics.units import G
 from companion.samples import ImuSample, Sample
 
@@ -43,7 +44,7 @@ class Reach:
     """Knows whether a ground station reaches the companion, and what the autopilot's parameters say of forwarding."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
-        self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
+        self._vehicle, self._parameters, self._url = vehicle, parameters, url
         self._heard_s = -math.inf
         self._closed: list[str] = []
         self.reading = RepeatedRead(vehicle, self._read, RETRY_S)
@@ -51,17 +52,14 @@ class Reach:
 
     def text(self) -> tuple[bool, str]:
         if not self._vehicle.alive:
-            return True, "not known: no autopilot"
+            return True, message("autopilot_not_heard", url=self._url)
         answers = (word for word, count in self._vehicle.commands.results.items() if count)
         if not self._parameters.answering and set(answers) <= {"no answer", "dropped"}:
-            needs = "" if self._baud is None else f"; {port_needs(self._vehicle.firmware, self._baud)}"
-            return False, (
-                "the autopilot is heard but does not answer: it does not hear our heartbeat, so nobody can reach the"
-                " companion through it; check the wire to the autopilot's RX, the baud rate and the port's protocol"
-                f"{needs}{self._vehicle.why_silent}"
-            )
+            baud = baud_of(self._url)
+            needs = "" if baud is None else f"; {port_needs(self._vehicle.firmware, baud)}"
+            return False, message("autopilot_does_not_answer", needs=f"{needs}{self._vehicle.why_silent}")
         if asyncio.get_running_loop().time() - self._heard_s < SILENT_S:
-            return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"
+            return True, message("ground_station_heard")
         return self._vehicle.kind.forwarding_words(self._closed)
 
     async def _read(self) -> None:
@@ -98,7 +96,8 @@ class Devices(Subsystem):
 
     @property
     def not_heard(self) -> str:
-        return ": ".join(filter(None, (f"not heard yet on {self._core.config.mavlink.url}", self.signing.rejecting)))
+        words = message("autopilot_not_heard", url=self._core.config.mavlink.url)
+        return ": ".join(filter(None, (words, self.signing.rejecting)))
 
     def load(self) -> None:
         self.signing.load()

@@ -26,6 +26,7 @@ from typing import Final, Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import LinkError
+from companion.messages import message
 
 EPOCH_S: Final = 1420070400
 TICKS_PER_S: Final = 100_000
@@ -199,16 +200,20 @@ def read_key(path: Path) -> bytes:
             rights = os.fstat(file.fileno()).st_mode
             content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise LinkError(f"signing key file {path}: {error.strerror or type(error).__name__}") from None
+        raise _unusable(path, error.strerror or type(error).__name__) from None
     if rights & (stat.S_IROTH | stat.S_IWOTH):
-        raise LinkError(f"signing key file {path}: everybody on this computer may open it: chmod 600 {path}")
+        raise _unusable(path, f"everybody on this computer may open it: chmod 600 {path}")
     # 32 random bytes look like typed text once in 10^13.
     typed = all(32 <= byte < 127 or byte in b"\r\n" for byte in content)
     key = content if len(content) == KEY_BYTES and not typed else _from_text(content, path)
     if not any(key):
         # All zero means "no signing" in SETUP_SIGNING.
-        raise LinkError(f"signing key file {path}: a key of zeros is none")
+        raise _unusable(path, "the key is all zeros")
     return key
+
+
+def _unusable(path: Path, fault: str) -> LinkError:
+    return LinkError(message("signing_key_unusable", path=path, fault=fault))
 
 
 def _from_text(content: bytes, path: Path) -> bytes:
@@ -220,8 +225,8 @@ def _from_text(content: bytes, path: Path) -> bytes:
     except UnicodeDecodeError:
         passphrase = ""
     if len(content) > MAX_FILE_BYTES or len(passphrase) < LEAST_PASSPHRASE or not passphrase.isprintable():
-        raise LinkError(
-            f"signing key file {path}: found {len(content)} bytes; wanted: 32 bytes, 64 hexadecimal digits, or a"
-            f" passphrase of {LEAST_PASSPHRASE} characters or more on one line"
+        wanted = (
+            f"32 bytes, 64 hexadecimal digits, or a passphrase of {LEAST_PASSPHRASE} characters or more on one line"
         )
+        raise _unusable(path, f"found {len(content)} bytes; wanted: {wanted}")
     return hashlib.sha256(line).digest()

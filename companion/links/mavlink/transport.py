@@ -15,6 +15,7 @@ from companion.errors import LinkError
 from companion.links.mavlink.link import MavlinkLink, Sender
 from companion.links.serial.bytestream import ByteLink, PortSettings
 from companion.links.system.connection import OnState, Reconnection
+from companion.messages import message
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
@@ -75,13 +76,13 @@ async def _run_udp(
             async with asyncio.timeout(RESOLVE_DEADLINE_S):
                 transport, udp = await asyncio.get_running_loop().create_datagram_endpoint(factory, **end)  # type: ignore[arg-type]
         except TimeoutError:
-            return f"{url}: the name is not resolved within {RESOLVE_DEADLINE_S:g} s"
+            return message("no_connection", url=url, reason=f"host name unknown after {RESOLVE_DEADLINE_S:g} s")
         except (OSError, UnicodeError) as error:
-            return f"{url}: {getattr(error, 'strerror', None) or error}"
+            return message("no_connection", url=url, reason=getattr(error, "strerror", None) or error)
         host, port = transport.get_extra_info("sockname")[:2]
         reconnection.up(f"{url} is open at {host}:{port}")
         try:
-            return f"{url}: {await udp.run()}"
+            return message("no_connection", url=url, reason=await udp.run())
         finally:
             transport.abort()
             link.attach(None)

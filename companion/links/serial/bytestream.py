@@ -13,6 +13,7 @@ from companion.config.sections import Parity
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.system.connection import Budget, OnState, Reconnection, connect_tcp, words_of
+from companion.messages import message
 
 READ_BYTES = 4096  # size of a tty's buffer: one read empties the port, so one time stamp holds for it all
 QUICK_READS = 20
@@ -264,11 +265,10 @@ class ByteLink:
 
     def _explain(self, error: OSError | None) -> str:
         url = self.settings.url
-        if self.settings.is_tcp:
-            return f"{url}: {'the other side closed the connection' if error is None else words_of(error)}"
-        if error is None or error.errno in (errno.EIO, errno.ENXIO, errno.ENODEV):
-            return f"{url}: the device is gone; unplugged?"
-        return f"{url}: {words_of(error)}"
+        if not self.settings.is_tcp and (error is None or error.errno in (errno.EIO, errno.ENXIO, errno.ENODEV)):
+            return message("device_gone", port=url)
+        reason = "the other side closed the connection" if error is None else words_of(error)
+        return message("no_connection", url=url, reason=reason)
 
     def _lose(self, reason: str) -> None:
         # At once, not when `run` gets to it: while a dead descriptor is open, the device comes back under another name.

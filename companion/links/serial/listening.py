@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import LinkError
-from companion.links.serial.port import SerialOpener, close_serial
-from companion.links.serial.ports import ROOT, SerialPort, find_holders
+from companion.links.serial.port import DRIVER_REFUSES, SerialOpener, close_serial
+from companion.links.serial.ports import ROOT, SerialPort, find_holders, in_use
 from companion.links.system.events import comes
+from companion.messages import message
 from companion.protocols.guess import (
     ENOUGH_BYTES,
     Candidate,
@@ -76,8 +77,7 @@ async def listen_to_all(
 async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
     """Try line settings, likely ones first, for half a minute at most; raise LinkError if it cannot be opened."""
     if holders := [holder for holder in find_holders(path, root) if holder.pid != os.getpid()]:
-        who = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
-        raise LinkError(f"{path}: in use by another program ({who}); a port serves one reader only")
+        raise LinkError(in_use(path, holders))
     heard, plain = 0, dict[int, float]()
     bauds: list[int] = []
     for number, line in enumerate(lines_to_try(first)):
@@ -88,14 +88,14 @@ async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> He
         try:
             data = await _bytes_at(path, line, most_s=LINE_MOST_S if number else SILENT_S)
         except LinkError as error:
-            if "refuses" in str(error):
+            if DRIVER_REFUSES in str(error):
                 continue  # a speed that this driver does not know
             raise
         heard += len(data)
         if senders := heartbeats(data):
             speaker = senders[0]
             autopilot = speaker if speaker.is_autopilot else None
-            return Heard(line, None, f"MAVLink: {speaker}, which belongs into [mavlink]", heard, autopilot)
+            return Heard(line, None, message("mavlink_on_the_port", speaker=speaker), heard, autopilot)
         if (found := likeliest(data)) is not None:
             return Heard(line, found, None, heard)
         if (stranger := strangers(data)) is not None:

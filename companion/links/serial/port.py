@@ -19,10 +19,13 @@ from collections.abc import Callable
 
 from companion.config.sections import Parity
 from companion.errors import LinkError
-from companion.links.serial.ports import find_holders
+from companion.links.serial.ports import find_holders, in_use
+from companion.messages import message
 
 OPEN_DEADLINE_S = 5.0
 """A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
+
+DRIVER_REFUSES = "the driver refuses"
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
@@ -73,22 +76,22 @@ def _finish_settings(descriptor: int, parity: Parity) -> None:
 def explain(path: str, baud: int, error: Exception) -> str:
     number = _errno_of(error)
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return f"{path}: no such device; is it plugged in? (`companion ports` lists what is there)"
+        return message("no_device", port=path)
     if number == errno.EPERM:
         # Not the file's mode: systemd's device control, which knows the classes of the drivers loaded at its start.
-        return f"{path}: not permitted: the service's unit does not allow this kind of port (docs/service.md)"
+        return message("port_access_denied", port=path, why="the service's unit does not allow this kind of port")
     if number == errno.EACCES:
-        return f"{path}: permission denied; {_who_may(path)}"
+        return message("port_access_denied", port=path, why=_who_may(path))
     if number in (errno.EBUSY, errno.EAGAIN):
-        holders = ", ".join(f"{holder.name}, process {holder.pid}" for holder in find_holders(path))
-        return f"{path}: in use by another program{f' ({holders})' if holders else ''}; a port serves one reader only"
+        return in_use(path, find_holders(path))
     if number == errno.EIO:
-        return f"{path}: the device does not answer (input/output error); is it still plugged in?"
+        return message("device_gone", port=path)
+    reason: object = error
     if not _is_character_device(path):
-        return f"{path}: not a serial port"
-    if isinstance(error, ValueError | OverflowError) or number == errno.EINVAL:
-        return f"{path}: the driver refuses {baud} baud"
-    return f"{path}: cannot be opened: {error}"
+        reason = "not a serial port"
+    elif isinstance(error, ValueError | OverflowError) or number == errno.EINVAL:
+        reason = f"{DRIVER_REFUSES} {baud} baud"
+    return message("port_cannot_be_opened", port=path, reason=reason)
 
 
 def _errno_of(error: Exception) -> int | None:
@@ -104,7 +107,7 @@ def _who_may(path: str) -> str:
     try:
         status = os.stat(path)
     except OSError:
-        return f"user {user} may not look into the folder"
+        return f"user {user} may not open the folder"
     group = _name_of(grp.getgrgid, status.st_gid)
     mode = stat.S_IMODE(status.st_mode)
     if mode & stat.S_IRGRP and mode & stat.S_IWGRP and status.st_gid != 0:
@@ -140,7 +143,7 @@ class SerialOpener:
     async def open(self) -> int:
         """Return the descriptor of the opened port, none when cancelled; raise LinkError with port and cause."""
         if self._thread is not None and self._thread.is_alive():
-            raise LinkError(f"{self._path}: the driver still hangs in the last attempt to open; replug the device")
+            raise LinkError(message("port_cannot_be_opened", port=self._path, reason="the driver hangs"))
         loop = asyncio.get_running_loop()
         opened: asyncio.Future[int] = loop.create_future()
         self._thread = threading.Thread(
@@ -152,7 +155,8 @@ class SerialOpener:
             async with asyncio.timeout(OPEN_DEADLINE_S):
                 descriptor = await opened
         except TimeoutError:
-            raise LinkError(f"{self._path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
+            reason = f"no answer of the driver within {OPEN_DEADLINE_S:g} s"
+            raise LinkError(message("port_cannot_be_opened", port=self._path, reason=reason)) from None
         finally:
             # Cancelled between the thread's word and our turn: it is nobody's otherwise.
             if descriptor is None and opened.done() and not opened.cancelled() and opened.exception() is None:
@@ -166,7 +170,7 @@ class SerialOpener:
         except LinkError as error:
             found = error
         except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
-            found = LinkError(f"{self._path}: cannot be opened: {error!r}")
+            found = LinkError(message("port_cannot_be_opened", port=self._path, reason=repr(error)))
 
         def hand_over() -> None:
             if isinstance(found, LinkError):

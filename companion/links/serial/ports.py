@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.formats import printable
+from companion.messages import message
 
 ROOT = Path("/")
 _BY_ID, _BY_PATH = "/dev/serial/by-id/", "/dev/serial/by-path/"
@@ -63,6 +64,12 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
 
 def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     return tuple(_holders_by_device(root).get(resolve(root, device), ()))
+
+
+def in_use(port: str, holders: Sequence[Holder]) -> str:
+    """Return the message that other programs have the port open; their names are unknown to some users."""
+    programs = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
+    return message("port_in_use", port=port, programs=f" ({programs})" if programs else "")
 
 
 def _describe(
@@ -191,6 +198,7 @@ def _number(path: Path, base: int) -> int | None:
 
 SLOW_TIMER_MS: Final = 1
 _GETTY: Final = re.compile(r"a?getty|login|mgetty|getty")
+_MODEM_REMEDY: Final = "sudo companion install-service (its udev rule), or: sudo systemctl disable --now ModemManager"
 _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 
@@ -217,19 +225,15 @@ def port_faults(
     holders = [] if found is None else [holder for holder in found.holders if holder.pid not in ours]
     faults = [*_console(device, found, holders, root)]
     for holder in holders:
-        if holder.name == "ModemManager":
-            words = f"ModemManager (process {holder.pid}) has {device} open, and sends commands to it"
-            remedy = "sudo companion install-service (its udev rule), or: sudo systemctl disable --now ModemManager"
-            faults.append(PortFault(words, remedy))
-        elif not _GETTY.fullmatch(holder.name):
-            who = f"{holder.name} (process {holder.pid})"
-            words = f"{who} has {device} open too: each of two readers gets a part of the bytes"
-            faults.append(PortFault(words, f"end it (sudo kill {holder.pid}), and what starts it"))
+        if not _GETTY.fullmatch(holder.name):
+            remedy = f"sudo kill {holder.pid}, and end the service that starts it"
+            remedy = _MODEM_REMEDY if holder.name == "ModemManager" else remedy
+            faults.append(PortFault(in_use(device, [holder]), remedy))
     if found is None:
         return faults
     if found.latency_timer_ms is not None and found.latency_timer_ms > SLOW_TIMER_MS:
         name = device.removeprefix("/dev/")
-        words = f"the FTDI bridge collects bytes for {found.latency_timer_ms} ms, samples come in bunches"
+        words = message("usb_bridge_delays", port=device, milliseconds=found.latency_timer_ms)
         remedy = (
             f"sudo sh -c 'echo 1 > /sys/bus/usb-serial/devices/{name}/latency_timer'"
             " (for good: sudo companion install-service)"
@@ -237,8 +241,8 @@ def port_faults(
         faults.append(PortFault(words, remedy, good=not is_fast))
     if _PASSING.fullmatch(port):
         stable = found.stable_name
-        remedy = f'set port = "{stable}"' if stable is not None else "start udev, which gives a name that stays"
-        faults.append(PortFault(f"the name {port} changes with the order of plugging", remedy, good=True))
+        remedy = f'set port = "{stable}"' if stable is not None else "set up udev, which gives permanent names"
+        faults.append(PortFault(message("port_name_changes", port=port), remedy, good=True))
     return faults
 
 
@@ -262,11 +266,12 @@ def _console(device: str, port: SerialPort | None, holders: Sequence[Holder], ro
     # Another user's process shows by its command line only.
     gettys = [holder for holder in holders if _GETTY.fullmatch(holder.name)] or list(_gettys_on(name, root))
     if gettys:
-        who = f"{gettys[0].name}, process {gettys[0].pid}"
+        console = f"a login console ({gettys[0].name}, process {gettys[0].pid})"
         remedy = f"{disable} and {boot}" if is_console else disable
-        yield PortFault(f"a login console runs on {device} ({who})", remedy)
+        yield PortFault(message("console_on_the_port", port=device, console=console), remedy)
     elif is_console:
-        yield PortFault(f"the kernel's messages go to {device}", f"{boot}; {disable}")
+        words = message("console_on_the_port", port=device, console="kernel messages")
+        yield PortFault(words, f"{boot}; {disable}")
 
 
 def _gettys_on(name: str, root: Path) -> Iterator[Holder]:

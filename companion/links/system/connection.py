@@ -23,6 +23,7 @@ import msgspec
 
 from companion.errors import DaemonDeniedError, DaemonUnreachableError, LinkError
 from companion.formats import Object
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -101,21 +102,21 @@ async def connect_tcp(url: str, address: tuple[str, int]) -> int:
     """Connect to the first address of a host that answers and return the descriptor; raise LinkError with the cause."""
     host, port = address
     loop = asyncio.get_running_loop()
-    reason = f"{url}: the host has no address"
+    reason = "the host has no address"
     try:
         async with asyncio.timeout(CONNECT_DEADLINE_S):
             for family, kind, protocol, _, found in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
                 try:
                     return await _connect(loop, socket.socket(family, kind, protocol), found)
                 except OSError as error:
-                    reason = f"{url}: {words_of(error)}"
+                    reason = words_of(error)
     except TimeoutError:
-        reason = f"{url}: no answer within {CONNECT_DEADLINE_S:g} s"
+        reason = f"no answer within {CONNECT_DEADLINE_S:g} s"
     except (socket.gaierror, UnicodeError) as error:
-        reason = f"{url}: host {host} is not known ({error})"
+        reason = f"unknown host {host} ({error})"
     except OSError as error:
-        reason = f"{url}: {words_of(error)}"
-    raise LinkError(reason)
+        reason = words_of(error)
+    raise LinkError(message("no_connection", url=url, reason=reason))
 
 
 async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, address: tuple[object, ...]) -> int:
@@ -175,8 +176,8 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
             error.errno or 0, str(error)
         )
         if error.errno == errno.EACCES:
-            raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
-        raise DaemonUnreachableError(f"no daemon answers at {path} ({why})") from None
+            raise DaemonDeniedError(message("control_socket_denied", path=path, who=_who_may(path))) from None
+        raise DaemonUnreachableError(message("companion_not_running", path=path, why=why)) from None
     try:
         await write_line(writer, request)
         while line := await reader.readline():
@@ -184,9 +185,11 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
             yield reply
             if reply.get("kind") in ("result", "error"):
                 return
-        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer")
+        raise ConnectionResetError
     except ConnectionError:
-        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer") from None
+        raise DaemonUnreachableError(
+            message("companion_not_running", path=path, why="ended its answer early")
+        ) from None
     finally:
         writer.close()
         with contextlib.suppress(ConnectionError):
@@ -210,4 +213,4 @@ def _who_may(path: Path) -> str:
             return f"only group {grp.getgrgid(found.st_gid).gr_name} and root may: usermod -aG, log in again; or sudo"
     except (OSError, KeyError):
         pass
-    return "permission denied, try with sudo"
+    return "permission denied, use sudo"

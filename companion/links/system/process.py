@@ -28,6 +28,7 @@ import msgspec
 from companion.config.sections import Config
 from companion.formats import Object, printable
 from companion.links.system.connection import Budget
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -118,13 +119,15 @@ class ServiceManager:
     def from_environment(cls, environment: Mapping[str, str] = os.environ, process_id: int | None = None) -> Self:
         address = environment.get("NOTIFY_SOCKET") or None
         if address is not None and address[0] not in "/@":
-            logger.warning("NOTIFY_SOCKET: found %r; allowed: a path or @NAME; nobody is told", address)
+            reason = f"NOTIFY_SOCKET: found {address!r}; allowed: a path or @NAME"
+            logger.warning("%s", message("systemd_not_notified", reason=reason))
             address = None
         try:
             watchdog_us = int(environment.get("WATCHDOG_USEC") or 0)
             for_us = int(environment.get("WATCHDOG_PID") or 0) in (0, process_id or os.getpid())
         except ValueError:
-            logger.warning("WATCHDOG_USEC or WATCHDOG_PID is not a whole number; the watchdog is not fed")
+            reason = "WATCHDOG_USEC or WATCHDOG_PID is not a whole number"
+            logger.warning("%s", message("systemd_not_notified", reason=reason))
             return cls(address)
         return cls(address, watchdog_us * 1e-6 if for_us and watchdog_us > 0 else None)
 
@@ -155,7 +158,7 @@ class ServiceManager:
             self._socket.sendto(line.encode(), address)
         except OSError as error:
             level, why = logging.DEBUG if self._warned else logging.WARNING, error.strerror or error
-            logger.log(level, "the service manager cannot be told at %s: %s", self._address, why)
+            logger.log(level, "%s", message("systemd_not_notified", reason=f"{self._address}: {why}"))
             self._warned = True
             return False
         return True

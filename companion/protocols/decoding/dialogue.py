@@ -8,6 +8,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Final
 
+from companion.messages import message
+
 SILENT_S: Final = 2.0  # silence of a streaming device before anything is sent to it
 ANSWER_S: Final = 1.0  # wait for an answer before the next question; no polled device documents a delay
 PATIENCE: Final = 3
@@ -70,7 +72,8 @@ class PollDialogue(Dialogue):
             return b""
         self._asked_s, self._next_s, self._since_asked = t_s, t_s + self.period_s, 0
         answers = ", no answer yet" if self._unanswered else ""
-        self.words = f"asked {1.0 / self.period_s:.0f} times a second with {self._name}{answers}"
+        rate = f"{1.0 / self.period_s:.0f}"
+        self.words = message("sensor_polled", rate=rate, command=self._name, answers=answers)
         set_up, self._set_up = self._set_up, True
         return self._question if set_up else self._first
 

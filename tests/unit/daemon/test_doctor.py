@@ -104,7 +104,7 @@ def test_a_login_console_is_named_with_what_ends_it(board: Board) -> None:
     board.process(412, "agetty", "-o", "-p", "--keep-baud", "115200,57600", "ttyS0", "vt220", opened=("/dev/ttyS0",))
     (line,) = [line for line in faults(board, "/dev/ttyS0") if "console" in line]
     assert line == (
-        "a login console runs on /dev/ttyS0 (agetty, process 412): "
+        "/dev/ttyS0 carries a login console (agetty, process 412): "
         "sudo systemctl disable --now serial-getty@ttyS0.service"
     )
     board.write("proc/cmdline", "console=ttyS0,115200 console=tty1\n")
@@ -118,9 +118,9 @@ def test_modem_manager_is_named_with_what_keeps_it_away(board: Board) -> None:
     assert not any("Modem" in line for line in faults(board, "/dev/ttyUSB1")), "it leaves the port alone"
     (board.root / "proc/600/fd/7").symlink_to("/dev/ttyUSB1")
     lines = faults(board, "/dev/ttyUSB1")
-    assert any("ModemManager (process 600) has /dev/ttyUSB1 open" in line for line in lines)
+    assert any("/dev/ttyUSB1: in use by another program (ModemManager, process 600)" in line for line in lines)
     assert any("sudo companion install-service" in line for line in lines)
-    assert not any("open too" in line for line in lines), "one line is enough"
+    assert sum("in use" in line for line in lines) == 1, "one line is enough"
 
 
 def test_a_second_reader_is_named_unless_it_is_ours(board: Board) -> None:
@@ -130,8 +130,8 @@ def test_a_second_reader_is_named_unless_it_is_ours(board: Board) -> None:
     (finding,) = found
     assert finding.name == "own"
     assert not finding.good
-    assert finding.words.startswith("gpsd (process 1234) has /dev/ttyUSB0 open too")
-    assert finding.remedy.startswith("end it (sudo kill 1234)")
+    assert finding.words.startswith("/dev/ttyUSB0: in use by another program (gpsd, process 1234)")
+    assert finding.remedy.startswith("sudo kill 1234, ")
     assert len(system_findings(config(), [], board.root)) == 2
 
 

@@ -67,7 +67,7 @@ def test_an_autopilot_that_never_answers_does_not_hear_us() -> None:
     autopilot.on_message = deaf
     good, words = words_of(autopilot)
     assert not good
-    assert "does not hear our heartbeat" in words
+    assert "sends but does not answer: check the wire to its RX" in words
 
 
 def test_ardupilot_needs_nothing_but_our_heartbeat() -> None:

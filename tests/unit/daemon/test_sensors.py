@@ -131,7 +131,7 @@ def test_headings_to_another_north_than_the_configured_one_are_refused_in_words(
         assert taken == []
         status = sensor.roles[0].status()
         assert not status["good"]
-        assert 'its headings are true, compass.reference is another; set reference = "true"' in str(status["summary"])
+        assert 'its headings are true; set compass.reference = "true"' in str(status["summary"])
         sensor.receive(sentence("HEHDM,92.0,M") + sentence("PTNTHPR,92.0,N,1.0,N,2.0,N"), now_s())
         assert [part.heading_deg for _, part in taken if isinstance(part, CompassSample)] == [92.0, 92.0]
         assert sensor.roles[0].status()["good"]
@@ -257,7 +257,7 @@ def test_while_another_program_has_the_port_open_nothing_is_sent(monkeypatch: py
         sensor = SerialSensor(device(*BOTH, dialogue=Chatterbox, port=path), lambda role, part: None)
         running = asyncio.create_task(sensor.run())
         try:
-            await until(lambda: "has the port open too" in sensor.text)
+            await until(lambda: "in use by another program" in sensor.text)
             assert str(other.pid) in sensor.text
             await asyncio.sleep(0.6)  # more than two looks: time enough for a byte that must not come
             assert arrived(master) == b""

@@ -236,6 +236,7 @@ def run_as_nobody(code: str) -> str:
     drop = f"import os\nos.setgroups([])\nos.setgid({NOBODY})\nos.setuid({NOBODY})\n" if IS_ROOT else "import os\n"
     imports = (
         "import serial\nfrom companion.errors import LinkError\nfrom companion.links.serial.port import open_serial\n"
+        "from companion.messages import catalogue\ncatalogue()\n"
     )
     root = Path(__file__).parents[3]
     command = [sys.executable, "-c", imports + drop + code]
@@ -289,7 +290,7 @@ def test_a_port_that_was_given_back_can_be_opened_by_others(path: Path) -> None:
 def test_what_is_no_port_is_said_to_be_none(tmp_path: Path) -> None:
     plain = tmp_path / "file"
     plain.write_text("not a tty")
-    with pytest.raises(LinkError, match=r"file: not a serial port$"):
+    with pytest.raises(LinkError, match=r"file: cannot be opened: not a serial port$"):
         open_serial(str(plain), 9600, "none")
     with pytest.raises(LinkError, match="no such device"):
         open_serial(str(tmp_path / "missing"), 9600, "none")
@@ -338,7 +339,7 @@ def test_speed_and_parity_are_set(
 
 
 def test_a_speed_that_cannot_be_is_refused(path: Path) -> None:
-    with plugged(path), pytest.raises(LinkError, match=r"imu: the driver refuses 99999999999 baud$"):
+    with plugged(path), pytest.raises(LinkError, match=r"imu: cannot be opened: the driver refuses 99999999999 baud$"):
         open_serial(str(path), 99_999_999_999, "none")
 
 
@@ -409,8 +410,8 @@ def test_a_driver_that_hangs_is_reported_and_not_asked_again(path: Path, monkeyp
 
     async def main() -> None:
         async with running(path) as port:
-            assert "the driver has not opened it within 0.05 s" in await port.state(connected=False)
-            assert "the driver still hangs" in await port.state(connected=False)
+            assert "no answer of the driver within 0.05 s" in await port.state(connected=False)
+            assert "the driver hangs" in await port.state(connected=False)
 
     asyncio.run(main())
     release.set()
@@ -564,7 +565,7 @@ def test_a_peer_that_vanishes_without_a_word_is_probed() -> None:
         ("tcp://127.0.0.1", "allowed: tcp://HOST:PORT"),
         ("tcp://:80", "allowed: tcp://HOST:PORT"),
         ("tcp://[::1:80", "allowed: tcp://HOST:PORT"),
-        ("tcp://" + "a" * 80 + ".invalid:80", "is not known"),
+        ("tcp://" + "a" * 80 + ".invalid:80", "no connection: unknown host "),
     ],
 )
 def test_an_address_that_cannot_be_is_reported_and_does_not_end_the_link(url: str, message: str) -> None:
@@ -588,4 +589,4 @@ def test_explanations_name_the_mode_of_a_device() -> None:
 
 def test_what_the_units_device_control_forbids_is_not_taken_for_a_missing_group() -> None:
     said = serial_port.explain("/dev/null", 9600, PermissionError(1, "Operation not permitted"))
-    assert said.startswith("/dev/null: not permitted: the service's unit does not allow this kind of port")
+    assert said.startswith("/dev/null: permission denied; the service's unit does not allow this kind of port")

@@ -47,7 +47,7 @@ def test_a_manager_that_is_gone_is_said_once(tmp_path: Path, caplog: pytest.LogC
     assert not manager.notify("READY=1")
     assert not manager.notify("WATCHDOG=1")
     (said,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert "cannot be told" in said
+    assert "systemd is not notified" in said
     manager.close()
 
 

@@ -112,7 +112,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_a_recording(
 ) -> None:
     monkeypatch.setattr(files, "open_new", full)
     file = RecordingFile(tmp_path / "a.mcap")
-    with pytest.raises(StorageError, match=r"a\.mcap: cannot be written: No space left on device"):
+    with pytest.raises(StorageError, match=r"a\.mcap: recording cannot be written: No space left on device"):
         file.write(raw(100, 1000), beginning())
     file.write(raw(1, 10), beginning())  # nothing more happens
     file.close()
