@@ -122,7 +122,7 @@ def test_an_entry_is_whole(name: str, entry: Entry) -> None:
 def test_the_page_is_that_of_the_catalogue() -> None:
     made = runpy.run_path(str(ROOT / "packaging/messages.py"))["page"]()
     assert (ROOT / "docs/messages.md").read_text(encoding="utf-8") == made, "make messages"
-    assert len(made.split()) <= 6900
+    assert len(made.split()) <= 7500
 
 
 @pytest.mark.parametrize("name", catalogue())
