@@ -309,7 +309,7 @@ class _LoggedParameters(Parameters):
     def __init__(self, firmware: FirmwareName, values: Mapping[str, float]) -> None:
         self.firmware, self._values = firmware, values
 
-    async def ensure_same_boot(self, boots: int, words: str) -> None:
+    async def ensure_same_boot(self, boots: int, doing: str) -> None:
         pass
 
     async def read(self, name: str) -> float:

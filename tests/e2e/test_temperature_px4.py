@@ -17,6 +17,6 @@ async def test_a_write_is_refused_in_one_line_and_writes_nothing(tmp_path: Path)
         before = dict(rig.px4.parameters.values)
         with pytest.raises(RequestRefusedError) as refused:
             await rig.ask(action="write")
-        why = "PX4's thermal compensation (TC_*) is not written: the firmware of common boards is built without it"
+        why = "temperature curves are not written: PX4 for common boards is built without TC_*"
         assert str(refused.value) == why
         assert rig.px4.parameters.values == before

@@ -39,6 +39,7 @@ from companion.autopilot.firmware.imu_messages import HIGHRES, SCALED, SCALED2, 
 from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Names, Parameters
 from companion.errors import AutopilotError
 from companion.estimation.solution.curve import ZERO, Polynomial
+from companion.messages import message
 from companion.physics.frames import Matrix, rotation_matrix, vector
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Vector
@@ -76,7 +77,8 @@ class ArduPilotParameters(ImuParameters):
     def __init__(self, instance: int) -> None:
         """Raise AutopilotError where there is no such instance."""
         if instance not in INSTANCES:
-            raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
+            reason = f"allowed are {', '.join(map(str, INSTANCES))}"
+            raise AutopilotError(message("autopilot_has_no_imu", imu=instance, reason=reason))
         # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
         ins, n = (f"INS{instance}_", "") if instance > 3 else ("INS_", "" if instance == 1 else str(instance))
         tcal = f"INS{instance}_TCAL_" if instance > 3 else f"INS_TCAL{instance}_"
@@ -150,23 +152,21 @@ class ArduPilot(Firmware):
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
         names = ArduPilotParameters(instance)
         if await parameters.read_optional(names.gyro_offset[0]) is None:
-            raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
+            missing = f"{names.gyro_offset[0]} does not exist"
+            raise AutopilotError(message("autopilot_has_no_imu", imu=instance, reason=missing))
         gyro_id = await parameters.read_integer(names.gyro_id)
         accel_id = await parameters.read_integer(names.accel_id)
-        for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
+        for name, found in ((names.gyro_id, gyro_id), (names.accel_id, accel_id)):
             if found == 0:
-                raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
+                raise AutopilotError(message("autopilot_has_no_imu", imu=instance, reason=f"{name} = 0"))
         thermal = await _read_thermal(parameters, instance)
         accel_offset = await parameters.read_vector(names.accel_offset)
         warnings: list[str] = []
         if not any(accel_offset):
-            warnings.append(
-                f"{names.accel_offset[0]}, _Y and _Z are 0: the autopilot takes IMU {instance}'s accelerometers for"
-                ' uncalibrated and may still refuse to arm ("3D Accel calibration needed") until its accelerometer'
-                " calibration is accepted once (PREFLIGHT_CALIBRATION, param5 = 76)"
-            )
+            zero = f"{names.accel_offset[0]}, _Y and _Z"
+            warnings.append(message("ardupilot_accelerometers_uncalibrated", parameters=zero, imu=instance))
         if await parameters.read_integer(names.use) == 0:
-            warnings.append(f"{names.use} = 0: the autopilot does not use IMU {instance}")
+            warnings.append(message("imu_switched_off", parameter=names.use, sensor=f"IMU {instance}"))
         return ImuCalibration(
             instance=instance,
             parameters=names,
@@ -197,10 +197,8 @@ class ArduPilot(Firmware):
         assert gyro.reference_degc == REFERENCE_DEGC
         names, thermal = ArduPilotParameters(calibration.instance), calibration.thermal
         if not thermal.values:
-            raise AutopilotError(
-                f"{names.tcal_enable} does not exist: this firmware has no temperature calibration"
-                " (boards of 1 MB have none)"
-            )
+            missing = f"{names.tcal_enable} does not exist (boards of 1 MB have none)"
+            raise AutopilotError(message("curves_not_written", why=missing))
         acts = accel is not None or any(map(any, thermal.accel.coefficients))
         caltemps = [names.gyro_caltemp, *([names.accel_caltemp] if acts else [])]
         before = await parameters.read_many((*names.tcal, *caltemps))
@@ -273,7 +271,7 @@ class ArduPilot(Firmware):
             await asyncio.sleep(script_starts_s)
             enabled = await parameters.read_optional(_GATE_SCRIPT)
         if enabled is None:
-            return "the arming script does not run (see: companion lua)"
+            return message("arming_script_missing")
         return "set CMPG_ENABLE 1" if enabled == 0 else None
 
     # --- ports
@@ -282,7 +280,8 @@ class ArduPilot(Firmware):
         return f"SERIALn_PROTOCOL = 2, SERIALn_BAUD = {baud // 1000}"
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
-        return True, "none heard (none connected? or a link set not to forward: MAVn_OPTIONS bit 1)"
+        why = "none connected? or a link set not to forward: MAVn_OPTIONS bit 1"
+        return True, message("no_ground_station_heard", why=why)
 
 
 async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
@@ -292,9 +291,9 @@ async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
     if enable is None:
         return Thermal()
     if enable == _TCAL_LEARNING:
+        wanted = f"0 or 1 (2: IMU {instance} is learning its temperature calibration; let it finish)"
         raise AutopilotError(
-            f"{names.tcal_enable} = 2: IMU {instance} is learning its temperature calibration;"
-            " let it finish, or set it to 0 or 1"
+            message("parameter_not_plausible", parameter=names.tcal_enable, value=enable, wanted=wanted)
         )
     if enable != _TCAL_ON:
         return Thermal(values={names.tcal_enable: float(enable)})
@@ -329,12 +328,14 @@ async def _read_board_rotation(parameters: Parameters) -> Matrix:
         return rotation_matrix(ROTATION_NAMES[number])
     if number in _ARDUPILOT_ONLY_DEG:
         return rotation_matrix(_ARDUPILOT_ONLY_DEG[number])
+    wanted = ""
     if number not in _CUSTOM_NAMES:
-        raise AutopilotError(f"AHRS_ORIENTATION = {value:g} is not known")
+        wanted = "a known orientation"
     # A custom rotation that is set but switched off is an internal error to ArduPilot: nobody knows what it does.
-    if number > 100 and not await parameters.read_optional("CUST_ROT_ENABLE"):
-        raise AutopilotError(f"AHRS_ORIENTATION = {number} needs CUST_ROT_ENABLE = 1")
-    roll_deg, pitch_deg, yaw_deg = [await parameters.read(name) for name in _CUSTOM_NAMES[number]]
-    if not all(map(math.isfinite, (roll_deg, pitch_deg, yaw_deg))):
-        raise AutopilotError(f"AHRS_ORIENTATION = {number}: its angles are {roll_deg}, {pitch_deg}, {yaw_deg}")
-    return rotation_matrix((roll_deg, pitch_deg, yaw_deg))
+    elif number > 100 and not await parameters.read_optional("CUST_ROT_ENABLE"):
+        wanted = "CUST_ROT_ENABLE = 1 with it"
+    if wanted:
+        raise AutopilotError(
+            message("parameter_not_plausible", parameter="AHRS_ORIENTATION", value=f"{value:g}", wanted=wanted)
+        )
+    return rotation_matrix(await parameters.read_vector(_CUSTOM_NAMES[number]))

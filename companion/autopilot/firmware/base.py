@@ -19,6 +19,7 @@ from companion.config.sections import Profile
 from companion.errors import AutopilotError
 from companion.estimation.solution.curve import Polynomial
 from companion.links.mavlink.link import Message
+from companion.messages import message
 from companion.physics.frames import Matrix
 from companion.samples import Triad, Vector
 
@@ -60,7 +61,7 @@ class Firmware:
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
         """Read what the autopilot corrects one of its IMUs (1 to 3) with; see `firmwares.read_calibration`."""
-        raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
+        raise AutopilotError(message("firmware_not_supported", what="calibration"))
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
         """Return the tilt that the EKF may keep from before these changes until a restart; 0: none owes one."""
@@ -75,13 +76,13 @@ class Firmware:
         degc: float,
     ) -> list[Change]:
         """Plan curves over temperature so that the output at this temperature stays as it is."""
-        raise AutopilotError(self.why_no_thermal_write or "this autopilot is neither ArduPilot nor PX4: no curves")
+        raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
     ) -> tuple[list[Change], Matrix]:
         """Plan the level of a board that sits so; also the turn of up in the vehicle's axes that it makes, (3, 3)."""
-        raise AutopilotError("this autopilot is neither ArduPilot nor PX4; its level is not known")
+        raise AutopilotError(message("firmware_not_supported", what="level"))
 
     # --- heading from outside; `found`: values of `heading_names`
 
@@ -114,7 +115,7 @@ class Firmware:
 
         `script_starts_s`: time to wait for a script that does not run yet.
         """
-        return "this autopilot has no gate that is known here"
+        return message("no_arm_authorisation")
 
     # --- the port, and ground stations behind it
 
@@ -127,7 +128,7 @@ class Firmware:
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
         """Tell whether all is well while no ground station is heard, and the facts with the fix."""
-        return True, "none heard"
+        return True, message("no_ground_station_heard", why="none connected?")
 
     # --- follows from the answers above
 
@@ -155,9 +156,9 @@ class Firmware:
             AutopilotError: no autopilot yet, or a firmware that is not known.
         """
         if self.name is None:
-            raise AutopilotError("no autopilot has been heard yet")
+            raise AutopilotError(message("no_heartbeat_of_the_autopilot"))
         if not self.heading_settings:
-            raise AutopilotError("this autopilot is neither ArduPilot nor PX4; what takes a heading there is not known")
+            raise AutopilotError(message("firmware_not_supported", what="heading"))
         wanted = [name for one in self.heading_settings for name in (one.parameter, one.like) if name]
         return [*wanted, *self.heading_watched]
 
@@ -173,7 +174,7 @@ class Firmware:
             if before is None:
                 if setting.optional:
                     continue
-                raise AutopilotError(f"this autopilot has no {setting.parameter}: it cannot take in a heading")
+                raise AutopilotError(message("heading_parameter_missing", parameter=setting.parameter))
             after = setting.after(found)
             if not same_float32(before, after):
                 changes.append(Change(setting.parameter, before, after))
@@ -213,7 +214,7 @@ NETS: Final[dict[Net, str]] = {
     "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
     "command": "if our heading ends, the companion asks for gyros and GNSS, but not if its board dies (companion lua)",
     "autopilot": "if our heading ends, the autopilot goes back to its magnetometer",
-    "none": "if our heading ends there is none: fly only where you can land by hand",
+    "none": "if our heading ends there is none: fly only where you can land without one",
 }
 
 NO_IMU: Final = 0

@@ -19,6 +19,7 @@ from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.parameters.change import FirmwareName, Parameters
 from companion.config.sections import Profile
 from companion.estimation.records.record import Outcome, WrittenParameter
+from companion.messages import message
 from companion.samples import Triad
 
 FIRMWARES: Final[tuple[Firmware, ...]] = (ArduPilot(), PX4())
@@ -48,11 +49,12 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
     boots, firmware, memory = parameters.boots, firmware_named(parameters.firmware), memory or SlotMemory()
     found = await firmware.read_calibration(parameters, instance, memory)
     rivals = await firmware.read_rivals(parameters, memory.rivals)
-    await parameters.ensure_same_boot(boots, f"restarted while the parameters of IMU {instance} were read")
+    await parameters.ensure_same_boot(boots, "its parameters were read")
     warnings, (low, high) = [*(rival.words for rival in rivals), *found.warnings], ACCEL_SCALE_RANGE
-    if not all(low <= scale <= high for scale in found.accel_scale):
-        name = found.parameters.accel_scale[0]
-        warnings.append(f"{name}, Y or Z is outside {low} to {high}: the scale calibration looks wrong")
+    for name, scale in zip(found.parameters.accel_scale, found.accel_scale, strict=True):
+        if not low <= scale <= high:
+            value, wanted = f"{scale:.3g}", f"{low} to {high}"
+            warnings.append(message("parameter_not_plausible", parameter=name, value=value, wanted=wanted))
     return dataclasses.replace(found, rivals=rivals, warnings=tuple(warnings))
 
 

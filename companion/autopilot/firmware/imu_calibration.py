@@ -12,7 +12,6 @@ active (`Thermal`), takes its part off `raw` first. Names, R and the use of a va
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -21,6 +20,7 @@ import numpy as np
 from companion.autopilot.parameters.change import SCALES, Change, Names, float32, same_float32
 from companion.errors import CalibrationRefusedError
 from companion.estimation.solution.curve import NOTHING, Polynomial
+from companion.messages import message
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector
@@ -45,9 +45,8 @@ class Rival:
     @property
     def words(self) -> str:
         if self.until_boot:
-            return f"{self.parameter} is off from the next boot on: until then {self.what}; reboot the autopilot"
-        remedy = "set it to 0 to keep them (push.stop_rivals = true does)"
-        return f"{self.parameter} = {self.value}: {self.what}; {remedy}"
+            return message("overwrites_offsets_until_reboot", parameter=self.parameter, what=self.what)
+        return message("autopilot_overwrites_offsets", parameter=self.parameter, value=self.value, what=self.what)
 
     @property
     def name(self) -> str:
@@ -294,9 +293,7 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
     low, high = ACCEL_SCALE_RANGE
     for axis, value in zip(_AXES, after, strict=True):
         if not low <= value <= high:
-            raise CalibrationRefusedError(
-                f"IMU {calibration.instance}: accelerometer scale {axis} is {value:.3g}, allowed are {low} to {high}"
-            )
+            raise _implausible(calibration, "accelerometer scale", axis, f"{value:.3g}", f"{low} to {high}")
     far_axis = calibration.far_axis
     changes = vector_changes(names.accel_offset, calibration.accel_offset_m_s2, offset, far_axis, FAR_ACCEL_M_S2)
     if not calibration.scale_unused_within or after != calibration.accel_scale:
@@ -324,14 +321,18 @@ def output_step(
 
 
 def _require_plausible(calibration: ImuCalibration, what: str, vector: Vector, limit: float) -> None:
-    instance, (unit, words) = calibration.instance, (DEG, "deg/s") if "gyro" in what else (1.0, "m/s^2")
+    unit, words = (DEG, "deg/s") if "gyro" in what else (1.0, "m/s^2")
     for axis, value in zip(_AXES, vector, strict=True):
-        if not math.isfinite(value):
-            raise CalibrationRefusedError(f"IMU {instance}: {what} {axis} is {value}")
-        if abs(value) > limit:
-            raise CalibrationRefusedError(
-                f"IMU {instance}: {what} {axis} is {value / unit:.3g} {words}, allowed are {limit / unit:.3g}"
-            )
+        if not abs(value) <= limit:  # NaN is outside too
+            raise _implausible(calibration, what, axis, f"{value / unit:.3g} {words}", f"{limit / unit:.3g}")
+
+
+def _implausible(
+    calibration: ImuCalibration, what: str, axis: str, value: str, allowed: str
+) -> CalibrationRefusedError:
+    imu = calibration.instance
+    words = message("result_not_plausible", imu=imu, what=what, axis=axis, value=value, allowed=allowed)
+    return CalibrationRefusedError(words)
 
 
 def _vector(values: Array) -> Vector:

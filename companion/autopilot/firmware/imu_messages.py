@@ -50,13 +50,13 @@ _ACCEL_AND_GYRO: Final = 0b111111  # HIGHRES_IMU.fields_updated: all three axes 
 
 def _highres(message: Any, t_s: float) -> ImuSample | str:
     if message.id != 0:  # the first usable one: not ours when the autopilot does not use its first IMU
-        return f"HIGHRES_IMU shows IMU {message.id + 1}"
+        return f"shows IMU {message.id + 1}"
     if message.fields_updated & _ACCEL_AND_GYRO != _ACCEL_AND_GYRO:
-        return "HIGHRES_IMU without accelerometer or gyro"
+        return "lacks accelerometer or gyro"
     gyro = (message.xgyro, message.ygyro, message.zgyro)
     accel = (message.xacc, message.yacc, message.zacc)
     if not all(map(math.isfinite, (*gyro, *accel))):
-        return "HIGHRES_IMU with a value that is not a number"
+        return "carries a value that is not a number"
     # Its temperature is the barometer's (ArduPilot) or the air's (PX4).
     return ImuSample(t_s, gyro, accel, t_device_s=message.time_usec * 1e-6)
 
@@ -87,7 +87,7 @@ def _from_script(instance: int, message: Any, t_s: float) -> ImuSample | str:
         return ""  # somebody else's
     values = message.data[_SCRIPT_FLOATS * (instance - 1) :][:_SCRIPT_FLOATS]
     if not all(map(math.isfinite, values)):
-        return "the script tells a value that is not a number"
+        return "carries a value that is not a number"
     gx, gy, gz, ax, ay, az, degc = values
     return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), degc or None, t_device_s=message.time_usec * 1e-6)
 

@@ -36,6 +36,7 @@ from companion.autopilot.firmware.imu_calibration import (
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
 from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters
 from companion.errors import AutopilotError
+from companion.messages import message
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
@@ -125,9 +126,7 @@ class PX4(Firmware):
     ranges = _ranges()
     rivals = _RIVALS
     parts = {(0x26, 0x26): "icm42688p", (0x58, 0x58): "adis16470", (0x66, 0x6A): "bmi088"}  # drv_sensor.h
-    why_no_thermal_write = (
-        "PX4's thermal compensation (TC_*) is not written: the firmware of common boards is built without it"
-    )
+    why_no_thermal_write = "temperature curves are not written: PX4 for common boards is built without TC_*"
 
     def compass_ratio(self, message: Any) -> float:
         return float(message.mag_ratio) if message.flags & mavlink.ESTIMATOR_ATTITUDE else 0.0
@@ -172,7 +171,7 @@ class PX4(Firmware):
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
     ) -> tuple[list[Change], Matrix]:
-        x, y, z = await _read_level(parameters)
+        x, y, z = await parameters.read_vector(LEVEL)
         level = rotation_matrix((x, y, z))
         seen = body_from_ned(roll_rad, pitch_rad, 0.0) @ (0.0, 0.0, -1.0)
         roll, pitch = np.degrees(roll_pitch_from_up(level.T @ seen)).tolist()
@@ -212,7 +211,7 @@ class PX4(Firmware):
     ) -> str | None:
         required, system, method, timeout_s = [await parameters.read_optional(name) for name in self.gate_parameters]
         if required is None:
-            return "this PX4 has no arm authorisation"
+            return message("no_arm_authorisation")
         wanted = {
             "COM_ARM_AUTH_REQ 1": required == 1,
             f"COM_ARM_AUTH_ID {system_id}": system == system_id,
@@ -237,13 +236,9 @@ class PX4(Firmware):
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
         if not closed:
-            return True, "none heard (none connected?); PX4 forwards between all its links"
-        return False, (
-            f"none heard. PX4 does not forward to or from {', '.join(closed)}: if the companion or the ground station"
-            f" is on {'it' if len(closed) == 1 else 'one of them'}, ground stations can't reach the companion: set"
-            f" {closed[0]}_FORWARD=1 and reboot (no message tells which MAV_n the companion is on; TELEM2 usually is"
-            " MAV_1)"
-        )
+            return True, message("no_ground_station_heard", why="none connected? PX4 forwards between all its links")
+        why = f"PX4 does not forward to or from {', '.join(closed)}: set {closed[0]}_FORWARD=1 and reboot"
+        return False, message("no_ground_station_heard", why=why)
 
 
 def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) -> Vector:
@@ -257,8 +252,8 @@ def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tu
     after = accel_offset_with(calibration, changes)
     if calibration.far_axis is None or not _too_small_to_apply_at_boot(after):  # None: not PX4
         return ()
-    size = f"{calibration.parameters.accel_offset[0]}, Y and Z are {math.hypot(*after) / MG:.2f} mg in all"
-    return (f"{size}: below 1 mg (0.01 m/s^2) PX4 starts without them; calibrate again after a restart",)
+    small, size = f"{calibration.parameters.accel_offset[0]}, Y and Z", f"{math.hypot(*after) / MG:.2f}"
+    return (message("px4_ignores_small_offsets", parameters=small, size=size),)
 
 
 def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
@@ -297,13 +292,8 @@ def choose_slot(
 
     `like`: the device id of the IMU's other half, the same where one chip is both. Raise AutopilotError without a slot.
     """
-    prefix, word = PREFIX[sensor], WORDS[sensor]
+    prefix = PREFIX[sensor]
     memory.enabled[sensor] = sum(slot.enabled for slot in slots)
-    if not slots:
-        raise AutopilotError(
-            f"PX4 has no {word} in {prefix}0_ID to {prefix}{SLOTS - 1}_ID: calibrate its {word}s once with the"
-            " ground station, so that it knows them"
-        )
     own = next((slot for slot in slots if memory.known(sensor, slot.device_id) == instance), None)
     if own is None:
         free = [slot for slot in slots if memory.known(sensor, slot.device_id) is None] or [
@@ -315,34 +305,25 @@ def choose_slot(
         if own is None and instance <= len(slots):
             own = next((slot for slot in free if slot.enabled), None)
     if own is None:
-        raise AutopilotError(
-            f"the autopilot has no IMU {instance}: only {len(slots)} of {prefix}0_ID to {prefix}{SLOTS - 1}_ID"
-            f" hold a {word}"
-        )
+        reason = f"only {len(slots)} of {prefix}0_ID to {prefix}{SLOTS - 1}_ID hold a device"
+        raise AutopilotError(message("autopilot_has_no_imu", imu=instance, reason=reason))
     if not own.enabled:
-        raise AutopilotError(f"IMU {instance}: {prefix}{own.number}_PRIO = 0, so PX4 has this {word} switched off")
+        priority, sensor_words = f"{prefix}{own.number}_PRIO", f"the {WORDS[sensor]} of IMU {instance}"
+        raise AutopilotError(message("imu_switched_off", parameter=priority, sensor=sensor_words))
     return own
 
 
 async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Matrix:
-    level = rotation_matrix(await _read_level(parameters))
+    level = rotation_matrix(await parameters.read_vector(LEVEL))
     gyro_mounting = await _read_mounting(parameters, "gyro", gyro)
     accel_mounting = await _read_mounting(parameters, "accel", accel)
     if not np.array_equal(gyro_mounting, accel_mounting):
+        one, other = f"{PREFIX['gyro']}{gyro.number}_ROT", f"{PREFIX['accel']}{accel.number}_ROT"
         raise AutopilotError(
-            f"{PREFIX['gyro']}{gyro.number}_ROT and {PREFIX['accel']}{accel.number}_ROT mount the two halves of one IMU"
-            " differently; set both as it is mounted"
+            message("parameter_not_plausible", parameter=one, value=f"unlike {other}", wanted="the same mounting")
         )
     matrix: Matrix = level @ accel_mounting
     return matrix
-
-
-async def _read_level(parameters: Parameters) -> Vector:
-    x, y, z = [await parameters.read(name) for name in LEVEL]
-    for name, angle_deg in zip(LEVEL, (x, y, z), strict=True):
-        if not math.isfinite(angle_deg):
-            raise AutopilotError(f"{name} is {angle_deg}; an angle was expected")
-    return x, y, z
 
 
 async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:

@@ -16,6 +16,7 @@ from typing import ClassVar, Final, Literal
 
 from companion.errors import AutopilotError, NotDisarmedError
 from companion.estimation.records.record import Outcome, WrittenParameter
+from companion.messages import message
 from companion.samples import Vector
 
 FirmwareName = Literal["ardupilot", "px4", "other"]
@@ -68,22 +69,25 @@ class Parameters(abc.ABC):
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]: ...
 
     @abc.abstractmethod
-    async def ensure_same_boot(self, boots: int, words: str) -> None:
-        """Ask for the time since boot; raise AutopilotRebootedError with `words` if `boots` has changed."""
+    async def ensure_same_boot(self, boots: int, doing: str) -> None:
+        """Ask for the time since boot; raise AutopilotRebootedError if `boots` has changed while `doing` went on."""
 
     async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
         """Read three numbers within limits, such as `SCALES`; raise AutopilotError where one is outside."""
         x, y, z = [await self.read(name) for name in names]
         for name, value in zip(names, (x, y, z), strict=True):
             if not math.isfinite(value) or not low <= value <= high:
-                raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
+                wanted = f"{low:g} to {high:g}" if math.isfinite(high) else "a number"
+                raise AutopilotError(
+                    message("parameter_not_plausible", parameter=name, value=f"{value:.9g}", wanted=wanted)
+                )
         return x, y, z
 
     async def read_integer(self, name: str) -> int | None:
         """Read a whole number; None where the firmware has none. Raise AutopilotError where it is not a number."""
         value = await self.read_optional(name)
         if value is not None and not math.isfinite(value):
-            raise AutopilotError(f"{name} is {value}; a whole number was expected")
+            raise AutopilotError(message("parameter_not_plausible", parameter=name, value=value, wanted="a number"))
         return None if value is None else round(value)
 
 
@@ -95,7 +99,7 @@ FailureKind = Literal[
     "rebooted in the middle",
     "arm state unknown",
     "changed by someone else",
-    "not as believed",
+    "wrong slot, orientation or scale",
     "without effect",
     "not kept",
 ]
@@ -137,6 +141,21 @@ class Change:
         return (self.after,) if self.via is None else (self.after, self.via)
 
 
+def shown(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.9g}"
+
+
+def reads_otherwise(name: str, found: float | None, wanted: float) -> str:
+    return message("parameter_reads_otherwise", parameter=name, found=shown(found), wanted=shown(wanted))
+
+
+def with_restore(reason: str, left_changed: Sequence[str], *, restored: bool) -> str:
+    """Append to the reason of an ended write what has become of the old values."""
+    if left_changed:
+        return message("old_values_not_back", reason=reason, parameters=", ".join(left_changed))
+    return message("old_values_back", reason=reason) if restored else reason
+
+
 class NothingWrittenError(NotDisarmedError):
     """Refused before anything was sent: armed, unknown whether armed, or the autopilot calibrates itself."""
 
@@ -153,12 +172,8 @@ class WriteFailedError(AutopilotError):
     def __init__(
         self, kind: FailureKind, reason: str, written: dict[str, WrittenParameter], left_changed: tuple[str, ...]
     ) -> None:
-        words = f"{kind}: {reason}"
-        if left_changed:
-            words += f"; old values NOT back in {', '.join(left_changed)}"
-        elif any(parameter.outcome == "rolled_back" for parameter in written.values()):
-            words += "; old values back"
-        super().__init__(words)
+        restored = any(parameter.outcome == "rolled_back" for parameter in written.values())
+        super().__init__(with_restore(f"{kind}: {reason}", left_changed, restored=restored))
         self.kind: FailureKind = kind
         self.reason = reason
         self.written = written

@@ -20,6 +20,7 @@ from typing import Final, Literal
 import numpy as np
 
 from companion.autopilot.parameters.change import Names
+from companion.messages import message
 from companion.physics.frames import Matrix
 from companion.samples import Vector
 
@@ -30,7 +31,11 @@ VISIBLE_SIGMAS: Final = 2 * SIGMAS
 SCALE_TOLERANCE: Final = 0.05  # besides noise: scale error and cross-axis sensitivity, a few percent at most
 
 AxisWord = Literal["seen", "too small to see", "not seen", "wrong"]
-_REFUTED: Final = ("not seen", "wrong")
+_WHY: Final[Mapping[AxisWord, str]] = {
+    "not seen": "the autopilot stored the value but does not use it",
+    "wrong": "not the step that was written",
+}
+_REFUTED: Final = tuple(_WHY)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -93,20 +98,18 @@ def judge(seen: Observation) -> EffectVerdict:
     for name, e, m, s in zip(seen.parameters, expected.tolist(), made.tolist(), sigma.tolist(), strict=True):
         axes[name], why = _judge_axis(e, m, s, slack)
         if axes[name] in _REFUTED:
-            figures = f"the output moved by {m:.3g} {seen.unit}, expected {e:.3g}, noise {s:.2g}"
-            problems.append(f"{name}: {figures}: {why}")
+            problems.append(_problem(name, f"{m:.3g} {seen.unit}", f"{e:.3g}", f"{s:.2g}", why))
     family = f"{seen.parameters[0]}, {', '.join('_' + name[-1] for name in seen.parameters[1:])}"
-    if not problems and together == "not seen":
-        problems.append(f"{family}: no axis moved as written; the autopilot stored the values but does not use them")
-    elif not problems and together == "wrong":
-        problems.append(f"{family}: the output made {fraction:.0%} of the step that was written")
+    if not problems and together in _REFUTED:
+        problems.append(
+            _problem(family, f"{fraction:.0%} of the step", "100%", f"{fraction_sigma:.0%}", _WHY[together])
+        )
     residual = np.subtract(seen.after, seen.truth)
     allowed = seen.tolerance + SIGMAS * np.asarray(seen.after_sigma) + seen.resolution
     for axis, value, limit in zip("xyz", residual, allowed, strict=True):
         if not abs(value) <= limit:  # NaN is outside too
-            problems.append(
-                f"after the write {axis} is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g} ({family})"
-            )
+            off, most = f"{value:.3g} {seen.unit}", f"{limit:.2g}"
+            problems.append(message("still_off_after_write", axis=axis, value=off, limit=most, parameters=family))
     hidden = [name for name, step in zip(axes, expected, strict=True) if axes[name] == "too small to see" and step]
     return EffectVerdict(
         axes=axes,
@@ -126,8 +129,12 @@ def _judge_axis(expected: float, made: float, sigma: float, slack: float) -> tup
     if agrees:
         return "seen", ""
     if abs(made) <= noise:
-        return "not seen", "the autopilot stored the value but does not use it"
-    return "wrong", "not the step that was written (sign, orientation, scale, or it moved)"
+        return "not seen", _WHY["not seen"]
+    return "wrong", _WHY["wrong"]
+
+
+def _problem(parameters: str, moved: str, expected: str, noise: str, why: str) -> str:
+    return message("write_without_effect", parameters=parameters, moved=moved, expected=expected, noise=noise, why=why)
 
 
 def _together(fraction: float, sigma: float) -> AxisWord:

@@ -23,6 +23,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.events import comes
 from companion.lua import to_script
+from companion.messages import message
 from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
@@ -151,7 +152,7 @@ class ImuStream:
         self._restart.clear()
         messages = self._vehicle.kind.imu_messages.get(self._instance)
         if messages is None:
-            self._lose("this autopilot is neither ArduPilot nor PX4: what its IMU messages carry is not known")
+            self._lose(message("firmware_not_supported", what="telemetry"))
             await self._pause(60.0)
             return
         if self._ekf_bias.may_look:
@@ -246,9 +247,8 @@ class ImuStream:
             elif source.absent:
                 return None
             elif now_s - asked_s >= SILENCE_S:
-                self.problem = (
-                    f"{source.message.name} has been silent for {now_s - source.last_s:.0f} s; asked for it again"
-                )
+                seconds = f"{now_s - source.last_s:.0f}"
+                self.problem = message("imu_stream_interrupted", stream=source.message.name, seconds=seconds)
                 silent_asks += 1
                 if silent_asks > _ASKS:
                     return None
@@ -358,14 +358,13 @@ class ImuStream:
             self._on_kind_change(self.kind)
 
     def _why_none(self) -> str:
-        ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]
         sources = [source for source in self._sources if self._usable(source) and not source.message.from_script]
         if all(source.absent for source in sources if not source.refused and not source.reason):
             zero = [source.message.name for source in sources if source.absent]
             if zero:
-                return f"{zero[0]} is all zero: there is no {ordinal} IMU"
-        words = [f"{source.message.name} {source.reason or 'does not come'}" for source in sources]
-        return f"no samples of IMU {self._instance}: {', '.join(words)}"
+                return message("autopilot_has_no_imu", imu=self._instance, reason=f"{zero[0]} is all zero")
+        reasons = ", ".join(f"{source.message.name} {source.reason or 'does not come'}" for source in sources)
+        return message("imu_not_streamed", imu=self._instance, reasons=reasons)
 
 
 async def ask_script(link: MavlinkLink, streams: Sequence[ImuStream]) -> None:

@@ -26,6 +26,7 @@ from companion.autopilot.vehicle.heartbeats import ArmState
 from companion.errors import NotDisarmedError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.events import comes
+from companion.messages import message
 
 PROOF_HOLDS_S: Final = 1.5  # from the question to the write: some heartbeats come once a second only
 
@@ -122,7 +123,9 @@ class DisarmedCheck:
                 if state is ArmState.ARMED or (now_s - begun_s > GIVE_UP_S and state is ArmState.UNKNOWN):
                     raise NotDisarmedError(state.why_not_written)
                 if now_s - begun_s > GIVE_UP_S:
-                    raise NotDisarmedError(f"{self._name()} does not answer whether it is armed ({GIVE_UP_S:g} s)")
+                    raise NotDisarmedError(
+                        message("arm_question_not_answered", autopilot=self._name(), seconds=f"{GIVE_UP_S:g}")
+                    )
                 if now_s >= ask_s:
                     ask_s = now_s + max(ASK_AGAIN_S, self._proof.slowest_s)
                     request = self._ask(now_s)

@@ -27,6 +27,7 @@ from companion.estimation.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
 from companion.estimation.solution.truth import OwnHeading
 from companion.links.mavlink.link import Message
 from companion.links.system.events import comes
+from companion.messages import message
 from companion.physics.frames import Array, body_from_ned
 from companion.physics.units import DEG
 
@@ -73,24 +74,19 @@ class EkfWatch:
         self._seen.clear()  # what came before the write says nothing
         boots, give_up_s = self._vehicle.boots, loop.time() + within_s
         if await self.bias_rad_s() is None and self._vehicle.boots == boots:
-            return (
-                "wait 2 min before take-off, or restart the autopilot: it does not tell whether its EKF has settled"
-                " (no AHRS message)"
-            )
+            return message("ekf_not_settled", bias=_words(None))
         asked_s = loop.time()
         while True:
             if self._vehicle.boots != boots:
-                return "the autopilot restarted while its EKF settled"
+                return message("autopilot_restarted_meanwhile", autopilot="the autopilot", doing="its EKF settled")
             bias = self._mean(_AHRS_MEAN_S)
             if bias is not None and bias <= SETTLED_RAD_S:
                 return None
             if self._vehicle.arm_state is ArmState.ARMED:
-                return f"the heading may turn for a minute: armed before the EKF had settled ({_words(bias)})"
+                return message("heading_may_turn", bias=_words(bias))
             if loop.time() >= give_up_s:
-                return (
-                    f"the EKF has not settled within {within_s:.0f} s ({_words(bias)}): wait, or restart the autopilot"
-                )
-            go_on(f"{ADJUSTING}: {give_up_s - loop.time():.0f} s at most")
+                return message("ekf_not_settled", bias=_words(bias))
+            go_on(message("ekf_settling", seconds=f"{give_up_s - loop.time():.0f}"))
             silent_s = loop.time() - (self._seen[-1][0] if self._seen else asked_s)
             if min(silent_s, loop.time() - asked_s) > _FIRST_WITHIN_S:
                 asked_s = loop.time()

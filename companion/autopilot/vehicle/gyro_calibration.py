@@ -19,6 +19,7 @@ from companion.autopilot.firmware.ardupilot import INSTANCES, ArduPilotParameter
 from companion.autopilot.parameters.change import same_float32
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.errors import AutopilotError, NotDisarmedError
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -42,11 +43,12 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
     present = [names for names in every if names.gyro_offset[0] in found]
     if not present:
-        raise AutopilotError("the autopilot has no gyro offsets")
+        missing = f"{every[0].gyro_offset[0]} does not exist"
+        raise AutopilotError(message("autopilot_has_no_imu", imu=INSTANCES[0], reason=missing))
     found |= await parameters.read_many(name for names in present for name in names.gyro_offset[1:])
     more = (name for names in present for name in (names.gyro_caltemp, names.gyro_id))
     found |= await parameters.read_many(more, optional=True)
-    parameters.require_same_boot(boots, "restarted while its gyro parameters were read")
+    parameters.require_same_boot(boots, "its parameters were read")
     return found
 
 
@@ -74,11 +76,12 @@ async def calibrate(
     """
     vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
     boots = vehicle.boots
-    go_on("the autopilot calibrates its gyros: keep the aircraft still")
+    go_on(message("firmware_gyro_calibration_runs", seconds="0"))
     try:
         await vehicle.disarmed.ensure()
     except NotDisarmedError as error:
-        raise NotDisarmedError(f"the firmware's gyro calibration was not started: {error}") from error
+        words = message("firmware_gyro_calibration_failed", failure="did not run", reason=error)
+        raise NotDisarmedError(words) from error
     answer = vehicle.commands.send(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1.0, timeout_s=TIMEOUT_S)
     sent_s = loop.time()
     try:
@@ -87,7 +90,7 @@ async def calibrate(
                 await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
             else:
                 await asyncio.wait([answer], timeout=_LOOK_S)
-            parameters.require_same_boot(boots, "restarted during its gyro calibration")
+            parameters.require_same_boot(boots, "it calibrated its gyros")
             state = await _state(parameters, before)
             if state == "ended":
                 # An acknowledgement that is still on its way says more than its absence.
@@ -97,10 +100,10 @@ async def calibrate(
             if state == "untouched" and (answered or loop.time() > sent_s + _LOST_AFTER_S):
                 break
             if loop.time() > sent_s + 1.0:
-                go_on(f"the autopilot calibrates its gyros for {loop.time() - sent_s:.0f} s: keep the aircraft still")
+                go_on(message("firmware_gyro_calibration_runs", seconds=f"{loop.time() - sent_s:.0f}"))
         await asyncio.sleep(_AFTERWARDS_S)
         after = await read_overwritten(parameters)
-        parameters.require_same_boot(boots, "restarted during its gyro calibration")
+        parameters.require_same_boot(boots, "it calibrated its gyros")
         outcome, words = _judge(answer.result() if answer.done() else None, ran=bool(changed(before, after)))
         return outcome, words, after
     finally:
@@ -140,14 +143,12 @@ def _judge(result: int | None, *, ran: bool) -> tuple[GyroOutcome, str]:
     if result == mavlink.MAV_RESULT_ACCEPTED:
         return "reset", ""
     if not ran:
-        outcome, words = "not run", f"the firmware's gyro calibration did not run ({answer})"
+        outcome, failure = "not run", "did not run"
     elif result is None:
-        outcome, words = "unanswered", "the firmware's gyro calibration ran, its answer did not arrive"
+        outcome, failure = "unanswered", "ran"
     else:
-        outcome = "not converged"
-        words = (
-            f"the firmware's gyro calibration failed ({answer}): it will not arm (Gyros not calibrated) until a gyro"
-            " calibration succeeds or it restarts"
-        )
+        outcome, failure = "not converged", "failed"
+        answer += '; no arming ("Gyros not calibrated") until a gyro calibration succeeds or ArduPilot restarts'
+    words = message("firmware_gyro_calibration_failed", failure=failure, reason=answer)
     logger.warning("%s", words)
     return outcome, words

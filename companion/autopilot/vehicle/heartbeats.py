@@ -13,6 +13,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.messages import message
+
 ARMED_HOLDS_S: Final = 3.0  # over disarmed heartbeats: one comes a second at least, and two may be lost
 
 _CHANGES: Final = 4
@@ -37,7 +39,7 @@ class ArmState(enum.Enum):
         """Why nothing may be written, for people; None: it may."""
         if self is ArmState.DISARMED:
             return None
-        return "the aircraft is armed" if self is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+        return message("aircraft_is_armed") if self is ArmState.ARMED else message("unknown_whether_armed")
 
 
 class ArmingWatch:
@@ -84,8 +86,8 @@ class ArmingWatch:
     def conflict(self, t_s: float, system_id: int | None) -> str | None:
         """Describe two autopilots under the ids of one, of which nothing is believed; None without."""
         if self.contradicts_itself(t_s):
-            return f"system id {system_id} says armed and disarmed by turns: two autopilots, or a forger"
-        return f"two autopilots have system id {system_id}" if t_s - self._two_s < _TWO_HOLDS_S else None
+            return message("armed_and_disarmed_by_turns", system=system_id)
+        return message("two_autopilots_with_one_id", system=system_id) if t_s - self._two_s < _TWO_HOLDS_S else None
 
     def contradicts_itself(self, t_s: float) -> bool:
         """Check for armed and disarmed heartbeats by turns, from two autopilots, or from one and a forger."""

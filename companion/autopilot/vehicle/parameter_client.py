@@ -18,7 +18,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.change import FirmwareName, Parameters, float32, same_float32
+from companion.autopilot.parameters.change import FirmwareName, Parameters, float32, reads_otherwise, same_float32
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
@@ -29,6 +29,7 @@ from companion.errors import (
 )
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.events import Listeners, comes
+from companion.messages import message
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
@@ -108,14 +109,33 @@ class ParameterClient(Parameters):
     def boots(self) -> int:
         return self.vehicle.boots
 
-    async def ensure_same_boot(self, boots: int, words: str) -> None:
+    async def ensure_same_boot(self, boots: int, doing: str) -> None:
         await self.vehicle.hear_boot_time()
-        self.require_same_boot(boots, words)
+        self.require_same_boot(boots, doing)
 
-    def require_same_boot(self, boots: int, words: str) -> None:
+    def require_same_boot(self, boots: int, doing: str) -> None:
         """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
         if self.boots != boots:
-            raise AutopilotRebootedError(f"{self.vehicle.name} {words}")
+            raise self._rebooted(doing)
+
+    def _rebooted(self, doing: str) -> AutopilotRebootedError:
+        words = message("autopilot_restarted_meanwhile", autopilot=self.vehicle.name, doing=doing)
+        return AutopilotRebootedError(words)
+
+    def _refused(self, request: str, reason: str) -> ParameterRefusedError:
+        words = message("parameter_refused", autopilot=self.vehicle.name, request=request, reason=reason)
+        return ParameterRefusedError(words)
+
+    def _unanswered(self, request: str, tries: int) -> ParameterTimeoutError:
+        words = message(
+            "parameter_not_answered",
+            autopilot=self.vehicle.name,
+            request=request,
+            tries=tries,
+            seconds=f"{_TIMEOUT_S:g}",
+            hint=self.vehicle.why_silent,
+        )
+        return ParameterTimeoutError(words)
 
     async def read(self, name: str) -> float:
         """Read one that must exist.
@@ -129,11 +149,8 @@ class ParameterClient(Parameters):
         if isinstance(answer, float):
             return answer
         if answer is not None:
-            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer}")
-        raise ParameterTimeoutError(
-            f"{self.vehicle.name} does not answer for {name} ({tries} requests, {_TIMEOUT_S:g} s each)"
-            f"{self.vehicle.why_silent}"
-        )
+            raise self._refused(f"read {name}", answer)
+        raise self._unanswered(name, tries)
 
     async def read_optional(self, name: str) -> float | None:
         """Read as `read`; None when the autopilot has no such parameter.
@@ -154,20 +171,15 @@ class ParameterClient(Parameters):
             if answer == _ERROR_WORDS[_DOES_NOT_EXIST]:
                 self._absent.add(name)
                 return None
-            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer}")
+            raise self._refused(f"read {name}", answer)
         if not self.vehicle.alive or not await self._answers_at_all():
-            raise ParameterTimeoutError(
-                f"{self.vehicle.name} answers neither for {name} nor for anything else{self.vehicle.why_silent}"
-            )
+            raise self._unanswered(f"{name} and other parameters", tries)
         # It answers again or for others only: a silence that ends in this moment must not be taken for an absence.
         answer, _ = await self._ask_repeatedly(name, [1])
         if isinstance(answer, float):
             return answer
         if name in self._types:
-            raise ParameterTimeoutError(
-                f"{self.vehicle.name} does not answer for {name} any more ({tries + 1} requests, {_TIMEOUT_S:g} s"
-                f" each){self.vehicle.why_silent}"
-            )
+            raise self._unanswered(f"{name} any more", tries + 1)
         if self.vehicle.boots == boots:
             self._absent.add(name)
         return None
@@ -205,8 +217,8 @@ class ParameterClient(Parameters):
         wanted = value if whole else float32(value)
         carried = _encode(wanted, kind, bytewise=self.integers_bytewise)
         if not math.isfinite(wanted) or carried is None:
-            what = "a whole number" if whole else "a number"
-            raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
+            reason = "not a whole number" if whole else "not a number"
+            raise ParameterRefusedError(message("not_written", what=f"{name} = {value}", reason=reason))
         other: float | None = None
         tries = 0
         await self._ensure_disarmed(name)
@@ -214,24 +226,21 @@ class ParameterClient(Parameters):
             for tries in self._required_tries():
                 if other is not None and tries > _TRIES:
                     break
-                message = mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
+                request = mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
                 # Nothing may be awaited between the guard and this.
-                self.writes += self._link.send(message, self.vehicle.disarmed.proven)
+                self.writes += self._link.send(request, self.vehicle.disarmed.proven)
                 deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
                 while (answer := await inbox.get(deadline_s)) is not None:
                     if isinstance(answer, str):
-                        raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer}")
+                        raise self._refused(f"set {name} = {wanted:.9g}", answer)
                     if answer == wanted if whole else same_float32(answer, wanted):
                         self._learn_loss(tries)
                         return answer
                     other = answer
                 await self._ensure_disarmed(name)
         if other is not None:
-            raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
-        raise ParameterTimeoutError(
-            f"{self.vehicle.name} does not answer to setting {name} ({tries} times, {_TIMEOUT_S:g} s each)"
-            f"{self.vehicle.why_silent}"
-        )
+            raise ParameterMismatchError(reads_otherwise(name, other, wanted))
+        raise self._unanswered(f"{name} = {wanted:.9g}", tries)
 
     @property
     def answering(self) -> bool:
@@ -248,7 +257,7 @@ class ParameterClient(Parameters):
         try:
             await self.vehicle.disarmed.ensure()
         except NotDisarmedError as error:
-            raise NotDisarmedError(f"{name} is not written: {error}") from error
+            raise NotDisarmedError(message("not_written", what=name, reason=error)) from error
 
     @contextlib.contextmanager
     def _exchange(self, name: str) -> Iterator[_Inbox]:
@@ -305,7 +314,7 @@ class ParameterClient(Parameters):
 
     def _target(self) -> tuple[int, int]:
         if self.vehicle.system_id is None:
-            raise ParameterTimeoutError("no autopilot has been heard yet")
+            raise ParameterTimeoutError(message("no_heartbeat_of_the_autopilot"))
         return self.vehicle.system_id, self.vehicle.component_id
 
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
@@ -331,7 +340,7 @@ class ParameterClient(Parameters):
             self._absent.clear()
             self._types.clear()
             for inbox in self._inboxes:
-                inbox.put(AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged"))
+                inbox.put(self._rebooted(f"{inbox.name} was read or written"))
 
 
 def _wire_name(name: str) -> bytes:

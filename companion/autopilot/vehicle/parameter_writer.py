@@ -25,7 +25,10 @@ from companion.autopilot.parameters.change import (
     PendingVector,
     WriteFailedError,
     by_vector,
+    reads_otherwise,
     same_float32,
+    shown,
+    with_restore,
 )
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer
@@ -39,6 +42,7 @@ from companion.errors import (
     StorageError,
 )
 from companion.estimation.records.record import WrittenParameter
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -102,7 +106,7 @@ class ParameterWriter:
                 # In a task of its own: in a cancelled one asyncio.timeout raises CancelledError when it expires, before
                 # Python 3.11.4, and the rest would not be put back. Debian 12 has 3.11.2.
                 await asyncio.create_task(self._put_back(items, leave_foreign=False))
-                logger.warning("writing was cancelled; left changed: %s", ", ".join(self.left_changed) or "nothing")
+                logger.warning("%s", with_restore("write cancelled", self.left_changed, restored=True))
                 raise
             for item in items:
                 item.outcome = "stored"
@@ -124,7 +128,7 @@ class ParameterWriter:
             await self._put_back(items, leave_foreign=True)
             if self.left_changed:
                 foreign = {item.change.parameter: item.read_back for item in items if item.left}
-                reason = ", ".join(f"{name} is {_words(value)}" for name, value in foreign.items())
+                reason = ", ".join(f"{name} is {shown(value)}" for name, value in foreign.items())
                 raise WriteFailedError(self._kind_now(items), reason, self.written, self.left_changed)
             return self.written
 
@@ -150,9 +154,10 @@ class ParameterWriter:
         items = [PendingChange(change) for change in changes]
         self._publish(items)
         if (why := self._vehicle.arm_state.why_not_written) is not None:
-            raise NothingWrittenError(f"nothing is written: {why}")
+            raise NothingWrittenError(message("not_written", what="parameters", reason=why))
         if self._vehicle.system_status == mavlink.MAV_STATE_CALIBRATING:
-            raise NothingWrittenError(f"nothing is written: {self._vehicle.name} is calibrating its own sensors")
+            why = f"{self._vehicle.name} is calibrating its own sensors"
+            raise NothingWrittenError(message("not_written", what="parameters", reason=why))
         self._boots = self._vehicle.boots
         return items
 
@@ -161,10 +166,7 @@ class ParameterWriter:
             name, before = item.change.parameter, item.change.before
             now = await self._read(name)
             if not same_float32(now, before):
-                raise _Failure(
-                    "changed by someone else",
-                    f"{name} is {_words(now)} now but was {_words(before)} when it was measured; nothing was written",
-                )
+                raise _Failure("changed by someone else", reads_otherwise(name, now, before))
 
     async def _write_by_far(self, vectors: Sequence[PendingVector], probe: FarProbe | None) -> None:
         """Write one vector after another: its far value, and when that is in use all new values, the far axis last.
@@ -188,7 +190,7 @@ class ParameterWriter:
             # Whoever is told that it is done may arm.
             await VehicleTimer(self._vehicle).let_pass(POLL_S)
         if wrong:
-            raise _Failure("not as believed", "; ".join(wrong))
+            raise _Failure("wrong slot, orientation or scale", "; ".join(wrong))
 
     async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
         """Write the far value and wait until it is in use; return why it is not, if so."""
@@ -212,7 +214,7 @@ class ParameterWriter:
             item.confirmed = True
         finally:
             item.sent |= self._parameters.writes > sent_before
-        self._check_boot(f"after {name} was written")
+        self._check_boot(f"{name} was written")
 
     async def _read_back(self, items: list[PendingChange]) -> None:
         await asyncio.sleep(_LATE_ECHO_S)
@@ -224,24 +226,26 @@ class ParameterWriter:
                 item.read_back = await self._read(name)
             if not same_float32(item.read_back, wanted):
                 kind: FailureKind = "changed by someone else" if item.confirmed else "answered another value"
-                raise _Failure(kind, f"{name} was set to {_words(wanted)} and reads {_words(item.read_back)}")
+                raise _Failure(kind, reads_otherwise(name, item.read_back, wanted))
 
     async def _check_end(self) -> None:
         await self._vehicle.hear_boot_time()
-        self._check_boot("before all was read back")
+        self._check_boot("its parameters were read back")
         try:
             await self._vehicle.disarmed.ensure()
         except NotDisarmedError as error:
-            kind = kind_of(error, self._vehicle, self._boots)
-            raise _Failure(kind, f"{error}, after its parameters were written") from error
+            raise _Failure(kind_of(error, self._vehicle, self._boots), str(error)) from error
 
-    def _check_boot(self, when: str) -> None:
+    def _check_boot(self, doing: str) -> None:
         if self._vehicle.boots != self._boots:
-            raise _Failure("rebooted in the middle", f"{self._vehicle.name} restarted {when}")
+            raise _Failure("rebooted in the middle", self._restarted(doing))
+
+    def _restarted(self, doing: str) -> str:
+        return message("autopilot_restarted_meanwhile", autopilot=self._vehicle.name, doing=doing)
 
     async def _read(self, name: str) -> float:
         value = await self._parameters.read(name)
-        self._check_boot(f"before {name} was read")
+        self._check_boot(f"{name} was read")
         return value
 
     # --- back
@@ -261,7 +265,7 @@ class ParameterWriter:
             # Another value may be that of a start-up calibration, which is not ours to overwrite.
             await self._vehicle.hear_boot_time()
         if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
-            kind, reason = "rebooted in the middle", f"{self._vehicle.name} restarted ({reason})"
+            kind, reason = "rebooted in the middle", self._restarted(f"its parameters were written ({reason})")
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
@@ -311,7 +315,7 @@ class ParameterWriter:
         try:
             await self._parameters.write(change.parameter, value)
         except AutopilotError as error:
-            logger.warning("%s is not put back yet: %s", change.parameter, error)
+            logger.warning("%s", message("restore_not_confirmed", parameter=change.parameter, reason=error))
 
     async def _read_in_force(self, name: str) -> float | None:
         if not self._vehicle.alive or self._late():
@@ -322,7 +326,7 @@ class ParameterWriter:
             except AutopilotRebootedError:
                 continue
             except AutopilotError as error:
-                logger.error("%s could not be read: %s", name, error)  # noqa: TRY400 - one line
+                logger.warning("%s", message("restore_not_confirmed", parameter=name, reason=error))
                 return None
         return None
 
@@ -376,7 +380,3 @@ def kind_of(error: CompanionError, vehicle: Vehicle, boots: int) -> FailureKind:
 
 def _same(one: float | None, other: float) -> bool:
     return one is not None and same_float32(one, other)
-
-
-def _words(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.9g}"

@@ -33,6 +33,7 @@ from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
 from companion.links.mavlink.signing import EARLIEST_S
 from companion.links.system.events import Listeners, comes
+from companion.messages import message
 
 __all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 
@@ -155,8 +156,8 @@ class Vehicle:
 
     @property
     def why_silent(self) -> str:
-        """To be put behind the words that it does not answer although it is heard: what is known of the cause."""
-        return "; it signs what it sends: does it refuse what is not signed?" if self.signs else ""
+        """Return a possible cause, to append to the words that the autopilot is heard but does not answer."""
+        return "; the autopilot signs its messages: does it refuse unsigned ones?" if self.signs else ""
 
     def sent(self, message: Message) -> bool:
         header = message.get_header()
@@ -266,7 +267,7 @@ class Vehicle:
     def _log_conflict(self) -> None:
         conflict = self.conflict
         if conflict is not None and not self._conflict_logged:
-            logger.error("%s: %s; nothing is written", self.name, conflict)
+            logger.error("%s: %s", self.name, conflict)
         self._conflict_logged = conflict is not None
 
     def _latch_on(self, message: mavlink.MAVLink_heartbeat_message) -> None:
@@ -289,7 +290,7 @@ class Vehicle:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         if self._stalled(now_s):
-            logger.warning("the event loop stood still for %.1f s", now_s - self._tick_due_s)
+            logger.warning("%s", message("program_stood_still", seconds=f"{now_s - self._tick_due_s:.1f}"))
             self._link.settled()  # what has waited is no news
         self._tick_due_s = now_s + _TICK_S
         self._tick_timer = loop.call_at(self._tick_due_s, self._tick)

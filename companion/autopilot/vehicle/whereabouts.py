@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config.sections import HEIGHT_M, LATITUDE_DEG, LONGITUDE_DEG
 from companion.links.mavlink.signing import EARLIEST_S
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +32,6 @@ CONFIRMED_AFTER_S: Final = 2.5  # a first place: what one packet says is not eno
 SETTLED_AFTER_S: Final = 30.0
 SILENT_S: Final = 5.0  # time for which a place counts after it was said last
 
-_OR_SET: Final = "(or set vehicle.latitude_deg, longitude_deg, height_m)"
 _EARTH_RADIUS_M: Final = 6_371_000.0
 _ESTIMATE: Final = "autopilot GLOBAL_POSITION_INT"
 _RECEIVER: Final = "autopilot GPS_RAW_INT"
@@ -75,9 +75,8 @@ class TimeAndPlace:
         if now_s - self._heard_s >= SILENT_S:
             return None
         if self._anchor is None:
-            return f"waiting for the position to be confirmed {_OR_SET}"
-        left_s = max(1.0, SETTLED_AFTER_S - (now_s - self._since_s))
-        return f"{_apart(self._anchor, self._claim)} while still: waiting {left_s:.0f} s for it to stay {_OR_SET}"
+            return _doubt("new position", CONFIRMED_AFTER_S - (now_s - self._since_s))
+        return _doubt(_apart(self._anchor, self._claim), SETTLED_AFTER_S - (now_s - self._since_s))
 
     def restarted(self) -> None:
         """Forget what the autopilot has said; an aircraft that stands still is where it was."""
@@ -108,7 +107,7 @@ class TimeAndPlace:
         elif t_s - self._heard_s >= SILENT_S or not _is_near(place, self._claim):
             self._claim, self._since_s, self._heard_s = place, t_s, t_s
             if self._anchor is not None:
-                logger.warning("%s while the aircraft stands still: not believed yet", _apart(self._anchor, place))
+                logger.warning("%s", _doubt(_apart(self._anchor, place), SETTLED_AFTER_S))
         else:
             self._heard_s = t_s
             if t_s - self._since_s >= (CONFIRMED_AFTER_S if self._anchor is None else SETTLED_AFTER_S):
@@ -136,6 +135,10 @@ def _distance_m(one: Position, other: Position) -> float:
     turn = math.cos(math.radians(one.longitude_deg - other.longitude_deg))
     cosine = math.sin(north) * math.sin(from_north) + math.cos(north) * math.cos(from_north) * turn
     return _EARTH_RADIUS_M * math.acos(max(-1.0, min(cosine, 1.0)))
+
+
+def _doubt(change: str, left_s: float) -> str:
+    return message("position_in_doubt", change=change, seconds=f"{max(1.0, left_s):.0f}")
 
 
 def _apart(before: Position, now: Position | None) -> str:

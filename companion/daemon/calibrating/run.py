@@ -125,7 +125,8 @@ class CalibrationRun(Job):
                 await self._make_plan()
                 await self._write_and_settle()
             except WriteFailedError as error:
-                if not attempts_left or error.kind not in ("not as believed", "without effect") or error.left_changed:
+                repeatable = error.kind in ("wrong slot, orientation or scale", "without effect")
+                if not attempts_left or not repeatable or error.left_changed:
                     raise
                 self._begin_again(error)
             else:
@@ -154,7 +155,7 @@ class CalibrationRun(Job):
         self._machine.on(Event.MOVED)
         logger.warning("%s; put back, measuring again", error.reason)
         self._forget()
-        if error.kind == "not as believed":
+        if error.kind == "wrong slot, orientation or scale":
             self.log.warnings.append(f"{error.reason}; put back, and written where it belongs")
         else:
             self.log.warnings.append(f"{error.reason}; put back, and tried again")

@@ -117,7 +117,7 @@ class Px4Writes:
                 # One offset may be wrong on purpose, and while it is armed nobody may mend that.
                 for name in self._writer.left_far:
                     self._say(Severity.CRITICAL, _danger(self._steps[name]), Weight.RESULT)
-            if error.kind == "not as believed" and not self._learned:
+            if error.kind == "wrong slot, orientation or scale" and not self._learned:
                 # Nothing was learned: the same slot again, and not for ever.
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
             raise
@@ -148,7 +148,7 @@ class Px4Writes:
                         await self._writer.apply(changes, probe)
                 await self._ledger.undone()
         except WriteFailedError as error:
-            if error.kind != "not as believed" or error.left_changed:
+            if error.kind != "wrong slot, orientation or scale" or error.left_changed:
                 raise
             # Something was learned: the offsets are read again, from another slot.
         return True

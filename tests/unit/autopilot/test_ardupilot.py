@@ -141,13 +141,13 @@ def test_orientation_100_of_4_1_and_before_has_angles_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"INS_TCAL1_ENABLE": 2}, "INS_TCAL1_ENABLE = 2.*learning"),
+        ({"INS_TCAL1_ENABLE": 2}, "INS_TCAL1_ENABLE is 2.*learning"),
         ({"INS_ACC_ID": 0}, "no IMU 1: INS_ACC_ID = 0"),
         ({"INS_GYR_ID": 0}, "no IMU 1: INS_GYR_ID = 0"),
         ({"INS_ACCSCAL_Y": 0.0}, "INS_ACCSCAL_Y is 0"),
         ({"INS_GYROFFS_Z": math.nan}, "INS_GYROFFS_Z is nan"),
-        ({"AHRS_ORIENTATION": 77}, "AHRS_ORIENTATION = 77 is not known"),
-        ({"AHRS_ORIENTATION": 101, "CUST_ROT_ENABLE": 0}, "needs CUST_ROT_ENABLE = 1"),
+        ({"AHRS_ORIENTATION": 77}, "AHRS_ORIENTATION is 77, expected a known orientation"),
+        ({"AHRS_ORIENTATION": 101, "CUST_ROT_ENABLE": 0}, "AHRS_ORIENTATION is 101, expected CUST_ROT_ENABLE = 1"),
     ],
 )
 def test_what_cannot_be_worked_with_is_refused_with_a_reason(changed: dict[str, float], words: str) -> None:
@@ -176,7 +176,7 @@ def only_warning(**changed: float) -> str:
     [
         ({"INS_GYR_CAL": 1}, "INS_GYR_CAL = 1: the next boot"),
         ({"INS_ACCOFFS_X": 0, "INS_ACCOFFS_Y": 0, "INS_ACCOFFS_Z": 0}, "3D Accel calibration needed"),
-        ({"INS_ACCSCAL_X": 1.3}, "outside 0.8 to 1.2"),
+        ({"INS_ACCSCAL_X": 1.3}, "INS_ACCSCAL_X is 1.3, expected 0.8 to 1.2"),
         ({"INS_USE": 0}, "INS_USE = 0"),
     ],
 )

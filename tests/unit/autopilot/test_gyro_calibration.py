@@ -29,8 +29,8 @@ class _Autopilot:
         self.result, self.arm_state = result, arm_state
         self.looks = self.sent = 0
 
-    def require_same_boot(self, boots: int, when: str) -> None:
-        assert boots == self.boots, when
+    def require_same_boot(self, boots: int, doing: str) -> None:
+        assert boots == self.boots, doing
 
     async def ensure(self) -> None:
         if self.arm_state is not ArmState.DISARMED:
@@ -63,6 +63,6 @@ def test_offsets_that_stay_at_zero_after_the_answer_are_looked_at_four_times_a_s
 @pytest.mark.parametrize("arm_state", [ArmState.ARMED, ArmState.UNKNOWN])
 def test_it_is_not_asked_for_unless_the_aircraft_is_surely_disarmed(arm_state: ArmState) -> None:
     autopilot = _Autopilot(mavlink.MAV_RESULT_ACCEPTED, arm_state)
-    with pytest.raises(NotDisarmedError, match=r"not started: .*armed"):
+    with pytest.raises(NotDisarmedError, match=r"did not run: .*armed"):
         run_virtual(calibrate(cast("ParameterClient", autopilot), OFFSETS, lambda words: None))
     assert autopilot.sent == 0

@@ -147,7 +147,7 @@ async def test_a_third_imu_that_is_all_zero_is_none() -> None:
     autopilot = ScriptedAutopilot()
     async with aboard(autopilot, 3) as (stream, heard, _):
         await asyncio.sleep(10.0)
-        assert stream.problem == "SCALED_IMU3 is all zero: there is no third IMU"
+        assert stream.problem == "the autopilot has no IMU 3: SCALED_IMU3 is all zero"
         assert stream.kind is None
         assert heard.samples == []
         autopilot.imu[3] = autopilot.imu[2]

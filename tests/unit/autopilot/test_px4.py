@@ -140,15 +140,15 @@ def test_what_was_learned_about_a_device_goes_before_the_order_of_the_slots() ->
 @pytest.mark.parametrize(
     ("changed", "instance", "words"),
     [
-        ({"CAL_GYRO0_ID": 0}, 1, "no gyro in CAL_GYRO0_ID to CAL_GYRO3_ID: calibrate its gyros once"),
-        ({"CAL_ACC0_ID": 0}, 1, "no accelerometer in CAL_ACC0_ID"),
+        ({"CAL_GYRO0_ID": 0}, 1, "no IMU 1: only 0 of CAL_GYRO0_ID to CAL_GYRO3_ID"),
+        ({"CAL_ACC0_ID": 0}, 1, "no IMU 1: only 0 of CAL_ACC0_ID"),
         ({}, 2, "no IMU 2: only 1 of CAL_ACC0_ID to CAL_ACC3_ID"),
         ({"CAL_GYRO0_PRIO": 0}, 1, "CAL_GYRO0_PRIO = 0"),
         ({"CAL_ACC0_PRIO": 0}, 1, "CAL_ACC0_PRIO = 0"),
         ({"CAL_ACC0_YSCALE": 0.0}, 1, "CAL_ACC0_YSCALE is 0"),
         ({"CAL_GYRO0_ZOFF": math.nan}, 1, "CAL_GYRO0_ZOFF is nan"),
         ({"SENS_BOARD_X_OFF": math.inf}, 1, "SENS_BOARD_X_OFF is inf"),
-        ({"CAL_GYRO0_ROT": 2, "CAL_ACC0_ROT": 4}, 1, "mount the two halves of one IMU differently"),
+        ({"CAL_GYRO0_ROT": 2, "CAL_ACC0_ROT": 4}, 1, "CAL_GYRO0_ROT is unlike CAL_ACC0_ROT"),
     ],
 )
 def test_what_cannot_be_worked_with_is_refused_with_a_reason(
@@ -318,9 +318,11 @@ async def test_what_is_seen_on_the_way_may_put_everything_back() -> None:
             seen.append(in_use(stage.px4, "GYRO"))
             return "it acts on another IMU" if parameter.startswith("CAL_GYRO") else None
 
-        with pytest.raises(WriteFailedError, match="not as believed: it acts on another IMU") as caught:
+        with pytest.raises(
+            WriteFailedError, match="wrong slot, orientation or scale: it acts on another IMU"
+        ) as caught:
             await stage.writer.apply(changes, lambda parameter: functools.partial(verify, parameter))
-        assert caught.value.kind == "not as believed"
+        assert caught.value.kind == "wrong slot, orientation or scale"
         assert max(seen[-1]) == pytest.approx(0.0228)
         await asyncio.sleep(1.5)
         assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]

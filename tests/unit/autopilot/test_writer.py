@@ -75,7 +75,7 @@ async def test_a_value_that_is_already_there_is_not_written_again() -> None:
 async def test_a_value_changed_by_someone_else_refuses_the_set_and_names_both() -> None:
     autopilot = ScriptedAutopilot(parameters=BEFORE | {Y: 0.75})
     async with aboard(autopilot) as (writer, _, _):
-        with pytest.raises(WriteFailedError, match=r"INS_GYROFFS_Y is 0\.75 now but was -0\.00200000009") as caught:
+        with pytest.raises(WriteFailedError, match=r"INS_GYROFFS_Y reads 0\.75, expected -0\.00200000009") as caught:
             await writer.apply(CHANGES)
         assert caught.value.kind == "changed by someone else"
         assert caught.value.left_changed == ()
@@ -137,7 +137,7 @@ async def test_a_value_that_another_station_sets_in_the_middle_is_left_to_it_and
 
     on_nth_set(autopilot, 3, meddle)
     async with aboard(autopilot) as (writer, _, _):
-        with pytest.raises(WriteFailedError, match=r"INS_GYROFFS_X was set to 0\.0109999999 and reads 0\.5") as caught:
+        with pytest.raises(WriteFailedError, match=r"INS_GYROFFS_X reads 0\.5, expected 0\.0109999999") as caught:
             await writer.apply(CHANGES)
         assert caught.value.kind == "changed by someone else"
         assert caught.value.left_changed == (X,)
@@ -209,7 +209,7 @@ async def test_a_restart_so_short_that_no_answer_is_missed_is_found_before_the_w
 
     on_nth_set(autopilot, 3, restart)
     async with aboard(autopilot) as (writer, vehicle, _):
-        with pytest.raises(WriteFailedError, match="before all was read back") as caught:
+        with pytest.raises(WriteFailedError, match="restarted while its parameters were read back") as caught:
             await writer.apply(CHANGES)
         assert caught.value.kind == "rebooted in the middle"
         assert vehicle.boots == 1

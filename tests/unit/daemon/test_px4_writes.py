@@ -127,7 +127,7 @@ def test_the_wrong_slot_is_put_back_and_named_and_the_next_write_takes_the_right
         async with aboard(px4, tmp_path) as stage:
             with pytest.raises(WriteFailedError) as caught:
                 await stage.write(1)
-            assert caught.value.kind == "not as believed"
+            assert caught.value.kind == "wrong slot, orientation or scale"
             assert "the offsets in CAL_GYRO0 act on the gyro of IMU 2, not of IMU 1" in str(caught.value)
             assert "the offsets in CAL_ACC0 act on the accelerometer of IMU 2, not of IMU 1" in str(caught.value)
             assert px4.parameters == before

@@ -192,7 +192,7 @@ def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pyt
     assert flight["stages"]["take_off_s"] == pytest.approx(67.0, abs=1.0)
     (imu,) = flight["imus"]
     # No parameters are in this log.
-    assert imu["notes"][0].startswith("PX4 has no accelerometer in CAL_ACC0_ID")
+    assert imu["notes"][0].startswith("the autopilot has no IMU 1: only 0 of CAL_ACC0_ID")
     for axis, bias_now, unit in zip(
         imu["axes"], (*GYRO_DEG_H, ACCEL_MG[2] + STEP_MG), (DEG_H, DEG_H, DEG_H, MG), strict=True
     ):
