@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from companion.config.sections import Mqtt
 from companion.errors import CompanionError, LinkError
+from companion.messages import message
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -120,7 +121,7 @@ async def subscribe(client: aiomqtt.Client, topic: str, **options: Any) -> None:
     """Subscribe to a topic; raise LinkError where the broker refuses it."""
     granted = await client.subscribe(topic, **options)
     if any(getattr(code, "value", code) >= _LEAST_REFUSAL_CODE for code in granted):
-        raise LinkError(f"the broker does not let us hear {topic} (its access list?)")
+        raise LinkError(message("broker_refuses", what=f"topic {topic} (its access list?)"))
 
 
 def read_password(settings: Mqtt) -> str | None:
@@ -136,13 +137,14 @@ def read_password(settings: Mqtt) -> str | None:
         with path.open("rb") as file:
             content = file.read(MAX_PASSWORD_BYTES + 1)
     except OSError as error:
-        raise LinkError(f"password file {path}: {_words(error)}") from None
+        raise LinkError(message("path_not_usable", path=f"password file {path}", reason=_words(error))) from None
     try:
         password = content.decode().removesuffix("\n").removesuffix("\r")
     except UnicodeDecodeError:
         password = ""
     if not password or "\n" in password or len(content) > MAX_PASSWORD_BYTES:
-        raise LinkError(f"password file {path}: wanted: the password on one line, and nothing else")
+        reason = "wanted: the password on one line, and nothing else"
+        raise LinkError(message("path_not_usable", path=f"password file {path}", reason=reason))
     return password
 
 
@@ -173,34 +175,31 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
             context.load_cert_chain(settings.cert_file, settings.key_file, password=lambda: "")
     except ssl.SSLError as error:
         what = (error.reason or str(error)).lower().replace("_", " ")
-        raise LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)") from None
+        reason = f"{what} (wanted: PEM, a key without a passphrase)"
+        raise LinkError(message("path_not_usable", path=where, reason=reason)) from None
     except OSError as error:
-        raise LinkError(f"{error.filename or where}: {_words(error)}") from None
+        raise LinkError(message("path_not_usable", path=error.filename or where, reason=_words(error))) from None
     return context
 
 
 UNSUPPORTED_PROTOCOL: Final = 132
 """Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
 _BAD_PASSWORD: Final = (134, 135)
-_TAKEN_OVER: Final = (
-    "another client called {id!r} has taken over: is there a second companion for this vehicle?"
-    " (mqtt.base_topic tells them apart)"
-)
-_LOST: Final = "the connection is gone (broker stopped? network? another client called {id!r}?)"
+_LOST: Final = "has ended the connection (stopped? network? another client called {id!r}?)"
 """Codes of a lost connection: paho's own, and that of MQTT 5."""
-_SILENT: Final = "nothing heard from the broker any more"
+_SILENT: Final = "is silent"
 """Codes of silence for twice the keepalive: paho's own, and that of MQTT 5."""
-_REASONS: Final = {
+_STATES: Final = {
     7: _LOST,
     16: _SILENT,
     128: _LOST,
-    UNSUPPORTED_PROTOCOL: "the broker speaks neither MQTT 5 nor 3.1.1",
-    133: "the broker refuses the client id {id!r} (mqtt.client_id)",
-    136: "the broker is not available now",
-    137: "the broker is not available now",
-    139: "the broker shuts down",
+    UNSUPPORTED_PROTOCOL: "speaks neither MQTT 5 nor 3.1.1",
+    133: "refuses the client id {id!r} (mqtt.client_id)",
+    136: "is not available now",
+    137: "is not available now",
+    139: "shuts down",
     141: _SILENT,
-    142: _TAKEN_OVER,
+    142: "has another client called {id!r}: a second companion for this vehicle? (change mqtt.base_topic)",
 }
 """Reason codes of MQTT 5 (its section 2.4), and paho's own below 128; paho turns those of MQTT 3.1.1 into the same."""
 
@@ -236,17 +235,18 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
     """Say in one line why there is no connection, without the address; `reached`: there was one."""
     code = _reason_code(error)
     if code in _BAD_PASSWORD:
-        if settings.username is None:
-            return "the broker asks for a user (mqtt.username, mqtt.password_file)"
-        return f"the broker refuses user {settings.username!r}: unknown, or the password is wrong"
+        user = f"user {settings.username!r}: unknown, or the password is wrong"
+        nobody = "clients without a user (mqtt.username, mqtt.password_file)"
+        return message("broker_refuses", what=nobody if settings.username is None else user)
     if code is not None:
-        words = _REASONS.get(code)
-        return f"the broker says: {causes(error)[-1]}" if words is None else words.format(id=client_id)
+        state = _STATES.get(code)
+        state = f"says: {causes(error)[-1]}" if state is None else state.format(id=client_id)
+        return message("broker_fails", state=state)
     hint = " (does it want tls = true?)"
     if settings.tls:
         hint = " (does it want a certificate? mqtt.cert_file)" if settings.cert_file is None else ""
     if _is_unanswered(error):
-        return "the broker does not answer any more" if reached else f"what listens there says nothing{hint}"
+        return message("broker_fails", state=_SILENT if reached else f"says nothing{hint}")
     for cause in causes(error):
         if isinstance(cause, LinkError):
             return str(cause)
@@ -258,15 +258,16 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
 def _of_system(error: OSError, settings: Mqtt) -> str | None:
     if isinstance(error, ssl.SSLCertVerificationError):
         trusted = settings.ca_file or "the system's authorities; mqtt.ca_file names another"
-        return f"the broker's certificate is not trusted: {error.verify_message} (by {trusted})"
+        reason = f"its certificate is not trusted: {error.verify_message} (by {trusted})"
+        return message("tls_failed", reason=reason)
     if isinstance(error, ssl.SSLError):
-        return f"TLS fails: {(error.reason or str(error)).lower().replace('_', ' ')}"
+        return message("tls_failed", reason=(error.reason or str(error)).lower().replace("_", " "))
     if isinstance(error, socket.gaierror):
-        return f"host {settings.host} is not known"
+        return message("broker_fails", state=f"has an unknown host {settings.host}")
     if isinstance(error, TimeoutError):
-        return "no answer"
+        return message("broker_fails", state="gives no answer")
     if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there (is the broker running?)"
+        return message("broker_fails", state="does not listen (is it running?)")
     return _words(error) if error.errno else None
 
 

@@ -22,6 +22,7 @@ from companion.errors import LinkError
 from companion.formats import Object
 from companion.links.system.connection import Reconnection
 from companion.links.system.events import comes
+from companion.messages import message
 from companion.mqtt.broker import MQTT_5, Broker, subscribe
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
 GREETING_DEADLINE_S: Final = 5.0
 """Timeout of the broker's first answer; a broker that is silent to MQTT 5 is then tried with MQTT 3.1.1."""
 ANSWER_DEADLINE_S: Final = 5.0
@@ -195,8 +195,9 @@ class MqttLink:
             since = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=connected_for_s)
             if self._will is not None and not self._echoed and connected_for_s > ANSWER_DEADLINE_S:
                 # Few brokers tell a client that they let it neither speak nor hear.
-                faults.append("our own messages do not come back (the broker's access list?)")
-            words = "; ".join((f"connected to {self._broker.where} since {since:%H:%M:%S} UTC", *faults))
+                faults.append(message("broker_refuses", what="our own messages: none comes back (its access list?)"))
+            connected = message("mqtt_connected", broker=self._broker.where, detail=f"since {since:%H:%M:%S} UTC")
+            words = "; ".join((connected, *faults))
         else:
             words = self._reconnection.last_error or f"{self._broker.where}: not connected yet"
             if (retry_s := self._reconnection.retry_s) is not None:
@@ -215,9 +216,7 @@ class MqttLink:
         try:
             await asyncio.to_thread(_load_library)
         except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
-            self._reconnection.down(
-                f"aiomqtt cannot be loaded: {error} ({INSTALL}); the companion goes on without MQTT"
-            )
+            self._reconnection.down(message("mqtt_library_missing", error=error))
             await asyncio.get_running_loop().create_future()
         await self._reconnection.keep(self._once)
 
@@ -254,16 +253,14 @@ class MqttLink:
         self.connections += 1
         self.outbox.opened()
         name = "MQTT 5" if self._broker.protocol == MQTT_5 else "MQTT 3.1.1"
-        self._reconnection.up(f"connected to {self._broker.where} ({name})")
+        self._reconnection.up(message("mqtt_connected", broker=self._broker.where, detail=name))
         while True:
             parcel = await self.outbox.next()
             parcel.tries += 1
             if parcel.is_given_up:
-                logger.warning(
-                    "mqtt: %s: given up: %d bytes at %s, over which the connection ended %d times;"
-                    " set the broker's limit higher",
-                    *(self._broker.where, len(parcel.payload), parcel.topic, MOST_TRIES),
-                )
+                size, topic = len(parcel.payload), parcel.topic
+                lost = message("mqtt_message_given_up", size=size, topic=topic, times=MOST_TRIES)
+                logger.warning("mqtt: %s: %s", self._broker.where, lost)
             else:
                 await client.publish(parcel.topic, parcel.payload, parcel.qos, parcel.retain, timeout=ANSWER_DEADLINE_S)
                 parcel.tries = 0
@@ -294,11 +291,11 @@ class MqttLink:
             logger.warning("mqtt: %s: %s", self._broker.where, error)
 
     async def _receive(self, client: aiomqtt.Client) -> None:
-        async for message in client.messages:
-            topic = message.topic.value
+        async for received in client.messages:
+            topic = received.topic.value
             self._echoed |= self._will is not None and topic == self._will[0]
             try:
-                self._on_message(Incoming(topic, message.payload, bool(message.retain)))
+                self._on_message(Incoming(topic, received.payload, bool(received.retain)))
             except Exception:
                 logger.exception("an MQTT message could not be dealt with")
 

@@ -19,6 +19,7 @@ import msgspec
 from companion.commands import MAX_SHOWN, Interface, asked_by, shown
 from companion.errors import CalibrationRefusedError, CompanionError, DaemonUnreachableError
 from companion.formats import Object
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +71,8 @@ class Daemon:
                             self._accept(await anext(replies, None))
             except (CompanionError, TimeoutError) as error:
                 if self.alive:
-                    logger.warning("mqtt: the daemon gives no state: %s", str(error) or "it is silent")
+                    reason = str(error) or f"silent for {SILENT_S:g} s"
+                    logger.warning("mqtt: %s", message("daemon_gives_no_answer", reason=reason))
             self.alive, self.pose = False, None
             self.news.set()
             await asyncio.sleep(AGAIN_S)
@@ -99,7 +101,7 @@ class Daemon:
                         raise CompanionError(str(reply["reason"]))
                     if reply["kind"] == "result":
                         return reply
-        raise DaemonUnreachableError("the daemon gives no answer")
+        raise DaemonUnreachableError(message("daemon_gives_no_answer", reason=f"silent for {ANSWER_WITHIN_S:g} s"))
 
 
 class Request(msgspec.Struct):
@@ -186,13 +188,11 @@ class Requests:
         if not payload and (retained or command in self._retained):
             self._retained.discard(command)
             return
+        request = parse(command, payload)
+        reason = message("retained_request", topic=self._topic + command) if retained else request.problem
         if retained and command not in self._retained:
             self._retained.add(command)
-            topic = self._topic + command
-            words = "mqtt: the retained request at %s is not obeyed; delete it: mosquitto_pub -r -n -t %s"
-            logger.warning(words, topic, topic)
-        request = parse(command, payload)
-        reason = "a retained request is never obeyed; send it again without retain" if retained else request.problem
+            logger.warning("mqtt: %s", reason)
         if reason:
             self._refuse(request, "request", reason)
         elif not self._is_repeat(request):
@@ -221,7 +221,7 @@ class Requests:
 
     def _start(self, request: Request) -> None:
         if len(self._tasks) >= MAX_PENDING:
-            self._refuse(request, "busy", f"{MAX_PENDING} requests are waiting for their end already")
+            self._refuse(request, "busy", message("too_many_at_once", what="MQTT requests"))
             return
         if request.transaction is not None:
             request.at_s = asyncio.get_running_loop().time()
@@ -256,8 +256,7 @@ class Requests:
             self._reject(request, "other", str(error))
         except Exception:
             logger.exception("mqtt request %s failed", request.command)
-            reason = "internal error of the daemon; its log has the details"
-            self._answer(request, {"state": "failed", "reason": reason})
+            self._answer(request, {"state": "failed", "reason": message("daemon_internal_error")})
 
     def _answer(self, request: Request, answer: Object) -> None:
         request.response = {"transaction": request.transaction, **answer}

@@ -23,6 +23,7 @@ from companion.config.sections import Fleet, Location
 from companion.errors import CompanionError
 from companion.formats import Object, decode, utc_now
 from companion.links.system.events import comes
+from companion.messages import message
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Daemon
 from companion.mqtt.fleet_sources import CurrentAircraft, Sources, utc
@@ -107,11 +108,11 @@ class AircraftFleet:
         waiting = sum(kept.waiting for kept in self._kept)
         confirmed_at = max((kept.confirmed_at for kept in self._kept if kept.confirmed_at), default=None)
         last = "never confirmed so far" if confirmed_at is None else f"last confirmed {confirmed_at[:16]}Z"
-        words = f"{waiting or 'no'} item{'' if waiting == 1 else 's'} waiting for the fleet, {last}"
+        words = message("fleet_waiting", items=f"{waiting or 'no'} item{'' if waiting == 1 else 's'}", confirmed=last)
         if self._problem is not None:
             words = f"{words}; {self._problem}"
         elif self._nameless:
-            words = "the autopilot tells no unique id (AUTOPILOT_VERSION): nothing is kept for the fleet"
+            words = message("fleet_not_sent", reason="the autopilot has no unique id (AUTOPILOT_VERSION)")
         return {
             "good": self._problem is None and not self._nameless,
             "summary": words,

@@ -16,6 +16,7 @@ from companion.formats import Object
 from companion.links.system.connection import ask
 from companion.links.system.events import comes
 from companion.links.system.process import ChildSettings
+from companion.messages import message
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Ask, Daemon, Requests
 from companion.mqtt.fleet import AircraftFleet
@@ -60,7 +61,7 @@ class MqttProcess:
     def status(self) -> Object:
         fleet: Object | None = None if self.fleet is None else self.fleet.status()
         if self._only_listening and self._has_fleet:
-            fleet = {"good": True, "summary": "not looked at in a check: companion status, once the daemon runs"}
+            fleet = {"good": True, "summary": message("fleet_not_sent", reason="only a check is running")}
         if self.link is None or self.topics is None:
             waiting = "waiting for the autopilot's system id"
             return {"good": False, "summary": waiting, "connected": False, "fleet": fleet}

@@ -81,7 +81,7 @@ def test_another_speed_and_parity(tmp_path: Path) -> None:
             (finding,) = of(await found(text(tmp_path, "baud = 115200")), "gradienter", "ports")
             assert not finding.good
             assert finding.remedy == 'set baud = 9600 and parity = "even" in [gradienter]'
-            assert finding.words.startswith("it sends at 9600 8E1, not ")
+            assert finding.words.startswith("this is inclinometer_xy at 9600 8E1, not at ")
 
     asyncio.run(main())
 
@@ -91,10 +91,12 @@ def test_two_devices_swapped_each_at_its_own_speed(tmp_path: Path) -> None:
         async with bench(tmp_path, Setting(9600), Setting(19200), swapped=True):
             told = {each.name: each.words for each in of(await found(text(tmp_path)), "gradienter", "compass")}
             assert told["gradienter"].startswith(
-                "this is hmr3300, a device for compass: give [gradienter] the port of the gradienter"
+                "this is hmr3300, a device for compass, not for gradienter:"
+                " give [gradienter] the port of the gradienter"
             )
             assert told["compass"].startswith(
-                "this is inclinometer_xy, a device for gradienter: give [compass] the port of the compass"
+                "this is inclinometer_xy, a device for gradienter, not for compass:"
+                " give [compass] the port of the compass"
             )
 
     asyncio.run(main())

@@ -122,7 +122,7 @@ def test_a_retained_request_is_never_obeyed(tmp_path: Path, caplog: pytest.LogCa
                 await until_connected(service)
                 refused = await watcher.response(BASE, "calibrate", "old")
                 assert (refused["state"], refused["refusal"]) == ("refused", "request")
-                assert "retained request is never obeyed" in refused["reason"]
+                assert "the retained request at" in refused["reason"]
                 one.kill()
                 await until_connected(service, connected=False)
                 await one.start()

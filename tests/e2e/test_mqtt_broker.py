@@ -162,7 +162,7 @@ def test_an_access_list_that_keeps_us_from_speaking_or_hearing(
 
     async def main() -> None:
         async with broker(tmp_path, more=f"acl_file {path}") as one, alone(tmp_path, one.section()) as service:
-            await until_bad(service, "our own messages do not come back")
+            await until_bad(service, "our own messages: none comes back")
 
     asyncio.run(main())
 

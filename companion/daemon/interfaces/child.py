@@ -20,6 +20,7 @@ from companion.errors import LinkError
 from companion.formats import Object
 from companion.links.system.connection import Reconnection
 from companion.links.system.process import OUT_OF_MEMORY, REPORT_EVERY_S, ChildSettings
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -62,12 +63,13 @@ class Child:
                 start_new_session=True,
             )
         except OSError as error:
-            raise LinkError(f"the process cannot be started: {error.strerror or error}") from error
+            reason = f"cannot be started: {error.strerror or error}"
+            raise LinkError(message("process_failed", fault=reason)) from error
         self.process_id = process.pid
         try:
             assert process.stdin is not None
             process.stdin.write(msgspec.json.encode(self._settings) + b"\n")
-            return await self._watch(process)
+            return message("process_failed", fault=await self._watch(process))
         finally:
             self._report = self.process_id = None
             ending = asyncio.ensure_future(_end(process))
@@ -88,7 +90,7 @@ class Child:
                 silent_s, heard = (silent_s + REPORT_EVERY_S if heard is self._report else 0.0), self._report
                 if silent_s >= (SILENT_S if heard is not None else FIRST_REPORT_S):
                     _kill(process)
-                    return f"the process gave no sign of life for {silent_s:.0f} s: ended"
+                    return f"gave no sign of life for {silent_s:.0f} s: ended"
             return await reading
         finally:
             reading.cancel()
@@ -103,7 +105,7 @@ class Child:
                 self._report = msgspec.json.decode(line, type=dict[str, object])
         except ValueError as error:
             _kill(process)
-            return f"the process reported what is not understood: {error}"
+            return f"sent an unreadable report: {error}"
         return _ended(await process.wait())
 
 
@@ -138,7 +140,5 @@ def _kill(process: Process) -> None:
 
 def _ended(code: int) -> str:
     if code == OUT_OF_MEMORY:
-        return "the process needed more memory than it may have"
-    if code >= 0:
-        return f"the process ended with code {code}"
-    return f"the process was ended by {signal.Signals(-code).name}"
+        return "needed more memory than it may have"
+    return f"ended with code {code}" if code >= 0 else f"was ended by {signal.Signals(-code).name}"

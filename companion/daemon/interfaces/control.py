@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import grp
 import logging
 import os
@@ -23,6 +24,7 @@ from companion.commands import ALL
 from companion.errors import CompanionError, LinkError, RequestRefusedError
 from companion.formats import Object, parse_request
 from companion.links.system.connection import READ_TIMEOUT_S, write_line
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +33,6 @@ Handler = Callable[[Object], AsyncIterator[Object]]
 REQUEST_LIMIT: Final = 64 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
 KERNEL_BYTES: Final = 16 * 1024
-INTERNAL_ERROR: Final = "internal error of the daemon; its log has the details"
 MAX_CLIENTS: Final = 16
 """Most connections of each kind: without a request yet, urgent commands, all others."""
 URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
@@ -95,7 +96,7 @@ class ControlServer:
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     request = parse_request(await reader.readline())
             except ValueError as error:
-                await write_line(writer, {"kind": "error", "reason": f"request not understood: {error}"})
+                await write_line(writer, {"kind": "error", "reason": message("request_not_understood", reason=error)})
                 await _finish(writer)
                 return
             await self._take(request, writer)
@@ -105,7 +106,7 @@ class ControlServer:
             self._silent.pop(client, None)
         urgent = request.get("command") in URGENT
         if self._served[urgent] >= MAX_CLIENTS:
-            await write_line(writer, {"kind": "error", "reason": "the daemon has too many clients at once; try again"})
+            await write_line(writer, {"kind": "error", "reason": message("too_many_at_once", what="clients")})
             await _finish(writer)
             return
         self._served[urgent] += 1
@@ -127,7 +128,7 @@ class ControlServer:
             raise
         except Exception:
             logger.exception("control request %r failed", request.get("command"))
-            await write_line(writer, {"kind": "error", "reason": INTERNAL_ERROR})
+            await write_line(writer, {"kind": "error", "reason": message("daemon_internal_error")})
 
 
 async def _finish(writer: asyncio.StreamWriter) -> None:
@@ -151,7 +152,8 @@ def _bind(path: Path) -> socket.socket:
         finally:
             os.umask(old_mask)
     except OSError as error:
-        raise LinkError(f"control socket {path}: cannot be opened: {error.strerror or error}") from error
+        reason = error.strerror or error
+        raise LinkError(message("path_not_usable", path=f"control socket {path}", reason=reason)) from error
     return listener
 
 
@@ -160,24 +162,25 @@ def _open_to(path: Path, group: str) -> None:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
         path.chmod(0o660)
     except (KeyError, OSError) as error:
-        why = "there is no such group" if isinstance(error, KeyError) else error.strerror or str(error)
-        logger.warning("control socket: group %s may not use it: %s", group, why)
+        why = "no such group" if isinstance(error, KeyError) else error.strerror or str(error)
+        logger.warning("%s", message("path_not_usable", path=f"control socket {path}", reason=f"group {group}: {why}"))
 
 
 def _remove_stale(path: Path) -> None:
+    """Remove the socket of a daemon that has ended; raise OSError where another file or daemon is there."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise LinkError(f"control socket {path}: a file that is not a socket is in the way; remove it")
+        raise OSError(errno.EEXIST, "a file that is not a socket is in the way; remove it")
     probe = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         probe.connect(str(path))
     except ConnectionRefusedError:
         path.unlink()
     else:
-        raise LinkError(f"control socket {path}: another companion is running (see: companion status)")
+        raise OSError(errno.EADDRINUSE, "another companion is running (see: companion status)")
     finally:
         probe.close()
 

@@ -16,6 +16,7 @@ from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.estimation.machine import State
 from companion.formats import Object
+from companion.messages import message
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
@@ -76,7 +77,7 @@ class Headlines:
         if age_s is None:
             return "NO AUTOPILOT", self._devices.not_heard, "bad"
         why = self._devices.signing.rejecting or "power? cable?"
-        return "NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad"
+        return "NO AUTOPILOT", message("no_heartbeat_for", seconds=f"{age_s:.0f}", remedy=why), "bad"
 
     def _working(self, job: Job, now_s: float) -> Headline:
         state = self._manager.state

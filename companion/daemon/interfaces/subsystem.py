@@ -28,6 +28,7 @@ from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError, ConfigError
 from companion.estimation.records.record import ImuRecord
 from companion.formats import Object
+from companion.messages import message
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
@@ -95,7 +96,7 @@ class Interfaces(Subsystem):
         face = face or FACES.get(str(request.get("face")), "companion")
         handler = self._handlers.get(command) if isinstance(command, str) else None
         if handler is None:
-            yield {"kind": "error", "reason": f"unknown command {command!r}"}
+            yield {"kind": "error", "reason": message("request_not_understood", reason=f"command {command!r}")}
             return
         try:
             understood = ALL[str(command)].read(request)
@@ -179,7 +180,7 @@ class Interfaces(Subsystem):
         report: Object = {"connected": False, "fleet": None} | self.mqtt.status()
         fleet = report.pop("fleet")
         if fleet is None and self._core.config.fleet is not None:
-            fleet = {"good": False, "summary": f"nothing is sent: {report['summary']}"}
+            fleet = {"good": False, "summary": message("fleet_not_sent", reason=report["summary"])}
         return {"mqtt": report, "fleet": fleet}
 
     async def settled(self, within_s: float) -> None:

@@ -23,6 +23,7 @@ from companion.formats import Object
 from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, list_ports, port_faults, same_ports
 from companion.links.system.connection import ask
+from companion.messages import message
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, main_kind
 
@@ -72,7 +73,7 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
         for fault in port_faults(port, is_fast=name in fast, ours=ours, among=among, root=root)
     ]
     for first, second, device in same_ports(ports, root):
-        words = f"{first} and {second} are one and the same port, {device}: give each its own"
+        words = message("ports_are_one", first=first, second=second, port=device)
         found.append(CheckLine(second, good=False, words=words))
     return found
 
@@ -105,19 +106,22 @@ def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *,
         if isinstance(speaks, str):
             return bad(*_other_protocol(sensor, speaks))
         if not sensor.settings.is_tcp and not may_listen:
-            return bad("it may be set to another speed or parity", STOP_FIRST)
+            return bad(message("no_known_frames", where="at this speed and parity"), STOP_FIRST)
         return []
     if heard.stranger is not None:
-        return bad(f"no sensor on {sensor.port} ({heard.line}) but {heard.stranger}", "another port, or unplug it")
+        found = f"{heard.stranger} ({sensor.port}, {heard.line})"
+        return bad(message("other_device", found=found, wanted="a sensor"), "another port, or unplug it")
     if heard.candidate is None or heard.line is None:
         if not heard.bytes_heard:
             return []
-        return bad(f"{heard.bytes_heard} bytes came, nothing known at any usual speed", "wire, levels, protocol?")
+        where = f"in {heard.bytes_heard} bytes at any usual speed"
+        return bad(message("no_known_frames", where=where), "wire, levels, protocol?")
     lines = _line_keys(sensor, heard.line)
     if heard.candidate.protocol == sensor.info.name:
         if not lines:
             return []
-        return bad(f"it sends at {heard.line}, not {sensor.line}", f"set {' and '.join(lines)} in {_section(sensor)}")
+        words = message("other_device", found=f"{sensor.info.name} at {heard.line}", wanted=f"at {sensor.line}")
+        return bad(words, f"set {' and '.join(lines)} in {_section(sensor)}")
     words, remedy = _other_protocol(sensor, heard.candidate.protocol)
     return bad(words, f"{remedy} with {' and '.join(lines)}" if lines else remedy)
 
@@ -131,10 +135,10 @@ def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
     change = f'set protocol = "{protocol}" in {_section(sensor)}'
     main, right = main_kind(protocol), f"give {_section(sensor)} the port of the {sensor.kind}"
     if main == sensor.kind:
-        return f"this is {protocol}, not {sensor.info.name}", change
+        return message("other_device", found=protocol, wanted=sensor.info.name), change
     if protocol in PROTOCOLS[sensor.kind]:
-        return f"this is {protocol}, a device for {main}", f"{right}; or, to make do with it as {sensor.kind}, {change}"
-    return f"this is {protocol}, a device for {main}", right
+        right = f"{right}; or, to make do with it as {sensor.kind}, {change}"
+    return message("other_device", found=f"{protocol}, a device for {main}", wanted=f"for {sensor.kind}"), right
 
 
 async def run_check(
@@ -182,12 +186,10 @@ async def run_check(
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
-    for kind, without in (
-        ("gradienter", "gyros only (accelerometers by hand: companion align faces)"),
-        ("compass", "gyro sigma widened by the Earth's rate"),
-    ):
+    no_tilt = message("sensor_missing", sensor="gradienter", sensors="accelerometers")
+    for kind, words in (("gradienter", no_tilt), ("compass", message("no_heading", reason="no compass"))):
         if getattr(config, kind) is None:
-            findings.append(CheckLine(kind, good=True, words=f"not configured: {without}"))
+            findings.append(CheckLine(kind, good=True, words=words))
     return findings
 
 
@@ -210,7 +212,8 @@ def _autopilot(config: Config, vehicle: Object) -> CheckLine:
         if age_s < LOST_S:
             return CheckLine("autopilot", good=True, words=vehicle["summary"])
         remedy = "power? cable?"
-        return CheckLine("autopilot", good=False, words=f"no heartbeat for {age_s:.0f} s: {remedy}", remedy=remedy)
+        words = message("no_heartbeat_for", seconds=f"{age_s:.0f}", remedy=remedy)
+        return CheckLine("autopilot", good=False, words=words, remedy=remedy)
     baud = baud_of(config.mavlink.url)
     needs = "switched on, and sent there (MAVProxy --out, mavlink-router)?"
     if baud is not None:
@@ -230,7 +233,7 @@ def _profile(profile: Object) -> CheckLine:
 def _gate(config: Config, setup: Object) -> CheckLine:
     problem = setup["problem"]
     if not config.push.parameters:
-        problem = "at_arm = gate with push.parameters = false never opens"
+        problem = message("gate_never_opens")
     elif not setup["known"]:
         problem = "not known whether the autopilot asks before it arms: try again"
     return CheckLine("arming", good=problem is None, words=problem or "the autopilot asks before it arms")
@@ -246,4 +249,5 @@ async def _heading(config: Config) -> CheckLine:
 def _storage(directory: Path) -> CheckLine:
     place = next(path for path in (directory, *directory.parents) if path.exists())
     good = place.is_dir() and os.access(place, os.W_OK)
-    return CheckLine("storage", good, f"{directory}" + ("" if good else f": cannot be written by this user ({place})"))
+    words = str(directory) if good else message("path_not_usable", path=directory, reason=f"{place} is not writable")
+    return CheckLine("storage", good, words)

@@ -41,6 +41,7 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
 from companion.links.serial import bytestream
 from companion.links.system.process import ServiceManager, set_up_logs
+from companion.messages import message
 from companion.storage.profiles import saved_profile
 from companion.storage.state import only_daemon
 
@@ -265,7 +266,7 @@ class Supervisor:
     def _stop(self, why: str) -> None:
         if self._work is None or self._stopping:
             # A second signal must not cut off what the first one is putting in order.
-            logger.warning("%s: stopping already; what was begun is put in order first", why)
+            logger.warning("%s: %s", why, message("stops_already"))
             return
         logger.info("%s: stopping", why)
         self._stopping = True
@@ -292,8 +293,8 @@ class Supervisor:
         fed = "; the watchdog is not fed until it does" if self._manager.watchdog_s is not None else ""
         for each in overdue:
             if each.name not in self._missed:
-                where = _where(each.task)
-                logger.error("watchdog: %s has not gone on for %.0f s (%s)%s", each.name, each.age_s, where, fed)
+                where, age = _where(each.task), f"{each.age_s:.0f}"
+                logger.error("watchdog: %s%s", message("task_hangs", task=each.name, seconds=age, where=where), fed)
         missed = {each.name for each in overdue}
         for name in () if self._stopping else self._missed - missed:
             logger.warning("watchdog: %s goes on again", name)
@@ -317,7 +318,7 @@ class Supervisor:
             if not self._status_failed:
                 logger.exception("the status cannot be worked out")
             self._status_failed = True
-            return "; ".join([*notes, "the status cannot be worked out: see the log"])
+            return "; ".join([*notes, message("daemon_internal_error")])
 
 
 def _where(task_name: str) -> str:

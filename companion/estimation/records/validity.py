@@ -25,6 +25,7 @@ import numpy as np
 from companion.config.sections import AllanModel, Calibration
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import ImuRecord
+from companion.messages import message
 from companion.physics.units import UNITS
 from companion.samples import Triad, Vector
 
@@ -136,23 +137,28 @@ def judge(
     (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
     found: list[Objection] = []
     if not held.seen:
-        found.append(Objection(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
+        found.append(Objection(Why.UNSEEN, message("offsets_not_seen_to_work", triad=triad, imu=name)))
     if present is not None and (worst := worst_axis(held, present)) is not None:
-        found.append(Objection(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:.{digits}f} {words}"))
+        found.append(Objection(Why.RESIDUAL, _since(f"{triad} {name}", f"{worst / unit:.{digits}f} {words} off")))
     if held.temperature_degc is not None and temperature_degc is not None:
         change = temperature_degc - held.temperature_degc
-        warmer = "warmer" if change > 0 else "colder"
+        warmer = f"{abs(change):.0f} K {'warmer' if change > 0 else 'colder'}"
         if drift is not None:
             moved = max(math.sqrt(mean**2 + variance) for mean, variance in zip(*drift, strict=True))
             if moved > DRIFT_SIGMAS * max(held.sigma):
-                off = f"{triad} {name}: about {moved / unit:.{digits}f} {words} off"
-                found.append(Objection(Why.TEMPERATURE, f"{off}, {abs(change):.0f} K {warmer}"))
+                off = f"about {moved / unit:.{digits}f} {words} off, {warmer}"
+                found.append(Objection(Why.TEMPERATURE, _since(f"{triad} {name}", off)))
         elif abs(change) > limits.max_temperature_change_degc:
-            found.append(Objection(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
+            found.append(Objection(Why.TEMPERATURE, _since(f"imu {name}", warmer)))
     limit_s = min(60.0 * limits.max_age_min, age_limit_s(model, held.sigma, held.averaged_s))
     if (age_s := now_s - held.confirmed_s) > limit_s:
-        found.append(Objection(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
+        age, limit = f"{age_s / 60:.0f}", f"{limit_s / 60:.0f}"
+        found.append(Objection(Why.OLD, message("calibration_old", age=age, limit=limit)))
     return found
+
+
+def _since(part: str, change: str) -> str:
+    return message("changed_since_calibration", part=part, change=change)
 
 
 def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor: float = 0.0) -> list[float]:

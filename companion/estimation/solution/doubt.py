@@ -15,6 +15,7 @@ from typing import Final, Literal
 import numpy as np
 
 from companion.estimation.solution.prior import Prediction
+from companion.messages import message
 from companion.physics.frames import Array, Matrix
 from companion.physics.units import DEG, DEG_H, MG, UNITS
 from companion.samples import TRIADS, Triad
@@ -29,7 +30,7 @@ well be of another sensor takes no part."""
 _OF_ALL: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",
-    "turn": "it turns",
+    "turn": "the aircraft turns",
 }
 """Causes that concern a triad of all IMUs, in a few words."""
 
@@ -153,47 +154,40 @@ def _alone(
     triad, name, expected = witness.triad, witness.name, witness.expected
     unit, words, digits = UNITS[triad]
     axis = int(np.argmax(np.abs(witness.difference) / witness.sigma))
-    before = (
-        "the calibration before in this power-up"
-        if today
-        else f"{expected.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:.{digits}f})"
-    )
-    by = f"{witness.difference[axis] / unit:+.{digits}f} {words}"
-    line = f"{triad} {name}: {'xyz'[axis]} differs by {by} from {before}"
+    before = "the last calibration of this power-up"
+    if not today:
+        before = f"{expected.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:.{digits}f})"
+
+    def doubt(found: Cause, suspicion: str) -> Doubt:
+        axis_of, by = f"{triad} {name}: {'xyz'[axis]}", f"{witness.difference[axis] / unit:+.{digits}f} {words}"
+        line = message("imu_differs", axis=axis_of, difference=by, before=before, suspicion=suspicion)
+        return Doubt(triad, found, (name,), line)
+
     for cause, directions in causes:
         shift, size = _common([witness], directions)
         if witness.is_explained(shift) and not any(other.gain(shift) < -TELLS for other in others):
             also = {
                 "gradienter": f"the gradienter has moved by {math.hypot(*size) / DEG:.2f} deg",
-                "gravity": "height and latitude of the place are wrong",
-                "turn": "it turns (a boat?)",
+                "gravity": "height or latitude are wrong",
+                "turn": "the aircraft turns (a boat?)",
             }[cause]
-            return Doubt(triad, "unclear", (name,), f"{line}: this sensor is another one now, or {also}")
+            return doubt("unclear", f"sensor replaced, or {also}")
     agree = ", ".join(other.name for other in others)
-    end = f"while {agree} agrees with its own: look at this sensor" if agree else "look at this sensor"
-    return Doubt(triad, "imu", (name,), f"{line}, {end}")
+    return doubt("imu", f"check this sensor ({agree} agrees with its own)" if agree else "check this sensor")
 
 
 def _of_all(cause: Cause, size: Array, names: str, against: Sequence[Witness]) -> str:
-    """Say a contradiction of all IMUs to a pilot; `size` is the shift along the cause's directions."""
+    """Describe a contradiction of all IMUs; `size` is the shift along the cause's directions."""
+    sensors = "accelerometers"
     if cause == "turn":
-        return (
-            f"all gyros ({names}) differ alike from before, by {float(np.linalg.norm(size)) / DEG_H:.0f} deg/h:"
-            " does it turn (a boat, a turntable)?"
-        )
-    if cause == "gravity":
-        return (
-            f"all accelerometers ({names}) read {size[0] / MG:+.1f} mg more along the vertical than before: are"
-            " height and latitude of the place right?"
-        )
-    x, y = size / DEG
-    by = f"{math.hypot(x, y):.2f} deg (x {x:+.2f}, y {y:+.2f})"
-    if all(witness.expected.same_zero > 0.5 for witness in against):
-        return (
-            f"the gradienter has moved by {by}: all accelerometers ({names}) differ alike from before; look"
-            " at its mounting, then companion align zero"
-        )
-    return (
-        f"the gradienter's zero differs from the one before by {by} more than it should: all accelerometers"
-        f" ({names}) say so; companion align zero"
-    )
+        fault, sensors = f"the aircraft turns by {float(np.linalg.norm(size)) / DEG_H:.0f} deg/h", "gyros"
+        remedy = "is it on a boat or a turntable?"
+    elif cause == "gravity":
+        fault, remedy = f"gravity differs by {size[0] / MG:+.1f} mg", "check height and latitude"
+    else:
+        x, y = size / DEG
+        by = f"{math.hypot(x, y):.2f} deg (x {x:+.2f}, y {y:+.2f})"
+        fault, remedy = f"the gradienter has moved by {by}", "check its mounting, then companion align zero"
+        if not all(witness.expected.same_zero > 0.5 for witness in against):
+            fault, remedy = f"the gradienter's zero has changed by {by} too much", "repeat companion align zero"
+    return message("all_imus_differ", fault=fault, sensors=sensors, imus=names, remedy=remedy)

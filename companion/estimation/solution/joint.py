@@ -34,6 +34,7 @@ from companion.estimation.solution.doubt import Witness, contradictions
 from companion.estimation.solution.prior import Expectation, ExpectedImu
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.estimation.turning.turn import CHANCE_SIGMAS, Turn
+from companion.messages import message
 from companion.physics.frames import vector
 from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS, Triad, Vector, rows_of
@@ -114,10 +115,9 @@ def with_warm(imu: ImuSolution, expected: ExpectedImu, followed: Collection[Tria
         if abs(change[worst]) > _WORTH_SAYING * np.sqrt(present[worst]):
             unit, name, digits = UNITS[triad]
             then, of_then = (now + change)[worst] / unit, sigma[worst] / unit
-            words.append(
-                f"{triad} {imu.name} {'xyz'[worst]} now {now[worst] / unit:.{digits}f} {name},"
-                f" at {degc:.0f} degC {then:.{digits}f} +- {of_then:.{digits}f}"
-            )
+            cold = f"{triad} {imu.name} {'xyz'[worst]} now {now[worst] / unit:.{digits}f} {name}"
+            warm = f"{then:.{digits}f} +- {of_then:.{digits}f}"
+            words.append(message("bias_when_warm", now=cold, degc=f"{degc:.0f}", warm=warm))
     if "gyro" not in figures:
         return imu
     accel, of_accel = figures.get("accel", (None, None))

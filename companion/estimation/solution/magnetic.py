@@ -17,7 +17,8 @@ import numpy as np
 
 from companion.estimation.means.pose import CompassModel, FieldWindow, HeadingWindow, vehicle_heading_rad
 from companion.estimation.records.record import Magnetic
-from companion.estimation.solution.site import LocalEarth
+from companion.estimation.solution.site import LocalEarth, unknown
+from companion.messages import message
 from companion.physics.earth import MagneticField
 from companion.physics.frames import Array, Matrix, wrap_deg
 from companion.physics.magnetic import (
@@ -103,18 +104,18 @@ def assess(
     if useless:
         bound_deg = 180.0
     earths = local.field
-    warnings = ["compass field is vertical: no heading"] if vertical else []
+    warnings = [message("no_heading", reason="compass field is vertical")] if vertical else []
     if use == "none":
-        warnings.append("too near the magnetic pole for a compass: heading unknown, gyro sigma widened")
+        warnings.append(message("no_heading", reason="too near the magnetic pole for a compass"))
     elif use == "poor":
-        warnings.append("near the magnetic pole: the compass heading is weak")
+        warnings.append(unknown("exact heading", "gyro sigma widened", "near the magnetic pole"))
     if earths is not None:
         warnings += _disturbed(found, earths, bound_deg, useless=useless, near_pole=use == "none")
     warnings += _unsteady(window, difference, may_turn_deg)
     if field is not None and field.unit == "counts":
-        warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
+        warnings.append(unknown("compass field strength", "only its direction is checked", "set counts_per_gauss"))
     if field is not None and up_covariance is None:
-        warnings.append("compass field without a gradienter: heading error bound unknown")
+        warnings.append(unknown("heading error", "tilt of the compass field not measured", "no gradienter"))
     return CompassHeading(
         heading_rad=heading + (local.declination_deg * DEG if compass.magnetic else 0.0),
         # The sigma is never below the bound: a disturbance may last for the whole flight.
@@ -175,10 +176,8 @@ def _disturbed(
     if found.strength_gauss is not None:
         off = found.strength_gauss / earths.strength_gauss - 1.0
         if abs(off) > UNIT_GATE:
-            warnings.append(
-                f"compass field is {found.strength_gauss:.3g} gauss, the Earth's {earths.strength_gauss:.3g}: wrong"
-                " counts_per_gauss, or a magnet"
-            )
+            gauss, expected = f"{found.strength_gauss:.3g}", f"{earths.strength_gauss:.3g}"
+            warnings.append(message("compass_field_strength_wrong", gauss=gauss, expected=expected))
         if abs(off) > STRENGTH_GATE:
             parts.append(f"{abs(off) * 100.0:.0f} % {'above' if off > 0.0 else 'below'} the Earth's")
     if found.inclination_rad is not None:
@@ -186,27 +185,21 @@ def _disturbed(
         if abs(dip) > INCLINATION_GATE_DEG:
             parts.append(f"{abs(dip):.1f} deg off the Earth's inclination")
     if parts:
-        consequence = "" if bound_deg is None else f"heading may be off by {bound_deg:.0f} deg; "
-        consequence = "heading useless; " if useless else consequence
-        warnings.append(f"compass field {' and '.join(parts)}: {consequence}move away from iron")
+        effect = "" if bound_deg is None else f", heading may be off by {bound_deg:.0f} deg"
+        effect = ", heading useless" if useless else effect
+        warnings.append(message("compass_disturbed", fault=f"field {' and '.join(parts)}{effect}"))
     elif useless and not near_pole:
-        warnings.append("compass field too flat or too steep to show a heading: heading unknown, gyro sigma widened")
+        warnings.append(message("no_heading", reason="compass field too flat or too steep"))
     return warnings
 
 
 def _unsteady(window: HeadingWindow, difference: float | None, may_turn_deg: float) -> list[str]:
     warnings = []
     if window.wander_deg is not None and window.wander_deg > WANDER_WARNING_DEG:
-        moves = f"compass moves by {window.wander_deg:.1f} deg"
-        if window.wander_deg > may_turn_deg:
-            warnings.append(f"{moves}, gyros do not: iron or current near it?")
-        else:
-            warnings.append(f"{moves}: iron or current near it, or the aircraft turns slowly")
+        gyros = "gyros do not" if window.wander_deg > may_turn_deg else "or the aircraft turns slowly"
+        warnings.append(message("compass_disturbed", fault=f"moves by {window.wander_deg:.1f} deg, {gyros}"))
     if difference is not None and abs(difference) > DEVICE_WARNING_DEG:
-        warnings.append(
-            f"compass' own heading is {abs(difference):.0f} deg off the one from its field and the gradienter:"
-            " heading may be off as much"
-        )
+        warnings.append(message("compass_headings_differ", difference=f"{abs(difference):.0f}"))
     return warnings
 
 

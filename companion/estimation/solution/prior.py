@@ -29,6 +29,7 @@ from companion.estimation.records.align_record import Determined, ImuAlignmentRe
 from companion.estimation.records.history import WEIGHS_FROM, Point, believed
 from companion.estimation.records.record import Effective
 from companion.estimation.solution.curve import CATALOGUE_PER_K, Along, Curve, PowerUpNodes, fit, in_run_variance
+from companion.messages import message
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG, G
@@ -88,10 +89,7 @@ class PoseEffect:
         moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
             return None
-        return (
-            f"accel {name}: effective at this attitude; level again it may be off by {moves.max() / MG:.1f} mg, since"
-            " its scale error looks like a bias: calibrate level (companion align tilts tells the scale)"
-        )
+        return message("calibrated_tilted", imu=name, error=f"{moves.max() / MG:.1f}")
 
 
 def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:

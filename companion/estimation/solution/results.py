@@ -12,6 +12,7 @@ from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import ImuRecord, PlatformTurn, Record
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.solve import ImuSolution, Solution
+from companion.messages import message
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import TRIADS, Triad, Vector, rows_of
@@ -93,9 +94,9 @@ def unseen_turn(solution: Solution) -> tuple[str, ...]:
         return ()
     turn = solution.turn
     if not turn.is_told:
-        return ("no compass: nothing saw whether the ground turns",)
+        return (message("ground_turn_unseen"),)
     if turn.by == "earlier calibrations" and not turn.is_chance:
-        return (f"the aircraft {turn.in_words}, or its gyros are unlike in earlier power-ups: sigma widened",)
+        return (message("turns_or_gyros_changed", turns=turn.in_words),)
     return ()
 
 
@@ -123,7 +124,8 @@ def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
     unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
     kept = any(imu.unchanged for imu in imus) and not any(imu.written for imu in imus)
     begin = "unchanged," if kept else "sigma"
-    return f"{begin} {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
+    result = f"{begin} {', '.join(parts)}"
+    return message("biases_not_known", result=result, biases=unknown) if unknown else result
 
 
 def points(

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.records.record import SiteRecord
+from companion.messages import message
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
 
@@ -82,11 +83,15 @@ class LocalEarth:
         return body_from_ned @ mean, body_from_ned @ covariance @ body_from_ned.T
 
 
+def unknown(what: str, effect: str, remedy: str) -> str:
+    return message("input_unknown", what=what, effect=effect, remedy=remedy)
+
+
 def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:
     warnings: list[str] = []
     covariance, gravity, field = np.zeros((3, 3)), None, None
     if where.latitude_deg is None:
-        warnings.append(f"latitude unknown: Earth rate and gravity uncertain ({remedies.latitude})")
+        warnings.append(unknown("latitude", "Earth rate and gravity uncertain", remedies.latitude))
         rate = np.array([earth.EARTH_RATE_RAD_S * _MEAN_COS, 0.0, 0.0])
         covariance = earth.EARTH_RATE_RAD_S**2 * np.diag([_VARIANCE_COS, 0.0, _VARIANCE_SIN])
         gravity_sigma = _GRAVITY_SIGMA_M_S2
@@ -95,15 +100,13 @@ def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> Lo
         gravity = earth.gravity_m_s2(where.latitude_deg, where.height_m or 0.0)
         gravity_sigma = GRAVITY_MODEL_SIGMA_M_S2
         if where.height_m is None:
-            warnings.append(f"height unknown: gravity uncertain by 0.3 mg ({remedies.height})")
+            warnings.append(unknown("height", "gravity uncertain by 0.3 mg", remedies.height))
             gravity_sigma = math.hypot(gravity_sigma, UNKNOWN_HEIGHT_SIGMA_M * GRAVITY_BY_HEIGHT_1_S2)
         if where.longitude_deg is not None and where.date is not None:
             first, last = earth.WMM_VALID_YEARS
             if not first <= where.date.year < last:
-                warnings.append(
-                    f"the date {where.date.isoformat()} lies outside the magnetic model ({first:.0f} to {last:.0f}):"
-                    " declination of its nearest year used"
-                )
+                date, years = where.date.isoformat(), f"magnetic model: {first:.0f} to {last:.0f}"
+                warnings.append(unknown(f"declination of {date}", "nearest year used", years))
             field = earth.magnetic_field(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)
     declination_deg = None if field is None else field.declination_deg
     return LocalEarth(

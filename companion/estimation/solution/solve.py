@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -29,6 +29,7 @@ from companion.estimation.solution.site import LocalEarth, Remedies
 from companion.estimation.solution.truth import NOTHING, Otherwise, Truth, truth_of
 from companion.estimation.stillness.plausible import implausible
 from companion.estimation.turning.turn import Turn
+from companion.messages import message
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
 from companion.physics.units import DEG
 from companion.samples import Triad
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 
 Pair = tuple[Array | None, Array | None]
 """Biases of gyro and accelerometer, (3,) each, rad/s and m/s^2; None: unknown."""
-
-_ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks like a bias"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -187,12 +186,10 @@ def solve(
     gradienter = gradienter if window.tilt is not None else None
     compass = compass if window.heading is not None else None
     if what.accelerometers and gradienter is None:
+        missing = message("sensor_missing", sensor="gradienter", sensors="accelerometers")
         if what is What.ACCELEROMETERS:
-            raise CalibrationRefusedError(
-                "accelerometers need a gradienter: without one the tilt is unknown; configure [gradienter] or"
-                " calibrate the gyros only"
-            )
-        warnings.append("no gradienter: gyros only, accelerometers not calibrated")
+            raise CalibrationRefusedError(missing)
+        warnings.append(missing)
     if platform == "deck":
         # It turns: of a yaw nobody knows when it was true.
         otherwise = msgspec.structs.replace(otherwise, heading=None)
@@ -207,9 +204,10 @@ def solve(
     # A deck may turn, and a steady turn shows in nothing but the heading.
     turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
     if turn_unseen:
+        missing = message("sensor_missing", sensor="compass on a deck", sensors="gyros")
         if what is What.GYROS or gradienter is None:
-            raise CalibrationRefusedError(_ON_DECK)
-        warnings.append(f"{_ON_DECK}; not calibrated")
+            raise CalibrationRefusedError(missing)
+        warnings.append(missing)
     wanted: dict[Triad, bool] = {
         "gyro": what.gyros and not turn_unseen,
         "accel": what.accelerometers and gradienter is not None,
@@ -351,7 +349,7 @@ def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remed
         # Where integers hide the mean, that made it, and is said.
         if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
     ]
-    found = [f"imu {name}: gyro sigma is that of an unknown part: {remedies.part}" for name in by_part]
+    found = [message("gyro_part_unknown", imu=name, remedy=remedies.part) for name in by_part]
     if earth_covariance is not None and len(by_part) < len(imus):
-        found.append(f"{remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+        found.append(message("no_heading", reason=remedies.no_heading))
     return found

@@ -25,7 +25,8 @@ from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import HeadingFrom, Magnetic, TiltFrom
 from companion.estimation.solution import magnetic
 from companion.estimation.solution.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
-from companion.estimation.solution.site import LocalEarth
+from companion.estimation.solution.site import LocalEarth, unknown
+from companion.messages import message
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, symmetric_by
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
@@ -124,15 +125,14 @@ def truth_of(
         up = mean / np.linalg.norm(mean)
         up_covariance = (np.eye(3) - np.outer(up, up)) * (LEVEL_BY_ACCELEROMETER_SIGMA_DEG * DEG) ** 2
     if math.hypot(up[1], up[2]) < 0.1:
-        raise CalibrationRefusedError("the aircraft stands on its nose or tail (pitch beyond 84 deg): lay it down")
+        raise CalibrationRefusedError(message("nose_or_tail"))
     jacobian = attitude_error_jacobian(up)
     without = Truth(up, up_covariance, jacobian @ up_covariance @ jacobian.T, by_reading, reading_sigma, tilt_from)
     if compass is None or window.heading is None:
         if (own := otherwise.heading) is None:
             return without
-        warnings.append(
-            f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg"
-        )
+        angle, sigma = f"heading {own.heading_deg:.0f} deg by the autopilot", f"{own.sigma_deg:.0f}"
+        warnings.append(message("angle_without_sensor", sensor="compass", angle=angle, sigma_deg=sigma))
         return dataclasses.replace(
             without,
             attitude_covariance_rad2=without.attitude_covariance_rad2 + np.outer(up, up) * (own.sigma_deg * DEG) ** 2,
@@ -147,7 +147,7 @@ def truth_of(
     if not found.is_usable:
         return dataclasses.replace(without, magnetic=found.magnetic)
     if compass.magnetic and local.site.declination_deg is None:
-        warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
+        warnings.append(unknown("declination", "magnetic heading used, sigma widened", "no position or date"))
     # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
     turned = jacobian - np.outer(up, found.heading_by_up)
     return dataclasses.replace(
@@ -189,17 +189,13 @@ def _up_by_sides(
         off = length - local.gravity_m_s2
         sigma = float(np.hypot(np.sqrt(up @ covariance @ up), local.gravity_sigma_m_s2))
         if abs(off) > LENGTH_SIGMAS * sigma:
-            warnings.append(
-                f"imu {imu.name} reads {off / MG:+.1f} mg of gravity more than it did on all sides: no tilt from it;"
-                " companion align faces measures it again"
-            )
+            warnings.append(message("gravity_off_since_faces", imu=imu.name, excess=f"{off / MG:+.1f}"))
             continue
         across = (np.eye(3) - np.outer(up, up)) / length
         up_covariance = across @ covariance @ across.T
         sigma_deg = float(np.sqrt(np.linalg.eigvalsh(up_covariance)[-1])) / DEG
-        warnings.append(
-            f"no gradienter: tilt by the accelerometers of imu {imu.name}, known from all sides, to {sigma_deg:.2g} deg"
-        )
+        angle, sigma_words = f"tilt by the accelerometers of imu {imu.name}, known from all sides", f"{sigma_deg:.2g}"
+        warnings.append(message("angle_without_sensor", sensor="gradienter", angle=angle, sigma_deg=sigma_words))
         return up, up_covariance
     return None
 

@@ -81,7 +81,7 @@ def test_a_child_reports_and_ends_in_order(tmp_path: Path, monkeypatch: pytest.M
         ("greedy", "the process needed more memory than it may have"),
         ("greedy callback", "the process needed more memory than it may have"),
         ("hang", "the process gave no sign of life for 1 s: ended"),
-        ("garbage", "the process reported what is not understood: "),
+        ("garbage", "the process sent an unreadable report: "),
     ],
 )
 def test_a_child_that_fails_is_started_again(

@@ -128,7 +128,7 @@ def test_a_field_that_turns_while_the_gyros_do_not_is_in_nobodys_way() -> None:
     turn = stand.collector.turn
     assert turn.by == "gyros"
     assert turn.variance < (0.005 * DEG) ** 2
-    assert any(words.endswith("gyros do not: iron or current near it?") for words in stand.warnings())
+    assert any(words.endswith("gyros do not: move away from iron") for words in stand.warnings())
 
 
 def test_a_level_that_nobody_saw_at_rest_makes_no_iron_of_a_turn() -> None:

@@ -90,7 +90,7 @@ def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_o
     assert by(0.0, 11.0) == {Why.TEMPERATURE}
     drift = (90.0 * DEG_H, 0.0, 0.0), (0.0,) * 3
     (objection,) = judge(("fc", "gyro"), HELD, GYRO, LIMITS, now_s=10.0, temperature_degc=20.0, drift=drift)
-    assert objection.words == "gyro fc: about 90 deg/h off, 5 K colder"
+    assert objection.words == "gyro fc: about 90 deg/h off, 5 K colder since calibration"
 
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)

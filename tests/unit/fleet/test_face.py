@@ -199,7 +199,7 @@ def test_without_a_unique_id_nothing_is_kept_and_that_is_said(tmp_path: Path) ->
             aircraft.connection.connect()
             await asyncio.sleep(60.0)
             assert face.status()["good"] is False
-            assert "tells no unique id" in face.status()["summary"]
+            assert "has no unique id" in face.status()["summary"]
             aircraft.vehicle.uid = HERON
             await until_told(face)
             assert face.status()["good"] is True

@@ -39,12 +39,12 @@ def test_a_password_is_the_one_line_of_its_file(tmp_path: Path, content: bytes, 
 def test_a_file_that_holds_no_password(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "password"
     path.write_bytes(content)
-    with pytest.raises(LinkError, match=r"password file .*password: wanted: the password on one line"):
+    with pytest.raises(LinkError, match=r"password file .*password not usable: wanted: the password on one line"):
         read_password(of_file(path))
 
 
 def test_a_password_file_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(LinkError, match=r"^password file .*/none: no such file or directory$"):
+    with pytest.raises(LinkError, match=r"^password file .*/none not usable: no such file or directory$"):
         read_password(of_file(tmp_path / "none"))
     with pytest.raises(LinkError, match="is a directory"):
         read_password(of_file(tmp_path))
@@ -73,11 +73,11 @@ def test_certificates_that_cannot_be_used(tmp_path: Path) -> None:
     assert tls_context(settings("ca", "cert", "key")) is not None
     assert tls_context(Mqtt(host=HOST)) is None
     for wrong, words in (
-        (settings("none", "cert", "key"), "none: no such file"),
-        (settings("text", "cert", "key"), "text: not usable"),
-        (settings("ca", "none", "key"), "none: no such file"),
-        (settings("ca", "cert", "none"), "none: no such file"),
-        (settings("ca", "cert", "other"), "other: not usable"),
+        (settings("none", "cert", "key"), "none not usable: no such file"),
+        (settings("text", "cert", "key"), "text not usable"),
+        (settings("ca", "none", "key"), "none not usable: no such file"),
+        (settings("ca", "cert", "none"), "none not usable: no such file"),
+        (settings("ca", "cert", "other"), "other not usable"),
     ):
         with pytest.raises(LinkError, match=words) as caught:
             tls_context(wrong)
@@ -96,14 +96,14 @@ def _lost(name: str) -> Exception:
     ("error", "user", "words"),
     [
         (_refused("Bad user name or password"), "u", "refuses user 'u'"),
-        (_refused("Not authorized"), None, "asks for a user (mqtt.username"),
+        (_refused("Not authorized"), None, "clients without a user (mqtt.username"),
         (_refused("Client identifier not valid"), None, "refuses the client id 'me' (mqtt.client_id)"),
         (_refused("Server unavailable"), None, "not available now"),
         (_refused("Quota exceeded"), None, "the broker says: "),
-        (_lost("Session taken over"), None, "another client called 'me' has taken over"),
+        (_lost("Session taken over"), None, "the broker has another client called 'me'"),
         (_lost("Server shutting down"), None, "the broker shuts down"),
         (aiomqtt.MqttError("Operation timed out"), None, "says nothing (does it want tls = true?)"),
-        (ExceptionGroup("", [_lost("Keep alive timeout")]), None, "nothing heard from the broker any more"),
+        (ExceptionGroup("", [_lost("Keep alive timeout")]), None, "the broker is silent"),
         (LinkError("password file /x: no such file"), None, "password file /x: no such file"),
         (OSError(113, "Connect call failed ('192.0.2.1', 1883)"), None, "no route to host"),
         (ZeroDivisionError(), None, "ZeroDivisionError"),
