@@ -28,7 +28,8 @@ def page() -> str:
 
 
 def _row(entry: Entry) -> str:
-    shown = ", ".join(f"`{pattern}`" for pattern in entry.patterns)
+    # `companion explain` knows the other patterns too.
+    shown = ", ".join(f"`{pattern}`" for pattern in (entry.patterns[:1] if entry.text else entry.also))
     words = " ".join(part for part in (entry.cause, entry.remedy) if part)
     more = f" [More]({entry.see})" if entry.see else ""
     return f"| {shown} | {words}{more} |\n".replace("messages.md#", "#")
