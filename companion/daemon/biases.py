@@ -32,6 +32,7 @@ from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.results import points
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.formats import Object
+from companion.messages import message
 from companion.physics.frames import Array, vector
 from companion.samples import TRIADS, Triad, Vector
 from companion.storage.records import BiasStore, KnownImu, this_boot
@@ -140,19 +141,19 @@ class BiasMemory:
             self._settling.pop(name, None)
             self._today = {key: each for key, each in self._today.items() if key[0] != name}
             if known.points:
-                found[name] = f"imu {name}: {what} changed since then: its earlier biases are forgotten"
+                found[name] = message("biases_no_longer_count", changed=f"imu {name}: {what}")
                 logger.info("%s", found[name])
         return found
 
     def why_not_now(self, name: str, started_at: str) -> str | None:
         """Return why the bias of a calibration may have changed since; None without a reason."""
         if (point := self._point(name, started_at)) is None:
-            return "its calibration is not known of"
+            return message("imu_changed_since_calibration", event="has lost its history")
         if what := self._changed(name):
-            return f"another IMU than was calibrated ({what})"
+            return message("imu_changed_since_calibration", event=f"was changed ({what})")
         # An autopilot may have run on while our board was off.
         same = name in self._imus or point.power_up.is_same(self.power_up(name, time.time()))
-        return None if same else "the IMU was without power since its calibration"
+        return None if same else message("imu_changed_since_calibration", event="was without power")
 
     def on_since(self, name: str, started_at: str) -> bool:
         point = None if self._changed(name) else self._point(name, started_at)
@@ -286,7 +287,7 @@ class BiasMemory:
         try:
             await self._offload(self._store.write, dict(self._known))
         except StorageError as error:
-            logger.warning("%s; later calibrations will not know of this one", error)
+            logger.warning("%s", message("history_not_kept", what="biases of this calibration", reason=error))
 
     def _refer(self, name: str, triad: Triad, point: Point) -> None:
         """Set the reference of this power-up; a contradiction becomes the reference the third time."""
@@ -319,9 +320,7 @@ class BiasMemory:
                 now_degc=self._now_degc.get(name),
             )
             if what:
-                shown = msgspec.structs.replace(
-                    shown, needs=f"{what} changed: earlier biases count no more, a calibration begins anew"
-                )
+                shown = msgspec.structs.replace(shown, needs=message("biases_no_longer_count", changed=what))
             found.append(msgspec.to_builtins(shown))
         return found
 

@@ -18,6 +18,7 @@ from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
 from companion.errors import StorageError
 from companion.formats import Object
+from companion.messages import message
 from companion.storage.state import BoundedList, StateFile, numbers_in, remove_durably, write_atomically
 
 _UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
@@ -196,7 +197,6 @@ class ChangeLog:
 
 
 KEEP_INTERRUPTIONS: Final = 50  # years of interruptions
-PENDING: Final = "old values not restored yet: disarm and keep the link up"
 
 
 class Interruption(msgspec.Struct, frozen=True, kw_only=True):
@@ -210,14 +210,14 @@ class Interruption(msgspec.Struct, frozen=True, kw_only=True):
     reason: str  # result of the restore, for people
 
     @classmethod
-    def of(cls, step: ChangeSet, reason: str = PENDING, ended_at: str | None = None) -> Interruption:
+    def of(cls, step: ChangeSet, reason: str = "", ended_at: str | None = None) -> Interruption:
         return cls(
             what=step.origin.what,
             began_at=step.origin.at,
             ended_at=ended_at,
             system_id=step.system_id,
             parameters=tuple(step.names),
-            reason=reason,
+            reason=reason or message("interruption_not_restored"),
         )
 
 

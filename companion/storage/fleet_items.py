@@ -16,8 +16,7 @@ from typing import Final, Literal, NamedTuple
 
 import msgspec
 
-from companion.errors import StorageError
-from companion.storage.state import set_aside
+from companion.storage.state import file_error, set_aside
 
 FILE: Final = "fleet.sqlite"
 FORMAT_VERSION: Final = 1
@@ -191,13 +190,13 @@ class FleetItems:
                 words = str(error)
                 if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
                     words += f"; {self._begin_anew()}"
-                raise StorageError(f"{self.path}: {words}") from error
+                raise file_error(self.path, "used", words) from error
             except OSError as error:
-                raise StorageError(f"{self.path}: cannot be used: {error.strerror or error}") from error
+                raise file_error(self.path, "used", error) from error
 
     def _opened(self) -> sqlite3.Connection:
         if self.path.exists() and not self.path.is_file():
-            raise StorageError(f"{self.path}: cannot be used: not a regular file")
+            raise file_error(self.path, "used", "not a regular file")
         self.path.parent.mkdir(exist_ok=True)
         os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600))
         db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=1.0)
@@ -210,7 +209,8 @@ class FleetItems:
             db.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
             (version,) = db.execute("PRAGMA user_version").fetchone()
             if version > FORMAT_VERSION:
-                raise StorageError(f"{self.path}: found format {version}; allowed: up to {FORMAT_VERSION}")
+                words = f"found format {version}; allowed: up to {FORMAT_VERSION}"
+                raise file_error(self.path, "used", words)
             if version < FORMAT_VERSION:
                 db.executescript(
                     f"""

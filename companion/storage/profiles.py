@@ -19,7 +19,8 @@ from companion.config import CATALOGUE, no_profile
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import ConfigError, StorageError
 from companion.estimation.noise.allan import PROFILES
-from companion.storage.state import UNREADABLE, named_in, read_regular, sealed, unsealed, write_atomically
+from companion.messages import message
+from companion.storage.state import UNREADABLE, file_error, named_in, read_regular, sealed, unsealed, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -64,12 +65,13 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 def check_name(name: str) -> None:
     """Raise StorageError where a profile may not be saved under this name: the catalogue's, or no name for a file."""
     if _plain(name) in CATALOGUE:
-        raise StorageError(f"profile {name!r}: that name is the catalogue's; allowed: another one")
-    if not _NAME.fullmatch(name):
-        raise StorageError(
-            f"profile {name!r}: allowed: up to 40 small letters, digits, dots, dashes and underscores,"
-            " a letter or digit first"
-        )
+        fault, allowed = "that name is the catalogue's", "another one"
+    elif not _NAME.fullmatch(name):
+        fault = "no name for a file"
+        allowed = "up to 40 small letters, digits, dots, dashes and underscores, a letter or digit first"
+    else:
+        return
+    raise StorageError(message("profile_name_not_allowed", name=repr(name), fault=fault, allowed=allowed))
 
 
 def _plain(name: str) -> str:
@@ -94,7 +96,7 @@ class ProfileStore:
         path = self.path(name)
         found = read_profile(path)
         if found.name != name:
-            raise StorageError(f"{path}: not a readable profile: it is of {found.name!r}")
+            raise file_error(path, "used", f"it is of {found.name!r}")
         return found
 
     def write(self, profile: SavedProfile) -> Path:
@@ -118,9 +120,9 @@ def read_profile(path: Path) -> SavedProfile:
         if found.warm_up is not None and not all(0.0 < each < math.inf for each in found.warm_up):
             raise ValueError(f"found warm_up of {found.warm_up}; allowed: above 0")
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise file_error(path, "read", error) from error
     except UNREADABLE as error:
-        raise StorageError(f"{path}: not a readable profile: {error}") from error
+        raise file_error(path, "used", error) from error
     return found
 
 
@@ -138,8 +140,8 @@ def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> N
     except StorageError as error:
         if not forgiving:
             raise StorageError(f"{wanted!r}, a saved profile: {error}") from None
-        logger.warning("%s; its sigmas are those of the worst common parts", error)
-        origin = "which cannot be used: sigmas are those of the worst common parts"
+        logger.warning("%s", message("profile_replaced", reason=error))
+        origin = message("profile_replaced", reason="its saved profile cannot be used")
         return msgspec.structs.replace(PROFILES["unknown"], name=wanted, origin=origin)
     raise no_profile(wanted, names)
 

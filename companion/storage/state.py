@@ -24,6 +24,13 @@ import msgspec
 
 from companion import formats
 from companion.errors import StorageError
+from companion.messages import message
+
+
+def file_error(path: Path, done: str, reason: OSError | Exception | str) -> StorageError:
+    """Make the one-line error of a file or folder that cannot be `done` (read, written, used ...)."""
+    words = getattr(reason, "strerror", None) or reason
+    return StorageError(message("file_not_usable", path=path, done=done, reason=words))
 
 
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o600, parents: bool = False) -> None:
@@ -48,7 +55,7 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o600, parents: boo
             raise
         sync_folder(path.parent)
     except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise file_error(path, "written", error) from error
 
 
 def remove_durably(path: Path) -> None:
@@ -58,7 +65,7 @@ def remove_durably(path: Path) -> None:
         if path.parent.is_dir():
             sync_folder(path.parent)
     except OSError as error:
-        raise StorageError(f"{path}: cannot be removed: {error.strerror or error}") from error
+        raise file_error(path, "removed", error) from error
 
 
 def sync_folder(folder: Path) -> None:
@@ -106,7 +113,7 @@ def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        raise StorageError(f"{folder}: cannot be listed: {error.strerror or error}") from error
+        raise file_error(folder, "listed", error) from error
     return sorted(match[1] for match in map(kind.fullmatch, names) if match)
 
 
@@ -159,9 +166,9 @@ class StateFile(Generic[T]):
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            raise StorageError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+            raise file_error(self.path, "read", error) from error
         except UNREADABLE as error:
-            raise StorageError(f"{self.path}: cannot be used: {error}") from error
+            raise file_error(self.path, "used", error) from error
 
     def _of(self, data: bytes) -> T:
         if len(data) > MOST_BYTES:
@@ -256,9 +263,9 @@ def only_daemon(directory: Path) -> Iterator[None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise StorageError(f"{directory}: another daemon works with this directory") from None
+        raise file_error(directory, "used", "another daemon works with this directory") from None
     except OSError as error:
-        logger.warning("%s: cannot be locked: %s; run one daemon only", directory, error.strerror or error)
+        logger.warning("%s", file_error(directory, "locked", error))
     try:
         yield
     finally:

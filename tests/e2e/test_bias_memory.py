@@ -175,11 +175,11 @@ def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: 
     _, _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False, times=0)
     (shown,) = rig.service.calibrating.memory.temperature()
     assert (shown["points"], shown["curve"]) == ((), ())
-    assert shown["needs"] == "gyro (device id) changed: earlier biases count no more, a calibration begins anew"
+    assert shown["needs"] == "gyro (device id) changed: earlier biases no longer count"
 
     (record,), _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False)
     assert record.imus[0].prior is None
-    assert "imu fc: gyro (device id) changed since then: its earlier biases are forgotten" in record.imus[0].warnings
+    assert "imu fc: gyro (device id) changed: earlier biases no longer count" in record.imus[0].warnings
     assert rig.service.calibrating.memory.curve("fc", "gyro") is None
     assert len(store.read()["fc"].points) == 1
 

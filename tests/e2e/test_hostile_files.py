@@ -49,7 +49,7 @@ async def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
         if name == "undo-1.json":
             answer = rig.service.calibrating.manager.start_undo("test")
             assert isinstance(answer, Refusal)
-            assert answer.reason == "nothing to undo; what was kept could not be used"
+            assert answer.reason == "nothing to undo; the undo file was damaged"
         else:
             assert "Interrupted write, file damaged: calibrate" in rig.ground.texts()
         assert rig.double.writes == []

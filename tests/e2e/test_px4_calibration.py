@@ -150,7 +150,7 @@ async def test_the_autopilot_is_rebooted_only_when_asked_and_what_was_written_is
         await rig.ready()
         result, record = await calibrated(rig, reboot=True)
         assert result.outcome == "done", result
-        assert "rebooted, offsets in force" in record.reason
+        assert "rebooted, offsets active" in record.reason
         assert rig.service.core.vehicle.boots == 1
         assert in_use_as_stored(rig)
         assert not any("attitude stays wrong" in warning for warning in record.warnings)

@@ -146,7 +146,7 @@ def undone(flying: Flight) -> None:
 @pytest.mark.parametrize(
     ("own_imu", "happens", "why"),
     [
-        (False, exchanged_part, "another IMU than was calibrated (gyro (device id))"),
+        (False, exchanged_part, "the IMU was changed (gyro (device id)) since its calibration"),
         (True, of_another_power_up, "the IMU was without power since its calibration"),
         (True, undone, "no calibration is in force"),
     ],

@@ -32,7 +32,7 @@ async def test_no_reboot_into_a_gyro_calibration_that_would_throw_the_offsets_aw
         result, record = await calibrated(rig, reboot=True)
         assert result.outcome == "done", result
         assert rig.service.core.vehicle.boots == 0
-        assert any("not rebooted: INS_GYR_CAL = 1 would measure the gyros anew" in w for w in record.warnings)
+        assert any("reboot not completed: INS_GYR_CAL = 1 would measure the gyros anew" in w for w in record.warnings)
         assert any("push.stop_rivals = true" in warning for warning in record.imus[0].warnings)
 
 
@@ -41,7 +41,7 @@ async def test_with_the_rival_stopped_it_is_rebooted_and_the_offsets_are_confirm
         await rig.ready()
         result, record = await calibrated(rig, reboot=True)
         assert result.outcome == "done", result
-        assert "rebooted, offsets in force" in record.reason
+        assert "rebooted, offsets active" in record.reason
         assert rig.service.core.vehicle.boots == 1
         assert rig.double.parameter("INS_GYR_CAL") == 0
         written = record.imus[0].written
@@ -63,6 +63,6 @@ async def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path
         assert result.outcome == "done", result
         assert job.record is not None
         # Nor does the double restart while it is armed: what counts is that it was not asked.
-        assert any("not rebooted: the aircraft is armed" in warning for warning in job.record.warnings)
+        assert any("reboot not completed: the aircraft is armed" in warning for warning in job.record.warnings)
         await asyncio.sleep(5.0)
         assert rig.service.core.vehicle.boots == 0

@@ -185,7 +185,7 @@ async def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
         failed = await job.finished
         assert failed.outcome == "failed"
         assert why in failed.reason
-        assert failed.reason.endswith("level stays in force: undo again")
+        assert failed.reason.endswith("level stays active: undo again")
         assert "old values back" not in failed.reason
         assert read(rig) == wanted[0]
         assert step_file.read_bytes() == kept
@@ -211,9 +211,9 @@ async def test_what_somebody_else_has_changed_stops_it_is_named_and_passed_over_
         now = read(rig)
         refused = await undone(rig)
         assert refused.outcome == "failed"
-        assert refused.reason.startswith("auto calibration: changed by somebody else or by a boot since")
+        assert refused.reason.startswith("auto calibration not undone: another writer or a boot changed")
         assert f"{GYROS[0]} is 0.004, we had set 0.0025 (before: 0.001)" in refused.reason
-        assert refused.reason.endswith("companion undo --force leaves it so and comes to the one before")
+        assert refused.reason.endswith("companion undo --force skips this step")
         assert read(rig) == now
         assert steps(rig) == list(STEPS[1:])
         forced = await undone(rig, force=True)

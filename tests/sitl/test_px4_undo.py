@@ -45,7 +45,7 @@ def test_undo_leaves_every_parameter_of_px4_as_it_was_also_after_a_power_cycle_a
                 await vehicle.sleep(3.0)
                 refused = await daemon.ask("undo")
                 assert "CAL_GYRO0_XOFF" in str(refused)
-                assert "somebody else" in str(refused)
+                assert "another writer" in str(refused)
                 await ground.put("CAL_GYRO0_XOFF", wrote["CAL_GYRO0_XOFF"])
                 await vehicle.sleep(3.0)
                 undone = await daemon.ask("undo")

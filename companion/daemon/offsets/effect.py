@@ -26,6 +26,7 @@ from companion.estimation.collector.measurement import MIN_BATCHES
 from companion.estimation.means.warming import Warming
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
+from companion.messages import message
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
@@ -41,6 +42,7 @@ TELEMETRY_S: Final = 2.0
 """Time after a write in which the telemetry may seem to be missing."""
 TELEMETRY: Final = "waiting for the telemetry"
 """Progress text until the write has settled and `TELEMETRY_S` has passed: the offset step looks like movement."""
+UNWATCHED: Final = "this IMU is not in the telemetry"
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[EffectVerdict]]  # Verdicts by IMU
@@ -62,7 +64,7 @@ async def watch_effect(
     """
     watched = [target for target in plan.targets if target.watched]
     if not watched:
-        return None, "no autopilot IMU is in the telemetry"
+        return None, UNWATCHED
     loop, vehicle = asyncio.get_running_loop(), core.vehicle
     most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
     written = VehicleTimer(vehicle)
@@ -77,7 +79,7 @@ async def watch_effect(
         if vehicle.arm_state is ArmState.ARMED:
             return verdicts, "armed right after the write"
         if vehicle.boots != boots:
-            return None, "the autopilot rebooted right after the write"
+            return None, message("disturbed_after_write", event="the autopilot restarted")
         words = _in_the_way(core, looked_s)
         if not words:
             try:
@@ -125,9 +127,7 @@ def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
         verdict.ok and verdict.hidden and verdict.fraction_sigma is not None and verdict.fraction_sigma < 1 / 3
         for verdict in found
     )
-    if looked_s > LOOK_LONGER_S or not (hasty or nearly):
-        return ""
-    return f"the change {'does not show' if hasty else 'is small'}: looking longer"
+    return message("effect_not_clear_yet") if looked_s <= LOOK_LONGER_S and (hasty or nearly) else ""
 
 
 def judge_vectors(
@@ -229,8 +229,8 @@ def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> V
 def in_short(verdict: EffectVerdict) -> str:
     unused = [name for name, word in verdict.axes.items() if word == "not seen"]
     if unused:
-        return f"the autopilot stored {', '.join(unused)} but does not use {'it' if len(unused) == 1 else 'them'}"
+        return message("offsets_not_used", parameters=", ".join(unused))
     wrong = [name for name, word in verdict.axes.items() if word == "wrong"]
     if wrong:
-        return f"the output did not follow {', '.join(wrong)} (orientation, sign or scale not as believed, or it moved)"
+        return message("output_did_not_follow", parameters=", ".join(wrong))
     return "; ".join(verdict.problems)

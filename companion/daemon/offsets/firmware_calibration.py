@@ -33,6 +33,7 @@ from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import Plan, WriteLog
 from companion.errors import AutopilotError, CompanionError
 from companion.estimation.records.record import WrittenParameter
+from companion.messages import message
 from companion.physics.units import DEG_H
 from companion.storage.changes import ChangeSet
 
@@ -66,10 +67,8 @@ class FirmwareCalibration:
             return None
         before = await gyro_calibration.read_overwritten(self._parameters)
         if active := await gyro_calibration.read_active_tcal(self._parameters, before):
-            warn(
-                f"{', '.join(active)} is on: the firmware's own gyro calibration, which would reset its EKF, would"
-                " also change what the offsets mean, so it was left out; the EKF settles by itself"
-            )
+            result = f"skipped: {', '.join(active)} is on, the EKF settles by itself"
+            warn(message("firmware_gyro_calibration", result=result))
             return None
         return before
 
@@ -87,7 +86,7 @@ class FirmwareCalibration:
             ours = [change for change in changes if change.parameter not in before]
             await self._ledger.update_pending(ChangeSet.of(system_id, ours, before))
             outcome, warning, coarse = await gyro_calibration.calibrate(self._parameters, now, go_on)
-            go_on(f"writing {len(plan.gyros)} fine gyro offsets")
+            go_on(message("write_in_progress", count=len(plan.gyros), what="fine gyro offsets"))
             fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
             others = gyro_calibration.changed(before, coarse).items()
             collateral = tuple(Change(name, old, new) for name, (old, new) in others if name not in wanted)
@@ -101,10 +100,8 @@ class FirmwareCalibration:
         if warning:
             log.warnings.append(warning)
         if collateral:
-            log.warnings.append(
-                "the firmware's gyro calibration, which resets its EKF, has changed others too:"
-                f" {', '.join(c.parameter for c in collateral)}; undo puts them back"
-            )
+            result = f"also changed {', '.join(change.parameter for change in collateral)}; undo restores them"
+            log.warnings.append(message("firmware_gyro_calibration", result=result))
         return dataclasses.replace(plan, collateral=collateral, firmware=outcome)
 
     async def settle(self, plan: Plan, go_on: Callable[[str], None]) -> str | None:
@@ -120,13 +117,13 @@ class FirmwareCalibration:
         self, changes: Sequence[Change], before: Mapping[str, float], boots: int, error: CompanionError
     ) -> None:
         """Restore our old values and all that the firmware may have changed; always ends in a WriteFailedError."""
-        logger.warning("writing around the firmware's gyro calibration: %s; putting everything back", error)
+        logger.warning("%s", message("restoring_old_values", reason=error))
         reason = error.reason if isinstance(error, WriteFailedError) else str(error)
         back = [change for change in changes if change.parameter not in before]
         left: tuple[str, ...] = ()
         try:
             if self._vehicle.boots != boots and await self._parameters.read_optional(AT_START):
-                reason += f"; the restart has measured the gyros anew ({AT_START}), so those stay"
+                reason += f"; gyro offsets of the restart kept ({AT_START})"
             else:
                 now = await gyro_calibration.read_overwritten(self._parameters)
                 back += [Change(name, old, new) for name, (old, new) in gyro_calibration.changed(before, now).items()]

@@ -25,6 +25,7 @@ from companion.daemon.offsets.reboot import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object, utc_now
+from companion.messages import message
 from companion.storage.changes import ChangeLog, ChangeSet, Interruption, Undoable, interruptions_in
 
 logger = logging.getLogger(__name__)
@@ -56,7 +57,7 @@ class Ledger:
         try:
             self._log.check_writable()
         except StorageError as error:
-            self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
+            self.fault = message("no_writes_without_storage", reason=error)
         journal, undos = self._log.journal, self._log.undos()
         self._open = journal.load()
         kept = [file.load() for file in undos]
@@ -101,9 +102,9 @@ class Ledger:
             StorageError: the changes could not be kept, or hold a name or a value that is never written; do not write.
         """
         if self._open is not None:
-            raise AutopilotError("putting old values back first")
+            raise AutopilotError(message("restoring_old_values", reason="an earlier write is still open"))
         if (why := self.why_yield()) is not None:
-            raise AutopilotError(f"nothing is written: {why}")
+            raise AutopilotError(message("nothing_written", reason=why))
         await self.update_pending(changes)
         try:
             yield
@@ -179,30 +180,31 @@ class Recovery:
     def why_no_undo(self) -> str | None:
         if self.ledger.steps(self._vehicle.system_id):
             return None
+        where = "; the undo file was damaged" if self.ledger.unusable else ""
         if elsewhere := self.ledger.undoable:
-            return f"nothing to undo here, only on system {', '.join(map(str, elsewhere))}"
-        return "nothing to undo" + ("; what was kept could not be used" if self.ledger.unusable else "")
+            where = f" here, only on system {', '.join(map(str, elsewhere))}"
+        return message("nothing_to_undo_found", where=where)
 
     async def run(self) -> None:
         if self.ledger.lost_write:
-            self._say(Severity.WARNING, "Interrupted write, file damaged: calibrate", Weight.RESULT)
+            self._say(Severity.WARNING, message("interrupted_write_lost"), Weight.RESULT)
         while True:
             open_set = await self.ledger.interrupted()
             try:
                 await self._recover(open_set)
             except (AutopilotError, StorageError) as error:
-                logger.warning("putting old values back: %s; trying again", error)
+                logger.warning("%s", message("restoring_old_values", reason=error))
                 await asyncio.sleep(RETRY_S)
 
     async def _recover(self, open_set: ChangeSet) -> None:
         await self._vehicle.found.wait()
         ever_written = self._vehicle.kind.ranges
         if not ever_written.keys() >= set(open_set.names) or open_set.system_id != self._vehicle.system_id:
-            names = ", ".join(open_set.names)
-            words = f"Interrupted write on system {open_set.system_id}, not on this aircraft: check there {names}"
+            system_id, names = open_set.system_id, ", ".join(open_set.names)
+            words = message("interrupted_write_elsewhere", system=system_id, parameters=names)
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
-            await self._keep(open_set, f"not on this aircraft: check there {names}")
+            await self._keep(open_set, words)
             await self.ledger.unchanged()
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
@@ -215,10 +217,10 @@ class Recovery:
         if ours:
             with changing(self._imus.values()):
                 await self._writer.restore(ours)
-        found = f"{len(ours)} old values back" if ours else "nothing of ours was in force"
+        found = f"{len(ours)} old values back" if ours else "nothing to restore"
         if foreign:
-            found += f"; changed by others, left alone: {', '.join(foreign)}"
-        words = f"Interrupted write: {found}"
+            found += "; " + message("changed_by_others", values=", ".join(foreign))
+        words = message("interrupted_write_ended", result=found)
         if self.on_recovered is not None:
             await self.on_recovered(open_set, words, undone=self.ledger.is_undoable(open_set))
         await self._keep(open_set, found)
@@ -230,7 +232,7 @@ class Recovery:
         try:
             await self._offload(self._interruptions.append, Interruption.of(open_set, reason, utc_now()))
         except StorageError as error:
-            logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
+            logger.warning("%s", message("history_not_kept", what="interrupted write", reason=error))
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
         """Restore the values from before the last step, all or none; returns the step and the restored parameters.
@@ -242,15 +244,14 @@ class Recovery:
         if (why := self.why_no_undo()) is not None:
             raise AutopilotError(why)
         step = self.ledger.steps(self._vehicle.system_id)[0]
+        name = step.origin.what or "last write"
         ours, foreign = await self._sort(step)
         if foreign and not force:
-            raise AutopilotError(
-                f"{step.origin.what or 'last write'}: changed by somebody else or by a boot since, so nothing was put"
-                f" back: {'; '.join(foreign)}. companion undo --force"
-                f" {'puts the others back' if ours else 'leaves it so and comes to the one before'}"
-            )
+            effect = "restores the others" if ours else "skips this step"
+            values = "; ".join(foreign)
+            raise AutopilotError(message("undo_of_changed_values", step=name, values=values, effect=effect))
         if foreign:
-            logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
+            logger.warning("%s", message("changed_by_others", values="; ".join(foreign)))
         try:
             async with self.ledger.transaction(step):
                 with changing(self._imus.values()):
@@ -260,10 +261,9 @@ class Recovery:
         except (WriteFailedError, NothingWrittenError) as error:
             # Not the error's own words: the writer's "old values" are those from before the undo.
             cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)
-            end = f"{step.origin.what or 'last write'} stays in force: undo again"
-            if error.left_changed:
-                end = f"undone in part ({', '.join(error.left_changed)}): the rest follows once disarmed"
-            raise AutopilotError(f"{cause}; {end}") from error
+            if left := ", ".join(error.left_changed):
+                raise AutopilotError(message("undone_in_part", reason=cause, parameters=left)) from error
+            raise AutopilotError(message("undo_failed", reason=cause, step=name)) from error
         self._owed.say()
         return step, written
 

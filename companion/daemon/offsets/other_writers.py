@@ -25,6 +25,7 @@ from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.links.mavlink.link import MavlinkLink
+from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +56,7 @@ class _Other(msgspec.Struct):
         return self.is_new, self.instance
 
     def words(self, does: str) -> str:
-        return f"second companion ({self.system_id}/{self.component_id}) on this link {does}: stop one of them"
+        return message("second_companion", system=self.system_id, component=self.component_id, does=does)
 
     def counts(self, now_s: float) -> bool:
         return self.latest_s - self.first_s >= CONFIRM_S and now_s - self.latest_s < EXPIRE_S
@@ -155,9 +156,9 @@ class Rivalry:
             if rival.name not in self._told and (rival.until_boot or not self.stop_rivals):
                 self._told.add(rival.name)
                 what = "all" if rival.accelerometers else "gyro"
-                words = f"The autopilot may rewrite {what} offsets: set {rival.parameter} to 0"
+                words = message("rival_may_rewrite", what=what, parameter=rival.parameter)
                 if rival.until_boot:
-                    words = "Reboot PX4: its gyro calibration still runs"
+                    words = message("rival_runs_until_reboot")
                 self._say(Severity.WARNING, words, Weight.NEWS)
         if before is not None and before.parameters == after.parameters:
             self._compare(name, before, after)
@@ -169,6 +170,7 @@ class Rivalry:
             return
         what = "all" if gyros and accelerometers else "gyro" if gyros else "accelerometer"
         able = [rival.name for rival in after.rivals if rival.accelerometers or not accelerometers]
-        words = f"Somebody rewrote {what} offsets of {name}{f', perhaps {able[0]}' if able else ''}"
+        suspect = f", perhaps {able[0]}" if able else ""
+        words = message("offsets_rewritten", what=what, imu=name, suspect=suspect)
         logger.warning("%s", words)
         self._say(Severity.WARNING, words, Weight.NEWS)

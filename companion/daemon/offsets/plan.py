@@ -20,6 +20,7 @@ from companion.errors import AutopilotError
 from companion.estimation.records.record import ImuRecord, Outcome, WrittenParameter
 from companion.estimation.records.validity import RESIDUAL_SIGMAS
 from companion.estimation.solution.solve import ImuSolution, Shared
+from companion.messages import message
 from companion.physics.frames import Array
 from companion.physics.units import MG
 from companion.samples import TRIADS, Triad, rows_of
@@ -116,10 +117,7 @@ def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
     name, found = target.name, list[str]()
     coarse_mg = math.sqrt(np.diag(estimate.covariance)[3:].max()) / MG if estimate.accel_m_s2 is not None else 0.0
     if coarse_mg > COARSE_ACCEL_MG:
-        found.append(
-            f"accel {name} is known to {coarse_mg:.0f} mg only: the gradienter is too coarse for it"
-            " (companion align, or calibrate --gyros)"
-        )
+        found.append(message("accelerometer_known_coarsely", imu=name, sigma=f"{coarse_mg:.0f}"))
     return [*found, *warnings_about(target.calibration, target.changes)]
 
 
@@ -131,10 +129,8 @@ def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
             other = owners.setdefault(name, target.name)
             if other != target.name:
                 memory.forget()
-                raise AutopilotError(
-                    f"imu {other} and imu {target.name} seem to share {name}, which cannot be; what was learned"
-                    " about PX4's slots is forgotten; calibrate again"
-                )
+                effect = f"seem to be shared by IMU {other} and {target.name}: calibrate again"
+                raise AutopilotError(message("px4_slot_unclear", slot=name, effect=effect))
 
 
 def as_good(

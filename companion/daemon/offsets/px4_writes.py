@@ -32,6 +32,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import ImuPlan
 from companion.links.mavlink.link import MavlinkLink, Message
+from companion.messages import message
 from companion.physics.frames import Array
 from companion.physics.units import DEG, MG
 from companion.samples import ImuSample, Triad, Vector
@@ -194,18 +195,20 @@ class Px4Writes:
             return None
         if len(moved) == 1 and step.instance in still:
             self._correct(step, moved[0])
-            return f"the offsets in {step.slot} act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
-        if not moved and step.instance in still:
-            words = f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
+            effect = f"act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
+        elif not moved and step.instance in still:
+            effect = f"do not act on the {word} of IMU {step.instance}"
             if self._memory.holds_strangers(step.sensor, len(self._samples.keys() | self._unheard)):
                 self._correct(step, NO_IMU)
-                return words
-            # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
-            return f"{words}: PX4 does not use what it has stored, or it moved"
-        if len(moved) > 1:
-            return f"the offsets in {step.slot} seem to act on IMU {' and '.join(map(str, moved))} at once"
-        logger.warning("%s: it cannot be told yet which IMU its offsets act on", step.slot)
-        return None
+            else:
+                # Each slot belongs to a known IMU: another slot would be wrong, so the reason is another one.
+                effect += ": PX4 does not use the stored values, or the aircraft moved"
+        elif len(moved) > 1:
+            effect = f"act on {len(moved)} IMUs at once: {', '.join(map(str, moved))}"
+        else:
+            logger.warning("%s", message("px4_slot_unclear", slot=step.slot, effect="belong to an IMU not known yet"))
+            return None
+        return message("px4_slot_unclear", slot=step.slot, effect=effect)
 
     def _correct(self, step: ExpectedStep, instance: int) -> None:
         self._learned = True
@@ -316,8 +319,8 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
 def _danger(step: ExpectedStep) -> str:
     size = float(np.linalg.norm(step.step))
     if step.sensor == "gyro":
-        return f"DISARM NOW: yaw rate wrong by {size / DEG:.1f} deg/s"
-    return f"DISARM NOW: vertical acceleration wrong by {size / MG:.0f} mg"
+        return message("disarm_now", quantity="yaw rate", error=f"{size / DEG:.1f} deg/s")
+    return message("disarm_now", quantity="vertical acceleration", error=f"{size / MG:.0f} mg")
 
 
 def _same_again(calibration: ImuCalibration) -> tuple[Change, ...]:

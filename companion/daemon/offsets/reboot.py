@@ -25,6 +25,7 @@ from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.job import GoOn
 from companion.errors import AutopilotError, NotDisarmedError, StorageError
+from companion.messages import message
 from companion.storage.records import this_boot
 from companion.storage.state import StateFile
 
@@ -50,10 +51,8 @@ def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Cha
     gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
     for rival in (rival for calibration in calibrations for rival in calibration.rivals):
         if rival.at_start and after.get(rival.parameter) != 0.0 and gyros & set(after):
-            return (
-                f"not rebooted: {rival.parameter} = {rival.value} would measure the gyros anew at the start and"
-                f" throw these gyro offsets away; set {rival.parameter} to 0 first (push.stop_rivals = true does)"
-            )
+            reason = f"{rival.parameter} = {rival.value} would measure the gyros anew; set {rival.parameter} to 0 first"
+            return message("reboot_not_completed", reason=f"{reason} (push.stop_rivals = true does)")
     return None
 
 
@@ -71,19 +70,21 @@ async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
     try:
         await vehicle.disarmed.ensure()
     except NotDisarmedError as error:
-        raise NotRebootedError(f"not rebooted: {error}") from error
+        raise NotRebootedError(message("reboot_not_completed", reason=error)) from error
     logger.info("rebooting %s", vehicle.name)
     command = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
     result = await vehicle.commands.send(command, 1.0, timeout_s=ANSWER_S)
     if result not in (mavlink.MAV_RESULT_ACCEPTED, None):
-        raise NotRebootedError(f"not rebooted: {vehicle.name} refused ({result_name(result or 0)})")
+        reason = f"{vehicle.name} refused ({result_name(result or 0)})"
+        raise NotRebootedError(message("reboot_not_completed", reason=reason))
     # No answer proves nothing: it may have gone down with it.
     back_s = loop.time() + BACK_WITHIN_S
     while vehicle.boots == boots or vehicle.arm_state is not ArmState.DISARMED:
         if loop.time() > back_s:
             if vehicle.boots == boots and vehicle.alive:
-                raise NotRebootedError(f"not rebooted: {vehicle.name} did not answer and has not restarted")
-            raise AutopilotError(f"{vehicle.name} was rebooted and is not back, disarmed, within {BACK_WITHIN_S:.0f} s")
+                raise NotRebootedError(message("reboot_not_completed", reason=f"{vehicle.name} did not answer"))
+            reason = f"{vehicle.name} not back, disarmed, within {BACK_WITHIN_S:.0f} s"
+            raise AutopilotError(message("reboot_not_completed", reason=reason))
         await asyncio.sleep(POLL_S)
 
 
@@ -122,7 +123,7 @@ class RebootOwed:
         owed = self._owed
         if owed is None or self._vehicle.system_id not in (None, owed.system_id) or self._restarted(owed):
             return None
-        return f"reboot PX4: tilt {owed.tilt_deg:.1f} deg off"
+        return message("reboot_owed", tilt=f"{owed.tilt_deg:.1f}")
 
     def say(self) -> None:
         if (words := self.words) is not None:

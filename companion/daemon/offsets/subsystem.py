@@ -22,7 +22,7 @@ from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import GoOn, Job, JobCancelledError
-from companion.daemon.offsets.effect import in_short, watch_effect
+from companion.daemon.offsets.effect import UNWATCHED, in_short, watch_effect
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
 from companion.daemon.offsets.ledger import Ledger, Recovery
 from companion.daemon.offsets.other_writers import OtherCompanions, Rivalry
@@ -41,6 +41,7 @@ from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object
+from companion.messages import message
 from companion.storage.changes import ChangeLog, ChangeSet, Origin
 
 logger = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ class Offsets(Subsystem):
         """Announce a write of so many parameters; raises NotDisarmedError unless it is surely disarmed in time."""
         job.check_cancelled()
         self._machine.on(Event.WRITE)
-        job.progress(MEASURED_PERCENT, f"writing {parameters} parameters")
+        job.progress(MEASURED_PERCENT, message("write_in_progress", count=parameters, what="parameters"))
         await self._wait_disarmed()
 
     async def commit(
@@ -145,7 +146,7 @@ class Offsets(Subsystem):
     async def _roll_back(self, made: Sequence[Change], imus: Collection[AutopilotImu], reason: str, note: Note) -> str:
         """Restore the old values; return the reason and the outcome."""
         left: Sequence[str] = ()
-        end = "will be once disarmed"
+        outlook = "restored once disarmed"
         with contextlib.suppress(NotDisarmedError):
             await self._wait_disarmed()  # after a restart the first heartbeat is still to come
         with changing(imus):
@@ -155,22 +156,22 @@ class Offsets(Subsystem):
                 note(error.written, ())
                 left = error.left_changed
                 if error.kind == "changed by someone else":
-                    end = "somebody else changed them"
+                    outlook = "changed by another writer"
             except NothingWrittenError:
                 left = [change.parameter for change in made]
                 note({}, left)
         if left:
-            return f"{reason}; old values NOT back in {', '.join(left)}: {end}"
+            return message("write_not_rolled_back", reason=reason, parameters=", ".join(left), outlook=outlook)
         with contextlib.suppress(StorageError):
             await self.ledger.undone()
-        return f"{reason}; old values back"
+        return message("write_rolled_back", reason=reason)
 
     async def _wait_disarmed(self) -> None:
         await self._heartbeat(DISARMED_WITHIN_S)
         if self._vehicle.arm_state is ArmState.ARMED:
-            raise NotDisarmedError("armed; nothing written")
+            raise NotDisarmedError(message("nothing_written", reason="armed"))
         if self._vehicle.arm_state is ArmState.UNKNOWN:
-            raise NotDisarmedError("no heartbeat; nothing written")
+            raise NotDisarmedError(message("nothing_written", reason="no heartbeat"))
 
     async def _heartbeat(self, within_s: float) -> None:
         with contextlib.suppress(TimeoutError):
@@ -227,17 +228,16 @@ class Offsets(Subsystem):
         problems: list[str] = []
         try:
             async for name, now in self._not_as_written(plan, attempts=1):
-                problems.append(f"{name} is {now:.6g}, somebody changed it right after the write")
+                problems.append(message("disturbed_after_write", event=f"another writer changed {name} to {now:.6g}"))
         except AutopilotError as error:
             problems.append(str(error))
         if verdicts is None and self._vehicle.boots != plan.boots:
             problems.append(unseen)
         explained = bool(problems)
         for target in plan.targets:
-            if not target.watched:
-                log.warn(target.name, "effect of the written offsets not seen: this IMU is not in the telemetry")
-            elif verdicts is None:
-                log.warn(target.name, f"effect of the written offsets not seen: {unseen}")
+            if verdicts is None or not target.watched:
+                reason = unseen if target.watched else UNWATCHED
+                log.warn(target.name, message("effect_not_seen", when="", reason=reason))
             elif not explained:
                 problems += _note_verdicts(plan, target, verdicts[target.name], log)
         return problems
@@ -264,7 +264,7 @@ class Offsets(Subsystem):
         if not_rebooted := await self._restart(job, plan, before, log) if job.reboot else "":
             self._warn(log, not_rebooted)
         if (words := self.owed.words) is not None:
-            log.warnings.append(f"{words} for minutes after such a step (companion calibrate --reboot does it)")
+            log.warnings.append(words)
             self.owed.say()
         self._machine.on(Event.VERIFIED)
         if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
@@ -272,7 +272,7 @@ class Offsets(Subsystem):
             try:
                 unsettled = await self._firmware.settle(plan, job.going_on(CONCLUDING_PERCENT))
             except JobCancelledError as cancelled:
-                unsettled = f"wait 2 min before take-off: {cancelled} while the EKF took in the new offsets, which stay"
+                unsettled = message("settling_interrupted", reason=cancelled)
             if unsettled is not None:
                 self._warn(log, unsettled)
             if self._vehicle.boots != boots:
@@ -288,7 +288,7 @@ class Offsets(Subsystem):
         changed = [name async for name, _ in self._not_as_written(plan, attempts=READ_ATTEMPTS)]
         if changed:
             plan.mark(log, changed, "failed")
-            raise AutopilotError(f"the autopilot restarted and replaced {', '.join(changed)}: calibrate again")
+            raise AutopilotError(message("wrong_after_restart", problems=f"{', '.join(changed)} replaced"))
 
     async def _restart(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> str:
         """Restart the autopilot and check that the new offsets are in force; returns why that was not seen, or ""."""
@@ -300,23 +300,23 @@ class Offsets(Subsystem):
             await reboot(self._vehicle, go_on)
             stored = {change.parameter: change.after for change in plan.changes}
             changed = [
-                f"{name} is {now:.6g} after the reboot, {stored[name]:.6g} had been stored"
+                f"{name} ({now:.6g}, stored: {stored[name]:.6g})"
                 async for name, now in self._not_as_written(plan, attempts=READ_ATTEMPTS)
             ]
             if changed:
-                raise AutopilotError("; ".join(changed))
+                raise AutopilotError(message("wrong_after_restart", problems=f"{', '.join(changed)} replaced"))
             verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, self._vehicle.boots)
         except NotRebootedError as error:
             return str(error)
         except JobCancelledError as cancelled:
-            return f"{cancelled} before the reboot was confirmed; the new offsets stay"
+            return message("reboot_not_completed", reason=cancelled)
         found = (verdicts or {}).items()
         problems = [f"imu {name}: {in_short(verdict)}" for name, each in found for verdict in each if not verdict.ok]
         if problems:
-            raise AutopilotError(f"after the reboot: {'; '.join(problems)}")
+            raise AutopilotError(message("wrong_after_restart", problems="; ".join(problems)))
         if unseen:
-            log.warnings.append(f"rebooted, and the parameters are as written; their effect was not seen: {unseen}")
-        log.notes.append("rebooted" if unseen else "rebooted, offsets in force")
+            log.warnings.append(message("effect_not_seen", when=" after the reboot", reason=unseen))
+        log.notes.append("rebooted" if unseen else message("rebooted_and_active"))
         return ""
 
 
@@ -324,7 +324,7 @@ def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict
     """Enter the outcomes of one IMU's parameters; returns what is wrong, in words."""
     hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
     if hidden:
-        log.warn(target.name, f"so small a change does not show in the telemetry: {', '.join(hidden)}")
+        log.warn(target.name, message("change_too_small_to_see", parameters=", ".join(hidden)))
     for verdict in verdicts:
         log.warn(target.name, *verdict.problems)
         # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 
 from companion.component.statustext import Severity, as_lines, to_ascii
+from companion.messages import catalogue
 from tests.support.messages import FILLED, ROOT, template_of
 
 UNHEARD = re.compile(r"\b(sigma|deg|mg|K|imu|accel|GNSS|EKF2?)\b|[=_%/]")
@@ -40,10 +41,19 @@ def _said_in(function: ast.AST) -> Iterator[tuple[Severity, str]]:
         if severity is None or severity > Severity.NOTICE:
             continue
         for words in assigned.get(ast.unparse(call.args[1]), [call.args[1]]):
-            within = list(ast.walk(words))
-            parts = {id(part) for each in within if isinstance(each, ast.JoinedStr) for part in each.values}
-            texts = [template_of(each) for each in within if id(each) not in parts]
-            yield from ((severity, text) for text in texts if text is not None and " " in text.strip())
+            yield from ((severity, text) for text in _texts(words) if " " in text.strip())
+
+
+def _texts(words: ast.AST) -> Iterator[str]:
+    """Templates in an expression; those of the catalogue for a call of `message`."""
+    if isinstance(words, ast.Call) and ast.unparse(words.func) == "message":
+        yield re.sub(r"\{[^}]*\}", FILLED, catalogue()[ast.literal_eval(words.args[0])].text)
+        return
+    if (text := template_of(words)) is not None:
+        yield text
+    for part in ast.iter_child_nodes(words):
+        if not isinstance(words, ast.JoinedStr) or isinstance(part, ast.FormattedValue):
+            yield from _texts(part)
 
 
 def unheard(severity: Severity, template: str) -> str | None:

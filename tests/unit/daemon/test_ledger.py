@@ -206,12 +206,12 @@ def test_a_second_write_does_not_take_the_place_of_one_that_is_open_or_was_inter
     async def main() -> None:
         ledger = opened(tmp_path)
         async with ledger.transaction(OLD):
-            with pytest.raises(AutopilotError, match="putting old values back first"):
+            with pytest.raises(AutopilotError, match="restoring old values"):
                 async with ledger.transaction(WIDER):
                     raise AssertionError("written over")
             assert not ledger.pending
             assert on_disk(tmp_path) == OLD
-        assert "putting old values back first" in str(await end_of(ledger, wordless)), "interrupted"
+        assert "restoring old values" in str(await end_of(ledger, wordless)), "interrupted"
         assert on_disk(tmp_path) == OLD
         again = opened(tmp_path)
         assert await asyncio.wait_for(again.interrupted(), 30.0) == OLD, "of a daemon that died"

@@ -108,7 +108,7 @@ def test_values_that_could_not_be_restored_are_named_and_left_to_the_recovery(tm
     async def main() -> None:
         aircraft = Aircraft(tmp_path)
         aircraft.writer.fails = WriteFailedError("armed in the middle", "armed", {}, ("INS_GYROFFS_X",))
-        with pytest.raises(AutopilotError, match="old values NOT back in INS_GYROFFS_X: will be once disarmed"):
+        with pytest.raises(AutopilotError, match="old values NOT back in INS_GYROFFS_X: restored once disarmed"):
             await aircraft.commit(AutopilotError("not followed"))
         assert aircraft.ledger.pending
 

@@ -66,8 +66,8 @@ def changed(**changes: Any) -> Callable[[bytes], bytes]:
     [
         (lambda data: data[: len(data) // 2], "truncated"),
         (lambda _: b"", "truncated"),
-        (lambda _: b"\x00\xff" * 40, "not a readable profile"),
-        (lambda _: b"[1, 2]", "not a readable profile"),
+        (lambda _: b"\x00\xff" * 40, "mine.json: cannot be used: "),
+        (lambda _: b"[1, 2]", "mine.json: cannot be used: "),
         (lambda data: data.replace(b'"mine"', b'"nine"'), "its checksum does not fit: damaged, or changed by hand"),
         (lambda data: data + b" " * MOST_BYTES, f"more than {MOST_BYTES} bytes"),
         (changed(format_version=2), "found format 2; allowed: up to 1 (a newer companion has saved it)"),
@@ -96,7 +96,7 @@ def test_a_damaged_or_newer_one_is_refused_in_one_line(
     assert words in str(refused.value)
     # All but the daemon's own start, which no file may prevent: then with the figures of the worst parts, and a word.
     config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name, forgiving=True))
-    assert str(Profiles(config).status()[0]["summary"]).startswith("mine, which cannot be used")
+    assert str(Profiles(config).status()[0]["summary"]).startswith("mine, sigmas are those of the worst")
     instead, worst = noise_profile(config.imu[0].profile), noise_profile(None)
     assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
     (said,) = caplog.messages

@@ -29,7 +29,7 @@ def test_a_second_one_is_refused_until_the_first_has_ended_even_by_kill_9(tmp_pa
         try:
             assert holder.stdout is not None
             assert holder.stdout.readline() == "held\n"
-            words = r"state: another daemon works with this directory$"
+            words = r"state: cannot be used: another daemon works with this directory$"
             for _ in range(2):
                 with pytest.raises(StorageError, match=words), only_daemon(folder):
                     pass
@@ -50,7 +50,7 @@ def test_the_command_ends_with_1_and_one_line(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "companion", "-c", str(config), "run"]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
     assert ended.returncode == 1, ended.stderr
-    words = f"companion: {tmp_path}/state: another daemon works with this directory"
+    words = f"companion: {tmp_path}/state: cannot be used: another daemon works with this directory"
     assert ended.stderr.splitlines()[-1] == words
     assert "Traceback" not in ended.stderr
     assert not (tmp_path / "c").exists()
