@@ -55,11 +55,11 @@ def headings(path: Path) -> set[str]:
 def commands_in(path: Path) -> Iterator[str]:
     """Command lines of `companion` and `python -m sim`, from blocks and from code spans, as one would type them.
 
-    Not what the tables of messages show in their first column: there the companion speaks of itself.
+    Not the messages in the page of messages: there the companion speaks of itself.
     """
     text = prose(path)
     if path.name == "messages.md":
-        text = re.sub(r"^\|[^|]*\|", "", text, flags=re.MULTILINE)
+        text = re.sub(r"^- `.*?`: ", "", text, flags=re.MULTILINE)
     texts = [line.removeprefix("$ ") for block in blocks(path) for line in block.text.splitlines()]
     texts += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
     for line in texts:
