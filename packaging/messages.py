@@ -23,15 +23,15 @@ def page() -> str:
     parts = [_HEAD]
     for kind, title in KINDS.items():
         rows = [_row(entry) for entry in catalogue().values() if entry.do == kind]
-        parts.append(f"\n## {title}\n\n" + "".join(rows))
+        parts.append(f"\n## {title}\n" + "".join(rows))
     return "".join(parts)
 
 
 def _row(entry: Entry) -> str:
     # `companion explain` knows all patterns.
-    shown = ", ".join(f"`{pattern}`" for pattern in (entry.patterns[:1] if entry.text else entry.also[:4]))
+    shown = ", ".join(f"`{pattern}`" for pattern in (entry.patterns[:1] if entry.text else entry.also[:3]))
     words = " ".join(part for part in (entry.cause, entry.remedy) if part)
-    return f"- {shown}: {words}{f' [More]({entry.see})' if entry.see else ''}\n"
+    return f"\n{f'[{shown}]({entry.see})' if entry.see else shown}: {words}\n"
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def commands_in(path: Path) -> Iterator[str]:
     """
     text = prose(path)
     if path.name == "messages.md":
-        text = re.sub(r"^- `.*?`: ", "", text, flags=re.MULTILINE)
+        text = re.sub(r"^\[?`.*?: ", "", text, flags=re.MULTILINE)
     texts = [line.removeprefix("$ ") for block in blocks(path) for line in block.text.splitlines()]
     texts += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
     for line in texts:
