@@ -11,10 +11,10 @@ _HEAD: Final = """\
 # Messages: what the companion says, and what to do
 
 Type `companion explain WORDS` with some words of the line, or search this page for them. `…` is a name or a number.
-`status`, `check`, `calibrate --wait` and the page of the companion show the remedy under the message.
+`status`, `check`, failed commands and the page show the remedy too.
 
-A line often has a speaker and a reason: in `Not armed: hold still 6 s` look up the part behind the colon. The ground
-station gets STATUSTEXT lines of at most 50 characters; one that begins with `... ` continues the line before.
+A line often has a speaker and a reason: in `Not armed: hold still 6 s` look up the part behind the colon. A line
+that begins with `... ` continues the one before.
 """
 
 

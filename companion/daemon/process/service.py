@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from companion import config as configuration
-from companion import summary
+from companion import messages, summary
 from companion.autopilot.telemetry import imu_stream
 from companion.config.sections import Config
 from companion.configured import models
@@ -199,6 +199,7 @@ def main(path: str, *verbose: str) -> int:
         wanted = configuration.load(Path(path), partial(saved_profile, forgiving=True))
         if not verbose:
             logging.getLogger().setLevel(wanted.log.level.upper())
+        messages.catalogue()  # now, and not in the middle of an update of the package
         asyncio.run(run(wanted))
     except ConfigError as error:
         sys.stderr.write(printable(f"{error}") + "\n")
