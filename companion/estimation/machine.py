@@ -66,7 +66,7 @@ class Event(enum.Enum):
     REQUEST = "request"
     UNDO = "undo"
     STILL = "still long enough"
-    MOVED = "moved, or not as believed"
+    MOVED = "moved, or without the expected effect"
     ENOUGH = "measured enough"
     WRITE = "biases to write"
     NOTHING_TO_WRITE = "nothing to write"

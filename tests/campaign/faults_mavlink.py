@@ -13,7 +13,7 @@ from tests.campaign.rough_wire import Stranger, malformed
 from tests.support.component import CALIBRATE, CANCEL, UNDO, command_message
 
 LOST = (
-    r"heartbeat|does not answer|answers neither|no answer|telemetry|not be put back|NOT back|not read|lost|not seen"
+    r"heartbeat|does not answer|no answer|telemetry|not be put back|NOT back|not read|lost|not seen"
     r"|restart|unknown whether|arm state unknown"
 )
 ARMED = r"armed|Armed"

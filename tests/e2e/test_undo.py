@@ -167,7 +167,7 @@ def mended(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "why", "restart"),
-    [(arms, "armed", True), (refuses, f"refuses {TRIM[0]}", False), (falls_silent, "no answer", False)],
+    [(arms, "armed", True), (refuses, f"refuses to set {TRIM[0]}", False), (falls_silent, "no answer", False)],
 )
 async def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
     tmp_path: Path, fault: Callable[[Rig], None], why: str, restart: bool

@@ -36,7 +36,7 @@ from companion.autopilot.firmware.imu_calibration import (
     vector_changes,
 )
 from companion.autopilot.firmware.imu_messages import HIGHRES, SCALED, SCALED2, SCALED3, SCRIPT
-from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Names, Parameters
+from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Names, Parameters, implausible
 from companion.errors import AutopilotError
 from companion.estimation.solution.curve import ZERO, Polynomial
 from companion.messages import message
@@ -292,9 +292,7 @@ async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
         return Thermal()
     if enable == _TCAL_LEARNING:
         wanted = f"0 or 1 (2: IMU {instance} is learning its temperature calibration; let it finish)"
-        raise AutopilotError(
-            message("parameter_not_plausible", parameter=names.tcal_enable, value=enable, wanted=wanted)
-        )
+        raise implausible(names.tcal_enable, f"{enable}", wanted)
     if enable != _TCAL_ON:
         return Thermal(values={names.tcal_enable: float(enable)})
     found = await parameters.read_many((*names.tcal, names.gyro_caltemp, names.accel_caltemp))
@@ -328,14 +326,9 @@ async def _read_board_rotation(parameters: Parameters) -> Matrix:
         return rotation_matrix(ROTATION_NAMES[number])
     if number in _ARDUPILOT_ONLY_DEG:
         return rotation_matrix(_ARDUPILOT_ONLY_DEG[number])
-    wanted = ""
     if number not in _CUSTOM_NAMES:
-        wanted = "a known orientation"
+        raise implausible("AHRS_ORIENTATION", f"{value:g}", "a known orientation")
     # A custom rotation that is set but switched off is an internal error to ArduPilot: nobody knows what it does.
-    elif number > 100 and not await parameters.read_optional("CUST_ROT_ENABLE"):
-        wanted = "CUST_ROT_ENABLE = 1 with it"
-    if wanted:
-        raise AutopilotError(
-            message("parameter_not_plausible", parameter="AHRS_ORIENTATION", value=f"{value:g}", wanted=wanted)
-        )
+    if number > 100 and not await parameters.read_optional("CUST_ROT_ENABLE"):
+        raise implausible("AHRS_ORIENTATION", f"{number}", "CUST_ROT_ENABLE = 1 with it")
     return rotation_matrix(await parameters.read_vector(_CUSTOM_NAMES[number]))

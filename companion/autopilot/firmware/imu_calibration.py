@@ -293,7 +293,7 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
     low, high = ACCEL_SCALE_RANGE
     for axis, value in zip(_AXES, after, strict=True):
         if not low <= value <= high:
-            raise _implausible(calibration, "accelerometer scale", axis, f"{value:.3g}", f"{low} to {high}")
+            raise _implausible(calibration, f"accelerometer scale {axis}", f"{value:.3g}", f"{low} to {high}")
     far_axis = calibration.far_axis
     changes = vector_changes(names.accel_offset, calibration.accel_offset_m_s2, offset, far_axis, FAR_ACCEL_M_S2)
     if not calibration.scale_unused_within or after != calibration.accel_scale:
@@ -324,14 +324,11 @@ def _require_plausible(calibration: ImuCalibration, what: str, vector: Vector, l
     unit, words = (DEG, "deg/s") if "gyro" in what else (1.0, "m/s^2")
     for axis, value in zip(_AXES, vector, strict=True):
         if not abs(value) <= limit:  # NaN is outside too
-            raise _implausible(calibration, what, axis, f"{value / unit:.3g} {words}", f"{limit / unit:.3g}")
+            raise _implausible(calibration, f"{what} {axis}", f"{value / unit:.3g} {words}", f"{limit / unit:.3g}")
 
 
-def _implausible(
-    calibration: ImuCalibration, what: str, axis: str, value: str, allowed: str
-) -> CalibrationRefusedError:
-    imu = calibration.instance
-    words = message("result_not_plausible", imu=imu, what=what, axis=axis, value=value, allowed=allowed)
+def _implausible(calibration: ImuCalibration, what: str, value: str, allowed: str) -> CalibrationRefusedError:
+    words = message("result_not_plausible", imu=calibration.instance, what=what, value=value, allowed=allowed)
     return CalibrationRefusedError(words)
 
 

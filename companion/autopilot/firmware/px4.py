@@ -34,7 +34,7 @@ from companion.autopilot.firmware.imu_calibration import (
     offset_ranges,
 )
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
-from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters
+from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters, implausible
 from companion.errors import AutopilotError
 from companion.messages import message
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
@@ -319,9 +319,7 @@ async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Mat
     accel_mounting = await _read_mounting(parameters, "accel", accel)
     if not np.array_equal(gyro_mounting, accel_mounting):
         one, other = f"{PREFIX['gyro']}{gyro.number}_ROT", f"{PREFIX['accel']}{accel.number}_ROT"
-        raise AutopilotError(
-            message("parameter_not_plausible", parameter=one, value=f"unlike {other}", wanted="the same mounting")
-        )
+        raise implausible(one, f"unlike {other}", "the same mounting")
     matrix: Matrix = level @ accel_mounting
     return matrix
 

@@ -44,6 +44,10 @@ def _rank(value: float) -> int:
     return bits if bits >= 0 else -(bits & 0x7FFFFFFF)
 
 
+def implausible(name: str, value: str, wanted: str) -> AutopilotError:
+    return AutopilotError(message("parameter_not_plausible", parameter=name, value=value, wanted=wanted))
+
+
 class Parameters(abc.ABC):
     """Parameters read by name, of an autopilot that answers or of a log; `ParameterClient` says what they raise.
 
@@ -77,17 +81,14 @@ class Parameters(abc.ABC):
         x, y, z = [await self.read(name) for name in names]
         for name, value in zip(names, (x, y, z), strict=True):
             if not math.isfinite(value) or not low <= value <= high:
-                wanted = f"{low:g} to {high:g}" if math.isfinite(high) else "a number"
-                raise AutopilotError(
-                    message("parameter_not_plausible", parameter=name, value=f"{value:.9g}", wanted=wanted)
-                )
+                raise implausible(name, f"{value:.9g}", f"{low:g} to {high:g}" if math.isfinite(high) else "a number")
         return x, y, z
 
     async def read_integer(self, name: str) -> int | None:
         """Read a whole number; None where the firmware has none. Raise AutopilotError where it is not a number."""
         value = await self.read_optional(name)
         if value is not None and not math.isfinite(value):
-            raise AutopilotError(message("parameter_not_plausible", parameter=name, value=value, wanted="a number"))
+            raise implausible(name, f"{value}", "a number")
         return None if value is None else round(value)
 
 

@@ -31,11 +31,7 @@ VISIBLE_SIGMAS: Final = 2 * SIGMAS
 SCALE_TOLERANCE: Final = 0.05  # besides noise: scale error and cross-axis sensitivity, a few percent at most
 
 AxisWord = Literal["seen", "too small to see", "not seen", "wrong"]
-_WHY: Final[Mapping[AxisWord, str]] = {
-    "not seen": "the autopilot stored the value but does not use it",
-    "wrong": "not the step that was written",
-}
-_REFUTED: Final = tuple(_WHY)
+_REFUTED: Final = ("not seen", "wrong")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -102,7 +98,7 @@ def judge(seen: Observation) -> EffectVerdict:
     family = f"{seen.parameters[0]}, {', '.join('_' + name[-1] for name in seen.parameters[1:])}"
     if not problems and together in _REFUTED:
         problems.append(
-            _problem(family, f"{fraction:.0%} of the step", "100%", f"{fraction_sigma:.0%}", _WHY[together])
+            _problem(family, f"{fraction:.0%} of the step", "100%", f"{fraction_sigma:.0%}", "all axes together")
         )
     residual = np.subtract(seen.after, seen.truth)
     allowed = seen.tolerance + SIGMAS * np.asarray(seen.after_sigma) + seen.resolution
@@ -129,8 +125,8 @@ def _judge_axis(expected: float, made: float, sigma: float, slack: float) -> tup
     if agrees:
         return "seen", ""
     if abs(made) <= noise:
-        return "not seen", _WHY["not seen"]
-    return "wrong", _WHY["wrong"]
+        return "not seen", "the autopilot stored the value but does not use it"
+    return "wrong", "not the step that was written"
 
 
 def _problem(parameters: str, moved: str, expected: str, noise: str, why: str) -> str:

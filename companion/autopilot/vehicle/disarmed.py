@@ -123,9 +123,8 @@ class DisarmedCheck:
                 if state is ArmState.ARMED or (now_s - begun_s > GIVE_UP_S and state is ArmState.UNKNOWN):
                     raise NotDisarmedError(state.why_not_written)
                 if now_s - begun_s > GIVE_UP_S:
-                    raise NotDisarmedError(
-                        message("arm_question_not_answered", autopilot=self._name(), seconds=f"{GIVE_UP_S:g}")
-                    )
+                    words = message("arm_question_not_answered", autopilot=self._name(), seconds=f"{GIVE_UP_S:g}")
+                    raise NotDisarmedError(words)
                 if now_s >= ask_s:
                     ask_s = now_s + max(ASK_AGAIN_S, self._proof.slowest_s)
                     request = self._ask(now_s)

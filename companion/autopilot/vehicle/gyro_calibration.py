@@ -43,8 +43,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
     found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
     present = [names for names in every if names.gyro_offset[0] in found]
     if not present:
-        missing = f"{every[0].gyro_offset[0]} does not exist"
-        raise AutopilotError(message("autopilot_has_no_imu", imu=INSTANCES[0], reason=missing))
+        raise AutopilotError(message("autopilot_has_no_imu", imu=1, reason=f"{every[0].gyro_offset[0]} does not exist"))
     found |= await parameters.read_many(name for names in present for name in names.gyro_offset[1:])
     more = (name for names in present for name in (names.gyro_caltemp, names.gyro_id))
     found |= await parameters.read_many(more, optional=True)

@@ -127,14 +127,8 @@ class ParameterClient(Parameters):
         return ParameterRefusedError(words)
 
     def _unanswered(self, request: str, tries: int) -> ParameterTimeoutError:
-        words = message(
-            "parameter_not_answered",
-            autopilot=self.vehicle.name,
-            request=request,
-            tries=tries,
-            seconds=f"{_TIMEOUT_S:g}",
-            hint=self.vehicle.why_silent,
-        )
+        name, hint = self.vehicle.name, self.vehicle.why_silent
+        words = message("parameter_not_answered", autopilot=name, request=request, tries=tries, hint=hint)
         return ParameterTimeoutError(words)
 
     async def read(self, name: str) -> float:

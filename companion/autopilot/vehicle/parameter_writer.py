@@ -214,7 +214,7 @@ class ParameterWriter:
             item.confirmed = True
         finally:
             item.sent |= self._parameters.writes > sent_before
-        self._check_boot(f"{name} was written")
+        self._parameters.require_same_boot(self._boots, f"{name} was written")
 
     async def _read_back(self, items: list[PendingChange]) -> None:
         await asyncio.sleep(_LATE_ECHO_S)
@@ -230,22 +230,15 @@ class ParameterWriter:
 
     async def _check_end(self) -> None:
         await self._vehicle.hear_boot_time()
-        self._check_boot("its parameters were read back")
+        self._parameters.require_same_boot(self._boots, "its parameters were read back")
         try:
             await self._vehicle.disarmed.ensure()
         except NotDisarmedError as error:
             raise _Failure(kind_of(error, self._vehicle, self._boots), str(error)) from error
 
-    def _check_boot(self, doing: str) -> None:
-        if self._vehicle.boots != self._boots:
-            raise _Failure("rebooted in the middle", self._restarted(doing))
-
-    def _restarted(self, doing: str) -> str:
-        return message("autopilot_restarted_meanwhile", autopilot=self._vehicle.name, doing=doing)
-
     async def _read(self, name: str) -> float:
         value = await self._parameters.read(name)
-        self._check_boot(f"{name} was read")
+        self._parameters.require_same_boot(self._boots, f"{name} was read")
         return value
 
     # --- back
@@ -265,7 +258,8 @@ class ParameterWriter:
             # Another value may be that of a start-up calibration, which is not ours to overwrite.
             await self._vehicle.hear_boot_time()
         if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
-            kind, reason = "rebooted in the middle", self._restarted(f"its parameters were written ({reason})")
+            kind, name, doing = "rebooted in the middle", self._vehicle.name, f"its parameters were written ({reason})"
+            reason = message("autopilot_restarted_meanwhile", autopilot=name, doing=doing)
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 

@@ -75,8 +75,11 @@ class TimeAndPlace:
         if now_s - self._heard_s >= SILENT_S:
             return None
         if self._anchor is None:
-            return _doubt("new position", CONFIRMED_AFTER_S - (now_s - self._since_s))
-        return _doubt(_apart(self._anchor, self._claim), SETTLED_AFTER_S - (now_s - self._since_s))
+            change, wait_s = "new position", CONFIRMED_AFTER_S
+        else:
+            change, wait_s = _apart(self._anchor, self._claim), SETTLED_AFTER_S
+        left_s = max(1.0, wait_s - (now_s - self._since_s))
+        return message("position_in_doubt", change=change, seconds=f"{left_s:.0f}")
 
     def restarted(self) -> None:
         """Forget what the autopilot has said; an aircraft that stands still is where it was."""
@@ -107,7 +110,7 @@ class TimeAndPlace:
         elif t_s - self._heard_s >= SILENT_S or not _is_near(place, self._claim):
             self._claim, self._since_s, self._heard_s = place, t_s, t_s
             if self._anchor is not None:
-                logger.warning("%s", _doubt(_apart(self._anchor, place), SETTLED_AFTER_S))
+                logger.warning("%s", self.doubt)
         else:
             self._heard_s = t_s
             if t_s - self._since_s >= (CONFIRMED_AFTER_S if self._anchor is None else SETTLED_AFTER_S):
@@ -135,10 +138,6 @@ def _distance_m(one: Position, other: Position) -> float:
     turn = math.cos(math.radians(one.longitude_deg - other.longitude_deg))
     cosine = math.sin(north) * math.sin(from_north) + math.cos(north) * math.cos(from_north) * turn
     return _EARTH_RADIUS_M * math.acos(max(-1.0, min(cosine, 1.0)))
-
-
-def _doubt(change: str, left_s: float) -> str:
-    return message("position_in_doubt", change=change, seconds=f"{max(1.0, left_s):.0f}")
 
 
 def _apart(before: Position, now: Position | None) -> str:
