@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion import __version__, config
+from companion import __version__, config, messages
 from companion.cli.terminal import (
     FAILED,
     NO_DAEMON,
@@ -26,7 +26,6 @@ from companion.cli.terminal import (
     how_to_start,
     print_json,
     print_lines,
-    print_remedy,
 )
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
 from companion.links.system.process import OneLineFormatter
@@ -60,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
     print_lines(f"companion: {reason}", error=True)
-    print_remedy(reason)
+    if state != "failed" and (remedy := messages.remedy(reason)):  # what the daemon says; a desk's errors say all
+        print_lines(f"-> {remedy}", error=True)
     if options.json:
         print_json({"state": state, "reason": reason})
 

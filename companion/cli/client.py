@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from companion import commands
+from companion import commands, messages
 from companion.cli import show
 from companion.cli.monitor import monitor
 from companion.cli.terminal import (
@@ -86,6 +86,12 @@ async def request(
     return reply
 
 
+def _conclude(options: argparse.Namespace, answer: Object, lines: Sequence[str], *, good: bool) -> int:
+    """Print an answer of the daemon, and what to do about a failure."""
+    remedy = "" if good else messages.remedy(answer.get("reason") or "")
+    return conclude(options, answer, [*lines, *([f"{show.REMEDY}{remedy}"] if remedy else [])], good=good)
+
+
 async def status(options: argparse.Namespace) -> int:
     answer = (await request(options, {"command": "status"}))["status"]
     return conclude(options, answer, show.status_lines(answer), good=True)
@@ -96,12 +102,12 @@ async def calibrate(options: argparse.Namespace) -> int:
     if "record" not in reply:
         return _conclude_briefly(options, reply, good=not options.wait)
     record = reply["record"]
-    return conclude(options, record, show.record_lines(record), good=record["state"] == "done")
+    return _conclude(options, record, show.record_lines(record), good=record["state"] == "done")
 
 
 def _conclude_briefly(options: argparse.Namespace, reply: Object, *, good: bool = True) -> int:
     answer = {key: reply.get(key) for key in ("state", "reason")}
-    return conclude(options, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
+    return _conclude(options, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
 
 
 async def cancel(options: argparse.Namespace) -> int:
@@ -112,7 +118,7 @@ async def undo(options: argparse.Namespace, kind: type[commands.Command] = comma
     reply = await request(options, request_of(options, kind))
     answer = {key: reply.get(key) for key in ("state", "reason", "written", "undone", "undoable")}
     lines = [f"{answer['state']}: {answer['reason']}", show.undo_line(answer["undoable"] or ())]
-    return conclude(options, answer, lines, good=answer["state"] == "done")
+    return _conclude(options, answer, lines, good=answer["state"] == "done")
 
 
 async def history(options: argparse.Namespace) -> int:
@@ -130,7 +136,7 @@ async def temperature(options: argparse.Namespace) -> int:
         reply = await request(options, {**wanted, "action": "write"}, CANCEL)
         answer: Object = {key: reply.get(key) for key in ("state", "reason", "written")}
         lines = [_heading(answer), *show.curves_written_lines(answer["written"])]
-        return conclude(options, answer, lines, good=answer["state"] == "done")
+        return _conclude(options, answer, lines, good=answer["state"] == "done")
     imus = (await request(options, wanted)).get("imus", [])
     return conclude(options, {"imus": imus}, show.temperature_lines(imus), good=True)
 
@@ -152,7 +158,7 @@ async def align(options: argparse.Namespace) -> int:
     lines = [_heading(answer), *(stands_lines(alignment) if alignment else [])]
     lines += sides_lines(answer.get("accelerometers", ()))
     good = state in ("done", "in force") or (wanted["action"] == "show" and state != "refused")
-    return conclude(options, answer, lines, good=good)
+    return _conclude(options, answer, lines, good=good)
 
 
 async def record(options: argparse.Namespace) -> int:
@@ -165,7 +171,7 @@ async def record(options: argparse.Namespace) -> int:
         lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
         size = f"{answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB"
         lines = [f"{answer['file']}: {size}{lost}; {answer['reason']}"]
-    return conclude(options, answer, lines, good=answer.get("state") == "done")
+    return _conclude(options, answer, lines, good=answer.get("state") == "done")
 
 
 def setup_lines(answer: Object) -> list[str]:

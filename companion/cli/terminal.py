@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 from urllib.parse import quote
 
-from companion import commands, config, messages
+from companion import commands, config
 from companion.config.sections import Config, NoiseProfile, Storage
 from companion.config.words import COMMAND_LINE, refusal_of_words
 from companion.errors import CompanionError, ConfigError
@@ -203,15 +203,7 @@ def conclude(options: argparse.Namespace, answer: Any, lines: Iterable[object], 
         print_json(answer)
     else:
         print_lines(*lines)
-        if not good:
-            print_remedy(answer.get("reason") or "")
     return DONE if good else FAILED
-
-
-def print_remedy(reason: str) -> None:
-    """Print on stderr what to do about the reason of a failure, where the catalogue knows more than the reason says."""
-    if remedy := messages.remedy(reason):
-        print_lines(f"-> {remedy}", error=True)
 
 
 def print_json(value: Any) -> None:

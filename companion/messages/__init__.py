@@ -61,7 +61,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return (*([re.sub(r"\{[^}]*\}", ANY, self.text)] if self.text else []), *self.also)
 
     def advice(self) -> str:
-        return f"{self.remedy} (docs/{self.see})" if self.see else self.remedy
+        return f"{self.remedy} (docs/{self.see})" if self.remedy and self.see else self.remedy
 
 
 @functools.cache
