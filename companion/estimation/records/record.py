@@ -24,7 +24,7 @@ HeadingFrom = Literal["compass", "autopilot"]
 
 
 def outcome_word(outcome: str) -> str:
-    return "put back" if outcome == "rolled_back" else outcome
+    return "restored" if outcome == "rolled_back" else outcome
 
 
 class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
