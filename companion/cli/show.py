@@ -120,7 +120,9 @@ def explained_lines(found: Sequence[tuple[str, messages.Entry]]) -> list[str]:
     for name, entry in found:
         lines += ["", f"{name}: {' | '.join(entry.patterns)}"] if lines else [f"{name}: {' | '.join(entry.patterns)}"]
         lines += [f"  why: {entry.cause}"] if entry.cause else []
-        lines += [f"  {REMEDY}{entry.advice() or ' '.join((messages.KINDS[entry.do], f'(docs/{entry.see})' * bool(entry.see)))}".rstrip()]
+        lines += [
+            f"  {REMEDY}{entry.advice() or ' '.join((messages.KINDS[entry.do], f'(docs/{entry.see})' * bool(entry.see)))}".rstrip()
+        ]
     return lines
 
 
