@@ -209,8 +209,7 @@ class FleetItems:
             db.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
             (version,) = db.execute("PRAGMA user_version").fetchone()
             if version > FORMAT_VERSION:
-                words = f"found format {version}; allowed: up to {FORMAT_VERSION}"
-                raise file_error(self.path, "used", words)
+                raise file_error(self.path, "used", f"found format {version}; allowed: up to {FORMAT_VERSION}")
             if version < FORMAT_VERSION:
                 db.executescript(
                     f"""

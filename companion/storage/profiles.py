@@ -64,14 +64,8 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
 def check_name(name: str) -> None:
     """Raise StorageError where a profile may not be saved under this name: the catalogue's, or no name for a file."""
-    if _plain(name) in CATALOGUE:
-        fault, allowed = "that name is the catalogue's", "another one"
-    elif not _NAME.fullmatch(name):
-        fault = "no name for a file"
-        allowed = "up to 40 small letters, digits, dots, dashes and underscores, a letter or digit first"
-    else:
-        return
-    raise StorageError(message("profile_name_not_allowed", name=repr(name), fault=fault, allowed=allowed))
+    if _plain(name) in CATALOGUE or not _NAME.fullmatch(name):
+        raise StorageError(message("profile_name_not_allowed", name=repr(name)))
 
 
 def _plain(name: str) -> str:
@@ -119,9 +113,7 @@ def read_profile(path: Path) -> SavedProfile:
                 raise ValueError(f"found N, B, K of {figures}; allowed: N above 0, none negative")
         if found.warm_up is not None and not all(0.0 < each < math.inf for each in found.warm_up):
             raise ValueError(f"found warm_up of {found.warm_up}; allowed: above 0")
-    except OSError as error:
-        raise file_error(path, "read", error) from error
-    except UNREADABLE as error:
+    except (OSError, *UNREADABLE) as error:
         raise file_error(path, "used", error) from error
     return found
 

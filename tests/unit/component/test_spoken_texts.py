@@ -38,10 +38,9 @@ def _said_in(function: ast.AST) -> Iterator[tuple[Severity, str]]:
         name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
         named = ast.unparse(call.args[0]).removeprefix("Severity.")
         severity = Severity.NOTICE if name == "prompt" else Severity.__members__.get(named)
-        if severity is None or severity > Severity.NOTICE:
-            continue
-        for words in assigned.get(ast.unparse(call.args[1]), [call.args[1]]):
-            yield from ((severity, text) for text in _texts(words) if " " in text.strip())
+        if severity is not None and severity <= Severity.NOTICE:
+            for words in assigned.get(ast.unparse(call.args[1]), [call.args[1]]):
+                yield from ((severity, text) for text in _texts(words) if " " in text.strip())
 
 
 def _texts(words: ast.AST) -> Iterator[str]:
@@ -49,10 +48,9 @@ def _texts(words: ast.AST) -> Iterator[str]:
     if isinstance(words, ast.Call) and ast.unparse(words.func) == "message":
         yield re.sub(r"\{[^}]*\}", FILLED, catalogue()[ast.literal_eval(words.args[0])].text)
         return
-    if (text := template_of(words)) is not None:
-        yield text
+    yield from filter(None, [template_of(words)])
     for part in ast.iter_child_nodes(words):
-        if not isinstance(words, ast.JoinedStr) or isinstance(part, ast.FormattedValue):
+        if not (isinstance(words, ast.JoinedStr) and isinstance(part, ast.Constant)):
             yield from _texts(part)
 
 

@@ -18,7 +18,6 @@ from companion.estimation.means.windows import ImuWindow
 NOISE_RAD_S = 1e-4
 """Noise of a second's mean."""
 STEP_RAD_S = 2e-5
-LONGER = "effect of the write not clear yet: hold still, measuring longer"
 
 
 def calibration() -> ImuCalibration:
@@ -92,9 +91,9 @@ def test_a_step_that_is_not_the_one_written_is_refused_all_the_same() -> None:
 @pytest.mark.parametrize(
     ("problems", "sigma", "looked_s", "words"),
     [
-        (("by chance",), 0.1, 2.0, LONGER),
+        (("by chance",), 0.1, 2.0, "effect of the write not clear yet: hold still, measuring longer"),
         (("by chance",), 0.1, LOOK_S, ""),
-        ((), 0.3, LOOK_S, LONGER),
+        ((), 0.3, LOOK_S, "effect of the write not clear yet: hold still, measuring longer"),
         ((), 0.5, 2.0, ""),
         ((), 0.3, LOOK_LONGER_S + 0.1, ""),
     ],

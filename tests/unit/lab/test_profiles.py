@@ -182,7 +182,7 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gx, gy, gz, ax, ay, az in t_s, gx"),
         ("", [], 1, "the file is empty"),
         (None, [], 1, "No such file"),
-        (None, ["--save", "bmi088"], 1, "that name is the catalogue's"),
+        (None, ["--save", "bmi088"], 1, "found a name of the catalogue"),
         (None, ["--profile", "bmi08"], 2, "did you mean 'bmi088'?"),
         ("short", [], 1, "imu imu: only 28 s at rest; a profile needs 60 s"),
         ("short", ["--imu", "fc"], 1, "imu fc: only 28 s at rest"),
