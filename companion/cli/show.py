@@ -120,9 +120,8 @@ def explained_lines(found: Sequence[tuple[str, messages.Entry]]) -> list[str]:
     for name, entry in found:
         lines += ["", f"{name}: {' | '.join(entry.patterns)}"] if lines else [f"{name}: {' | '.join(entry.patterns)}"]
         lines += [f"  why: {entry.cause}"] if entry.cause else []
-        lines += [
-            f"  {REMEDY}{entry.advice() or ' '.join((messages.KINDS[entry.do], f'(docs/{entry.see})' * bool(entry.see)))}".rstrip()
-        ]
+        what = entry.remedy or messages.KINDS[entry.do]
+        lines.append(f"  {REMEDY}{what}{f' (docs/{entry.see})' if entry.see else ''}")
     return lines
 
 
