@@ -63,8 +63,8 @@ def transmit(data: bytes, setting: Setting, gap_bits: int = 0) -> list[int]:
 def receive(levels: list[int], sent_baud: int, setting: Setting) -> Iterator[Received]:
     """Yield the frames that a receiver finds.
 
-    A low stop bit is taken for the start bit of the next frame, as the 16550 and its many descendants do (NS16550
-    data sheet, line status register, framing error), unless all was low: after such a break it waits for an edge.
+    A low stop bit counts as the start bit of the next frame, as in the 16550 and its many descendants (NS16550 data
+    sheet, line status register, framing error). Where all bits were low, a break, the receiver waits for an edge.
     """
     step = sent_baud / setting.baud  # bits of the line for one of the receiver's
     stop = DATA_BITS + (1 if setting.parity == "none" else 2)

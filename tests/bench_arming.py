@@ -1,8 +1,8 @@
 """Delay of the daemon's answer to a question at arming: idle, busy, and with a crowd at the page.
 
 The daemon is a process of its own with two integer IMUs of a PX4 double, a serial IMU, gradienter and compass, in gate
-mode. Between the two sits a relay that puts MAV_CMD_ARM_AUTHORIZATION_REQUEST into the autopilot's bytes and takes the
-time of the answer from the kernel, so that only the daemon's own delay counts. Beside it, asked at the same instants, a
+mode. A relay between the two puts MAV_CMD_ARM_AUTHORIZATION_REQUEST into the autopilot's bytes. The kernel
+dates the answer, so that only the daemon's own delay counts. Beside it, asked at the same instants, a
 bare asyncio process that echoes: what the machine itself costs.
 """
 

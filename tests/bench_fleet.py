@@ -2,8 +2,8 @@
 
 Each aircraft has a connection of its own and comes with a session: its hello, a calibration and an arming as companions
 send them. Rates are items a second: by the clock, by a core-second of the collector's process, and by one of process
-and database together. Then how long an item takes from being published to being confirmed, two collectors of which one
-is killed every ten seconds, and the pages of a database of five years.
+and database together. Then follow the time from publishing an item to its confirmation, two collectors of which one is
+killed every ten seconds, and the pages of a database of five years.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Memory of the daemon with everything on, after its start and after a calibration.
 
 A process of its own on a live virtual aircraft (devices on pseudo-terminals, the autopilot on UDP), with a real broker,
-a phone at the page, and recording on. Beside it the obvious script with the same devices' libraries. Of the kernel's
-figures RSS is all that is resident, PSS the share of it where other processes use the same pages (libraries), and USS
-what would be free if the process ended.
+a phone at the page, and recording on. Beside it the obvious script with the same devices' libraries. The figures
+are the kernel's: RSS is all that is resident, PSS the share of it where other processes use the same pages (libraries).
+USS is the memory that the end of the process would free.
 """
 
 from __future__ import annotations

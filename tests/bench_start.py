@@ -1,8 +1,8 @@
 """`python -m tests.bench_start`: how fast the daemon is there, what it keeps in memory, and how soon its record is.
 
-Cold start: from starting the process to the kernel having its first HEARTBEAT, on loopback UDP, with everything on that
-can be (an autopilot's IMU, a serial IMU, gradienter and compass on pseudo-terminals, the gate at arming, MQTT, page and
-recording), and with nothing but an autopilot's IMU. Beside it, round by round, so that a busy machine treats all alike:
+Cold start: from starting the process to its first HEARTBEAT in the kernel, on loopback UDP. One case has an autopilot's
+IMU, a serial IMU, gradienter and compass on pseudo-terminals, the gate at arming, MQTT, page and recording. The other
+has nothing but an autopilot's IMU. Beside it, round by round, so that a busy machine treats all alike:
 Python and the libraries by themselves, and the obvious scripts that others would write.
 """
 
@@ -94,7 +94,7 @@ asyncio.run(main())
 """
 
 
-class Bench:
+class StartBench:
     """A folder with ports that say nothing, a broker that does not answer, and a socket that hears heartbeats."""
 
     def __init__(self, folder: Path) -> None:
@@ -172,7 +172,7 @@ class Start(NamedTuple):
     """Wait for a heartbeat; else for the end of the process."""
 
 
-def starts(bench: Bench, folder: Path) -> list[Start]:
+def starts(bench: StartBench, folder: Path) -> list[Start]:
     """All rows of the table; the first is what a start of Python costs."""
     warm, cold = install(folder / "warm"), install(folder / "cold", bytecode=False)
     python = [sys.executable]
@@ -204,7 +204,7 @@ def _has_mavsdk() -> bool:
 def cold_start(rounds: int) -> None:
     """The table of starts."""
     with tempfile.TemporaryDirectory() as text:
-        bench = Bench(Path(text))
+        bench = StartBench(Path(text))
         rows = starts(bench, Path(text))
         wall: dict[str, list[float]] = {row.words: [] for row in rows}
         spent: dict[str, list[float]] = {row.words: [] for row in rows}
@@ -232,7 +232,7 @@ def _verdict(good: bool) -> str:
     return "held" if good else "NOT HELD"
 
 
-def _start(bench: Bench, row: Start) -> tuple[float, float]:
+def _start(bench: StartBench, row: Start) -> tuple[float, float]:
     if row.beats:
         return bench.heartbeat(row.command, row.environment)
     before = os.times()
@@ -250,7 +250,7 @@ def import_costs(rounds: int) -> None:
     """Print the cost of the imports up to the first heartbeat, by package: the least of some rounds for each module."""
     least: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as text:
-        bench = Bench(Path(text))
+        bench = StartBench(Path(text))
         warm, config = install(Path(text) / "warm"), bench.config(FULL)
         for _ in range(rounds):
             _, words = modules_at_first_heartbeat(config, warm)

@@ -2,8 +2,8 @@
 
 It is what `tests.bench_daemon` compares the daemon's processor time with, so it is written as such scripts are, and
 fairly: whole reads instead of single bytes, a CRC in C, no numpy for three numbers, no printing. It does the least of
-what the daemon does: it reads an IMU, a gradienter and a compass, takes a bias off that somebody has given it, carries
-an attitude with a complementary filter, keeps the last message of each kind, and sends the attitude 50 times a second.
+what the daemon does. It reads an IMU, a gradienter and a compass, and subtracts a given bias. A complementary filter
+carries the attitude, which it sends 50 times a second. It keeps the last message of each kind.
 It knows nothing of stillness, calibration, faults, records, people.
 """
 

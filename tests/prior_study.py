@@ -71,7 +71,7 @@ class Case:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class StudyOutcome:
     """Over all trials and axes."""
 
     rms_without: float
@@ -221,7 +221,7 @@ def one_trial(
     return of(found) - truth, of(weighed.imus) - truth, sigma, np.array([foretold, said_by]), weighed
 
 
-def study(case: Case, trials: int, seed: int = 1) -> Outcome:
+def study(case: Case, trials: int, seed: int = 1) -> StudyOutcome:
     """Many trials."""
     random, effect = np.random.default_rng(seed), pose_effect(None)
     without, having, sigmas, ahead, used, doubted = [], [], [], [], 0, 0
@@ -238,7 +238,7 @@ def study(case: Case, trials: int, seed: int = 1) -> Outcome:
     foretold, said_by = np.moveaxis(np.array(ahead), 1, 0)
     told = np.isfinite(foretold)
     foretold, said_by = (each[told] if told.any() else np.array([np.nan]) for each in (foretold, said_by))
-    return Outcome(
+    return StudyOutcome(
         rms_without=float(np.sqrt(np.mean(np.square(without)))),
         rms_with=float(np.sqrt(np.mean(np.square(errors)))),
         coverage=float(np.mean(np.abs(errors) <= 2.0 * np.array(sigmas))),

@@ -162,10 +162,10 @@ class GroundLink:
 
 
 class _Log:
-    """Takes MAVSDK's log, which would go to the terminal otherwise.
+    """Sink for MAVSDK's log, which would go to the terminal otherwise.
 
-    Not by `mavsdk.log_subscribe`: that fails on a text that is not UTF-8, as any component's STATUSTEXT may be (MAVSDK
-    logs them all), and the text then does go to the terminal, with a complaint about itself.
+    `mavsdk.log_subscribe` is no help: it fails on texts that are not UTF-8. Any component's STATUSTEXT may be one, and
+    MAVSDK logs them all. The text would then reach the terminal, with a complaint about itself.
     """
 
     def __init__(self) -> None:

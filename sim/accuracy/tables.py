@@ -49,8 +49,8 @@ def report(
     """Return all sections asked for, by name.
 
     Args:
-        runs: stands with white noise. A fifth of it for every part, a hundredth for every case of a warm-up, a
-            twentieth for every step of noise under integers, a thirty-second for every rate of a ground that turns; a
+        runs: stands with white noise. A fifth of it for every part, a hundredth for every case of a warm-up. A
+            twentieth for every step of noise under integers, a thirty-second for every rate of a ground that turns. A
             tenth of it aircraft turned by hand, a twentieth switched on day after day.
         seed: seed of everything.
         only: some of `cli.SECTIONS`.

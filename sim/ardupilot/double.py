@@ -34,9 +34,9 @@ class ArduPilotDouble(ArduPilotBoard):
     It is an `End` (attach, receive) for the companion; `ground` is a second one for a ground station. `run` sends due
     messages; answers need only the running loop. Time is the loop's clock.
 
-    Not modelled: flight, notches, the learning of a temperature calibration (INS_TCALn_ENABLE = 2), missions,
-    LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, calibrations of accelerometers and of the level, ODOMETRY,
-    SETUP_SIGNING (`require_signatures` stands for it), the 10 s that consistency checks must pass before arming.
+    Not modelled: flight, notches, missions, learning of temperature calibrations (INS_TCALn_ENABLE = 2), calibration of
+    accelerometers and of the level, the 10 s that consistency checks must pass before arming. Nor the messages
+    LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, ODOMETRY, SETUP_SIGNING (`require_signatures` stands for it).
 
     Arguments are those of `ArduPilotBoard`.
     """
@@ -187,8 +187,8 @@ class ArduPilotDouble(ArduPilotBoard):
 class Router:
     """Learns routes from every message, and keeps them until a reboot.
 
-    A message addressed to the vehicle's system and to a component that has been heard only on the sender's own port, or
-    never, is executed by the autopilot itself (autopilots 5.4, rule 1e).
+    The autopilot itself executes a message to a component of its system that was heard on the sender's own port only,
+    or never (autopilots 5.4, rule 1e).
     """
 
     def __init__(self, system_id: int, channels: Sequence[Channel]) -> None:

@@ -21,7 +21,7 @@ NEWEST: Final[Version] = "4.8"
 
 
 def since(version: Version, first: Version) -> bool:
-    """Whether a release has the features of `first`."""
+    """Compare releases: does `version` have what `first` introduced?"""
     return VERSIONS.index(version) >= VERSIONS.index(first)
 
 

@@ -53,7 +53,7 @@ class Channel(abc.ABC):
         return self._transmit is not None
 
     def has_room(self, size: int) -> bool:
-        """Whether so many bytes could be sent now, if the carrier can tell (its `has_room`)."""
+        """Return False where the carrier has a `has_room` that refuses this many bytes."""
         room: Callable[[int], bool] | None = getattr(self._transmit, "has_room", None)
         return room is None or room(size)
 

@@ -258,7 +258,7 @@ class AutopilotDouble(abc.ABC):
             self._timer = loop.call_at(min(due), self._tick)
 
     def _holds_back(self, message_id: int) -> bool:
-        """Whether a fault suppresses this stream."""
+        """Return True where a fault suppresses this stream."""
         return self.faults.heartbeat_off if message_id == HEARTBEAT else self.faults.telemetry_off
 
     def _send_due(self, loop_s: float) -> None:

@@ -41,5 +41,4 @@ class Faults:
 
 
 def names_match(patterns: Iterable[str], name: str) -> bool:
-    """Whether a name matches one of the patterns."""
     return any(fnmatchcase(name, pattern) for pattern in patterns)

@@ -291,7 +291,7 @@ FAULTS: dict[str, tuple[str, Strike]] = {
 
 
 def is_ours(texts: Sequence[str]) -> bool:
-    """Whether the latest text about the source of the heading, if any, names the companion."""
+    """Return False where the latest text about the source of the heading names another one."""
     told = [text for text in texts if text.startswith("Heading: ")]
     return not told or told[-1].startswith("Heading: companion")
 

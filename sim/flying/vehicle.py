@@ -1,8 +1,8 @@
 """A firmware that flies by its own physics, and the aircraft whose truth comes from it.
 
 The firmware's clock runs beside the wall's, a little behind it on a busy machine. Aircraft time is the wall's: states
-are dated at their arrival, smoothed, and rates are the turn of the attitude in that time, so that an IMU on the wall
-clock integrates to the true attitude, however slow the firmware.
+are dated at their arrival and smoothed, and rates are the turn of the attitude in that time. An IMU on the wall clock
+therefore integrates to the true attitude, however slow the firmware.
 """
 
 from __future__ import annotations

@@ -246,7 +246,7 @@ def forward(system_id: int, ports: Sequence[PX4Port], came_by: PX4Port, message:
 
 
 def is_for_us(system_id: int, message: Message, *, broadcast: bool) -> bool:
-    """Whether the target is this autopilot, which obeys nothing else; `broadcast`: or every system."""
+    """Return True for messages to this autopilot and, with `broadcast`, for those to every system."""
     system, component = int(getattr(message, "target_system", 0)), int(getattr(message, "target_component", 0))
     return (system == system_id or (broadcast and system == 0)) and component in (0, COMPONENT)
 

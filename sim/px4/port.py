@@ -101,7 +101,7 @@ class PX4Port(Channel):
         self.streams[HEARTBEAT].next_s = now_s
 
     def has_seen(self, system: int, component: int) -> bool:
-        """Whether a target was heard here; system 0: whether anybody was."""
+        """Return True where a target was heard here; system 0 stands for anybody."""
         if system == 0:
             return bool(self.seen)
         return any(s == system and component in (0, c) for s, c in self.seen)

@@ -1,7 +1,7 @@
 """One IMU of the PX4 double: means over an integration interval, corrected for offset and temperature; its estimator.
 
-A sample is the mean of the sensor over one interval, so its white noise is N / sqrt(interval) and independent of the
-next one's (the real one's outputs at 4 ms: autopilots 9.3.2); rounding inside the sensor adds white noise only.
+A sample is the mean of the sensor over one interval, so its white noise is N / sqrt(interval). It is independent of the
+next sample's (real outputs at 4 ms: autopilots 9.3.2). Rounding inside the sensor adds white noise only.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def ports_free(ports: Iterable[tuple[int, socket.SocketKind]]) -> bool:
 
 
 def unlocked(path: Path) -> bool:
-    """Whether no other process holds a record lock (fcntl, not flock) on a file."""
+    """Return True where no other process holds a record lock (fcntl, not flock) on a file."""
     with contextlib.suppress(OSError):
         descriptor = os.open(path, os.O_RDWR)
         try:

@@ -51,7 +51,7 @@ class NotApplicableError(Exception):
     """There is no such fault here; why."""
 
 
-class Scene:
+class FleetScene:
     """A fleet, its broker and its collectors, with a chance of their own."""
 
     def __init__(self, folder: Path, database: str, server: Postgres | None, chance: random.Random) -> None:
@@ -93,7 +93,7 @@ class Scene:
 # --- what happens
 
 
-async def broker_killed(scene: Scene) -> None:
+async def broker_killed(scene: FleetScene) -> None:
     for _ in range(3):
         await scene.a_while()
         scene.broker.kill()
@@ -102,7 +102,7 @@ async def broker_killed(scene: Scene) -> None:
         await scene.broker.start()
 
 
-async def collector_killed(scene: Scene) -> None:
+async def collector_killed(scene: FleetScene) -> None:
     scene.start()
     for _ in range(3):
         await scene.collectors[0].at_work()
@@ -113,7 +113,7 @@ async def collector_killed(scene: Scene) -> None:
         scene.start()
 
 
-async def database_killed(scene: Scene) -> None:
+async def database_killed(scene: FleetScene) -> None:
     if scene.server is None:
         raise NotApplicableError("a file is not killed")
     for _ in range(2):
@@ -124,7 +124,7 @@ async def database_killed(scene: Scene) -> None:
         scene.server.start()
 
 
-async def disk_full(scene: Scene) -> None:
+async def disk_full(scene: FleetScene) -> None:
     """A file system of a few MB is filled by others, and emptied again."""
     await scene.collectors[0].at_work()
     filler = scene.small_disk / "filler"
@@ -139,12 +139,12 @@ async def disk_full(scene: Scene) -> None:
     filler.unlink()
 
 
-async def clock_wrong(scene: Scene) -> None:
+async def clock_wrong(scene: FleetScene) -> None:
     """Set the clock wrong by a year, either way, from flight to flight."""
     scene.live(10, wrong_by=365.0)
 
 
-async def doubled_and_reordered(scene: Scene) -> None:
+async def doubled_and_reordered(scene: FleetScene) -> None:
     """Replay messages, in any order and repeatedly."""
     async with aiomqtt.Client("127.0.0.1", scene.broker.port) as client:
         for _ in range(4):
@@ -156,7 +156,7 @@ async def doubled_and_reordered(scene: Scene) -> None:
         scene.live(3)
 
 
-async def half_a_year_offline(scene: Scene) -> None:
+async def half_a_year_offline(scene: FleetScene) -> None:
     """A flight a day is kept, and told over a connection that is lost again and again."""
     for _ in range(3):
         await scene.a_while(2.0)
@@ -164,7 +164,7 @@ async def half_a_year_offline(scene: Scene) -> None:
         await scene.broker.start()
 
 
-FAULTS: dict[str, Callable[[Scene], Awaitable[None]]] = {
+FAULTS: dict[str, Callable[[FleetScene], Awaitable[None]]] = {
     strikes.__name__.replace("_", " "): strikes
     for strikes in (
         broker_killed,
@@ -198,7 +198,7 @@ def play(name: str, kind: Kind, seed: int, folder: Path, server: Postgres | None
         elif kind == "postgresql":
             assert server is not None
             database = server.create(f"fleet-{time.monotonic_ns()}")
-        scene = Scene(folder, database, server if kind == "postgresql" else None, chance)
+        scene = FleetScene(folder, database, server if kind == "postgresql" else None, chance)
         scene.small_disk = small
         if name == "half a year offline":
             scene.live(180, days=180.0)
@@ -212,7 +212,7 @@ def play(name: str, kind: Kind, seed: int, folder: Path, server: Postgres | None
     return ""
 
 
-async def _course(scene: Scene, strikes: Callable[[Scene], Awaitable[None]]) -> None:
+async def _course(scene: FleetScene, strikes: Callable[[FleetScene], Awaitable[None]]) -> None:
     async with broker(scene.folder) as scene.broker, _collected(scene), telling(scene.fleet, scene.broker):
         await strikes(scene)
         await until_confirmed(scene.fleet, 300.0)
@@ -222,7 +222,7 @@ async def _course(scene: Scene, strikes: Callable[[Scene], Awaitable[None]]) -> 
 
 
 @contextlib.asynccontextmanager
-async def _collected(scene: Scene) -> AsyncIterator[None]:
+async def _collected(scene: FleetScene) -> AsyncIterator[None]:
     scene.start()
     try:
         yield

@@ -71,8 +71,8 @@ def _pool(variant: str) -> list[Fault]:
 def _make_room_for_names() -> None:
     """Let the interpreter's table of interned names grow now.
 
-    Each path that is made puts its parts there, and when they are gone their places are not free before the table is
-    made anew, twice as large if need be. In the middle of the hour that is a step of 1.9 MiB, once.
+    Each new path puts its parts there. Their places are free again only when the table is made anew, twice as large if
+    need be. In the middle of the hour that is a step of 1.9 MiB, once.
     """
     names = [sys.intern(f"room for a name {k}") for k in range(NAMES)]
     names.clear()

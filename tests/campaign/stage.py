@@ -144,7 +144,7 @@ class Stage(Rig):
         self.disk = Disk(root, self.chance)
         self.wall = WallClock()
         self.mangle: dict[str, Callable[[list[Frame]], bytes]] = {}
-        """By device, a function that changes its frames under way."""
+        """Functions that change the frames of a device under way, by device."""
         self.slow_disk_s = 0.0
         self.offload = self._elsewhere
         self.incarnation = 0

@@ -18,7 +18,7 @@ from companion.estimation.machine import What
 from sim.motions import Turn
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
-from tests.support.witness import Witness
+from tests.support.witness import WriteWitness
 
 Vision = mavlink.MAVLink_vision_position_estimate_message
 Firmware = Literal["ardupilot", "px4"]
@@ -33,7 +33,7 @@ QUICK = {"min_still_s": 3.0, "max_s": 6.0}
 class Flight:
     """A rig with its witness."""
 
-    def __init__(self, rig: Rig, witness: Witness) -> None:
+    def __init__(self, rig: Rig, witness: WriteWitness) -> None:
         self.rig, self.witness = rig, witness
 
     @property
@@ -84,7 +84,7 @@ async def flight(
     parameters = (USES_OURS[firmware] if used else {}) | options.pop("parameters", {})
     options = {"own_imu": True, "feed_s": 0.01, "imu_rate_hz": 20.0, "imus": 1} | QUICK | options
     rig = Rig(folder, firmware=firmware, more=more, parameters=parameters, **options)
-    witness = Witness(rig)
+    witness = WriteWitness(rig)
     async with rig.running():
         await rig.ready()
         flying = Flight(rig, witness)

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.real_clock
 DONE, FAILED, USAGE, NO_DAEMON = 0, 1, 2, 3
 
 
-class Said(NamedTuple):
+class CommandOutput(NamedTuple):
     code: int
     out: str
     err: str
@@ -39,14 +39,14 @@ class Said(NamedTuple):
         return json.loads(self.out)
 
 
-async def companion(*words: str, within_s: float = 150.0) -> Said:
+async def companion(*words: str, within_s: float = 150.0) -> CommandOutput:
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "companion", *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
     async with asyncio.timeout(within_s):
         out, err = await process.communicate()
     assert process.returncode is not None
-    return Said(process.returncode, out.decode(), err.decode())
+    return CommandOutput(process.returncode, out.decode(), err.decode())
 
 
 class FlightLine(NamedTuple):

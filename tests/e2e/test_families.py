@@ -74,7 +74,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FamilyOutcome:
     """Result and truth of one family."""
 
     record: Record
@@ -142,7 +142,7 @@ def calm() -> SavedProfile:
     )
 
 
-async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
+async def carry_out(run: Run, folder: Path, number: int) -> FamilyOutcome:
     """One daemon from its start to a record."""
     aircraft = VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0))
     aircraft.begin(asyncio.get_running_loop().time())
@@ -188,7 +188,7 @@ async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
             record = await _calibrated(service, tasks)
             model = models.gradienter_model(config.gradienter)
             assert model is not None
-            return Outcome(
+            return FamilyOutcome(
                 record,
                 {name: each.true_bias_in_vehicle(aircraft.time_at(now_s())) for name, each in imus.items()},
                 POSE.heading_deg,
@@ -225,7 +225,7 @@ def within(found: Any, truth: Any, sigma: Any, times: float = 4.0) -> None:
 @pytest.mark.real_clock
 @pytest.mark.parametrize("first", range(0, extent(whole=len(RUNS), a_slice=len(plain_runs())), AT_ONCE))
 def test_families_on_ptys_calibrate_right(tmp_path_factory: pytest.TempPathFactory, first: int) -> None:
-    async def main(runs: list[Run]) -> list[Outcome]:
+    async def main(runs: list[Run]) -> list[FamilyOutcome]:
         folders = [tmp_path_factory.mktemp("family") for _ in runs]
         return await asyncio.gather(*map(carry_out, runs, folders, range(first, first + AT_ONCE)))
 
@@ -236,7 +236,7 @@ def test_families_on_ptys_calibrate_right(tmp_path_factory: pytest.TempPathFacto
                 check(outcome, role, name, shared=run.shared)
 
 
-def check(outcome: Outcome, role: str, name: str, *, shared: bool) -> None:
+def check(outcome: FamilyOutcome, role: str, name: str, *, shared: bool) -> None:
     pose = outcome.record.pose
     assert pose is not None
     device = outcome.devices[name if role == "imu" else role]
@@ -255,7 +255,7 @@ def check(outcome: Outcome, role: str, name: str, *, shared: bool) -> None:
         within((pose.psi_deg - outcome.heading_deg + 180.0) % 360.0 - 180.0, 0.0, pose.sigma_deg.psi)
 
 
-def check_imu(imu: ImuRecord, outcome: Outcome) -> None:
+def check_imu(imu: ImuRecord, outcome: FamilyOutcome) -> None:
     """Within its own sigma, which is no larger than what these sensors allow."""
     truth = outcome.truth[imu.name]
     assert imu.gyro_sigma_use_rad_s is not None

@@ -30,7 +30,7 @@ COMMANDS = (CALIBRATE, CANCEL, UNDO)
 
 
 @dataclasses.dataclass
-class Witness:
+class InterleavingWitness:
     """Listens at the companion's end of the wire and knows only MAVLink."""
 
     rig: Rig
@@ -167,7 +167,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         feed_s=0.4,
         version=chance.choice(("4.8", "4.8", "4.5")),
     )
-    witness = Witness(rig)
+    witness = InterleavingWitness(rig)
     start = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
     async with rig.running():
         await rig.ready()

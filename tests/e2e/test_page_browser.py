@@ -41,7 +41,7 @@ WORD = "document.querySelector('#word span').textContent"
 SAID = "(document.querySelector('#said').hidden ? '' : document.querySelector('#said').textContent)"
 
 
-class Scene(NamedTuple):
+class PageScene(NamedTuple):
     line: FlightLine
     tab: Tab
     url: str
@@ -54,7 +54,7 @@ class Scene(NamedTuple):
 @contextlib.asynccontextmanager
 async def scene(
     folder: Path, bind: str, size: tuple[int, int], still_s: tuple[float, float] = (3.0, 4.0)
-) -> AsyncIterator[Scene]:
+) -> AsyncIterator[PageScene]:
     async with (
         flight_line(folder, more=f'[web]\nbind = "{bind}"\n', still_s=still_s) as line,
         chromium(folder / "profile") as browser,
@@ -69,7 +69,7 @@ async def scene(
         tab = await browser.tab()
         await tab.open(url, size)
         await tab.until(f"{WORD} === 'NOT CALIBRATED'")
-        yield Scene(line, tab, url)
+        yield PageScene(line, tab, url)
 
 
 async def pixels_needed(tab: Tab) -> int:
@@ -77,7 +77,7 @@ async def pixels_needed(tab: Tab) -> int:
     return int(await tab.value("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
 
 
-async def read_the_record(here: Scene, record: Record) -> None:
+async def read_the_record(here: PageScene, record: Record) -> None:
     """Bars of the last calibration, and its download."""
     tab = here.tab
     await tab.until("document.querySelectorAll('#records details').length === 1")

@@ -57,7 +57,7 @@ def test_a_part_is_known_by_the_device_type_of_its_firmware(
     assert part_of(firmware, None, device_id(accel, 2)) is None
 
 
-class Found(NamedTuple):
+class FoundPart(NamedTuple):
     """End of a calibration of the gyros, and the message about the profile."""
 
     imu: ImuRecord
@@ -71,9 +71,9 @@ def ids(firmware: str, gyro: int, accel: int) -> dict[str, float]:
     return dict(zip(names, (device_id(gyro), device_id(accel, 2)), strict=True))
 
 
-def gyros(folder: Path, profile: str | NoiseProfile | None, *, compass: bool = True, **rig: Any) -> Found:
+def gyros(folder: Path, profile: str | NoiseProfile | None, *, compass: bool = True, **rig: Any) -> FoundPart:
     """One calibration of a BMI088's gyros, with this in the configuration."""
-    found: list[Found] = []
+    found: list[FoundPart] = []
 
     async def main() -> None:
         # Nothing is written: the double's own gyro calibration would put its own device id back.
@@ -89,13 +89,13 @@ def gyros(folder: Path, profile: str | NoiseProfile | None, *, compass: bool = T
             assert result.outcome == "done", result
             (shown,) = running.service.status()["profiles"]
             warnings = (*record.warnings, *record.imus[0].warnings)
-            found.append(Found(record.imus[0], warnings, shown["summary"], shown["by_device_id"]))
+            found.append(FoundPart(record.imus[0], warnings, shown["summary"], shown["by_device_id"]))
 
     run_virtual(main())
     return found[0]
 
 
-def sigma_deg_h(found: Found) -> float:
+def sigma_deg_h(found: FoundPart) -> float:
     assert found.imu.gyro_sigma_use_rad_s is not None
     return float(np.max(found.imu.gyro_sigma_use_rad_s)) / DEG_H
 

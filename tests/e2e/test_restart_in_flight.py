@@ -44,7 +44,7 @@ def worst_deg(flying: Flight, since_s: float) -> float:
 
 
 def begun(flying: Flight, since_s: float) -> list[str]:
-    """Everything that the new daemon started besides reading."""
+    """List what the new daemon started besides reading."""
     return [
         message.get_type()
         for t_s, message in flying.witness.heard

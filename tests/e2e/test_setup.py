@@ -38,7 +38,7 @@ def free_udp() -> int:
         return int(one.getsockname()[1])
 
 
-class Bench:
+class SetupBench:
     """Simulated devices on ports below a folder, an autopilot, and how to call the command."""
 
     def __init__(self, folder: Path) -> None:
@@ -68,9 +68,9 @@ async def bench(
     on_wire: bool = False,
     parameters: Mapping[str, float] = MappingProxyType({}),
     answers_after_s: float = 0.0,
-) -> AsyncIterator[Bench]:
+) -> AsyncIterator[SetupBench]:
     """The demonstration's aircraft: devices as from the factory, the autopilot on UDP or on a serial port."""
-    made, scenario = Bench(folder), demo(firmware=firmware)
+    made, scenario = SetupBench(folder), demo(firmware=firmware)
     loop = asyncio.get_running_loop()
     scenario.aircraft.begin(loop.time())
     autopilot, receive = scenario.autopilot, scenario.autopilot.receive
@@ -132,7 +132,7 @@ async def answered(terminal: Terminal, *answers: str) -> None:
         await terminal.answer(question, words)
 
 
-async def by_script(made: Bench, *words: str) -> tuple[int, Any, str]:
+async def by_script(made: SetupBench, *words: str) -> tuple[int, Any, str]:
     """Exit code, the JSON object, and what people are told."""
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "companion", *words, "--yes", "--json",
@@ -294,7 +294,7 @@ def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> 
 )
 def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[str], reason: str) -> None:
     async def main() -> None:
-        made = Bench(tmp_path)
+        made = SetupBench(tmp_path)
         code, _, told = await by_script(made, *made.words("nobody"), *words)
         assert code in (1, 2)
         assert reason in told.splitlines()[-1]
@@ -338,7 +338,7 @@ def test_the_service_is_started_with_it(
 
 def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:
     async def main() -> None:
-        made = Bench(tmp_path)
+        made = SetupBench(tmp_path)
         made.file.write_text("[mavlnk]\n")
         code, _, told = await by_script(made, *made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550")
         assert code == 2

@@ -56,7 +56,7 @@ class Network:
 
 
 @dataclasses.dataclass
-class Stage:
+class TwoVehicleStage:
     """Our aircraft with its rig, and another one that flies with other biases at another attitude."""
 
     rig: Rig
@@ -77,7 +77,7 @@ class Stage:
 @contextlib.asynccontextmanager
 async def stage(
     folder: Path, ours: Firmware, others: Firmware, *, own_id: int, configured: bool, late: bool
-) -> AsyncIterator[Stage]:
+) -> AsyncIterator[TwoVehicleStage]:
     more = f"[vehicle]\nsystem_id = {own_id}" if configured else ""
     rig = Rig(folder, firmware=ours, system_id=own_id, max_s=12.0, more=more)
     aircraft = VirtualAircraft(Pose(-20.0, 35.0, 200.0), rig.site)
@@ -93,7 +93,7 @@ async def stage(
     rig.wire.unplug()
     network = Network(rig.autopilot)
     rig.wire = Wire(rig.link, network)
-    it = Stage(rig, other, network)
+    it = TwoVehicleStage(rig, other, network)
     real_send = rig.link.send
 
     def send(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:

@@ -136,7 +136,6 @@ async def installed(machine: Machine, configuration: str) -> None:
 
 
 async def good(machine: Machine) -> bool:
-    """Whether every source is received."""
     status = (await machine.show("companion", "StatusText"))["StatusText"]
     return "ArduPilot" in status and "fc, own, gradienter, compass good" in status
 

@@ -27,14 +27,14 @@ _STYLE: Final = (
 )
 
 
-class Line(NamedTuple):
+class TerminalLine(NamedTuple):
     """A printed line and its time."""
 
     t_s: float
     text: str
 
 
-async def recorded(*words: str) -> list[Line]:
+async def recorded(*words: str) -> list[TerminalLine]:
     """Run `python -m WORDS` and take down what it prints.
 
     Raises:
@@ -46,32 +46,34 @@ async def recorded(*words: str) -> list[Line]:
     )  # fmt: skip
     assert process.stdout is not None
     loop = asyncio.get_running_loop()
-    lines = [Line(loop.time(), line.decode().rstrip("\n")) async for line in process.stdout]
+    lines = [TerminalLine(loop.time(), line.decode().rstrip("\n")) async for line in process.stdout]
     if code := await process.wait():
         raise RuntimeError(f"{' '.join(words)} ended with {code}: {lines[-1].text if lines else 'without a word'}")
     return lines
 
 
-def shortened(lines: Sequence[Line]) -> list[Line]:
+def shortened(lines: Sequence[TerminalLine]) -> list[TerminalLine]:
     """Shorten long pauses; start at 0."""
     now_s, before_s, found = 0.0, lines[0].t_s, []
     for line in lines:
         now_s += min(line.t_s - before_s, LONGEST_PAUSE_S)
         before_s = line.t_s
-        found.append(Line(now_s, line.text))
+        found.append(TerminalLine(now_s, line.text))
     return found
 
 
-def wrapped(lines: Sequence[Line]) -> list[Line]:
+def wrapped(lines: Sequence[TerminalLine]) -> list[TerminalLine]:
     """Wrap the lines at the width of the terminal."""
     return [
-        Line(line.t_s, line.text[at : at + COLUMNS]) for line in lines for at in range(0, len(line.text) or 1, COLUMNS)
+        TerminalLine(line.t_s, line.text[at : at + COLUMNS])
+        for line in lines
+        for at in range(0, len(line.text) or 1, COLUMNS)
     ]
 
 
-def svg(command: str, lines: Sequence[Line]) -> str:
+def svg(command: str, lines: Sequence[TerminalLine]) -> str:
     """The picture: the command at a prompt, then the lines."""
-    shown = [Line(0.0, f"$ {command}"), *wrapped(shortened(lines))]
+    shown = [TerminalLine(0.0, f"$ {command}"), *wrapped(shortened(lines))]
     total_s = shown[-1].t_s + END_S
     width, height = COLUMNS * CHARACTER_PX + 2 * MARGIN_PX, ROWS * LINE_PX + 2 * MARGIN_PX
     covered, scrolled = [], []

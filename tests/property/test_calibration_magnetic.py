@@ -25,7 +25,7 @@ TILT_SIGMA_DEG = 0.05
 NOISE_GAUSS = 0.0002
 
 
-class Drawn:
+class DrawnField:
     """One draw of pose, disturbance and errors of the sensors, and what came of it."""
 
     def __init__(
@@ -98,7 +98,7 @@ def test_the_bound_covers_the_true_error_of_19_in_20_disturbances(place: str, gr
     random = np.random.default_rng([7, len(place), ground])
     mounting = about(2, 0.7) @ about(1, 0.1)
     draws = [
-        Drawn(place, random, random.uniform(0.0, 0.05), at.compass(mounting=mounting), ground=ground)
+        DrawnField(place, random, random.uniform(0.0, 0.05), at.compass(mounting=mounting), ground=ground)
         for _ in range(400)
     ]
     covered = np.mean([draw.error_deg <= draw.bound_deg for draw in draws])
@@ -117,7 +117,7 @@ def test_the_bound_covers_the_true_error_of_19_in_20_disturbances(place: str, gr
 )
 def test_a_clean_field_and_a_good_magnetometer_are_good_to_two_degrees(place: str, most_deg: float) -> None:
     random = np.random.default_rng([8, len(place)])
-    draws = [Drawn(place, random, 0.0, at.compass()) for _ in range(30)]
+    draws = [DrawnField(place, random, 0.0, at.compass()) for _ in range(30)]
     assert max(draw.bound_deg for draw in draws) < most_deg
     assert all(draw.error_deg < draw.bound_deg for draw in draws)
     assert all(not draw.solution.warnings for draw in draws), draws[0].solution.warnings
@@ -125,9 +125,9 @@ def test_a_clean_field_and_a_good_magnetometer_are_good_to_two_degrees(place: st
 
 def test_counts_without_a_unit_bound_by_their_direction_alone() -> None:
     random = np.random.default_rng(9)
-    draws = [Drawn("Beijing", random, random.uniform(0.0, 0.05), at.compass(), unit="counts") for _ in range(400)]
+    draws = [DrawnField("Beijing", random, random.uniform(0.0, 0.05), at.compass(), unit="counts") for _ in range(400)]
     assert np.mean([draw.error_deg <= draw.bound_deg for draw in draws]) >= 0.95
-    clean = Drawn("Beijing", random, 0.0, at.compass(), unit="counts").solution
+    clean = DrawnField("Beijing", random, 0.0, at.compass(), unit="counts").solution
     assert clean.magnetic is not None
     assert clean.magnetic.field_gauss is None
     assert clean.magnetic.inclination_deg == pytest.approx(clean.magnetic.inclination_expected_deg, abs=0.3)
@@ -166,7 +166,7 @@ def test_a_phone_in_the_method_raises_the_warning_that_a_norm_gate_does_not() ->
 
 def test_near_the_magnetic_pole_it_is_said_that_a_compass_shows_little_and_at_it_nothing() -> None:
     random = np.random.default_rng(10)
-    draws = [Drawn("Resolute", random, random.uniform(0.0, 0.05), at.compass()) for _ in range(300)]
+    draws = [DrawnField("Resolute", random, random.uniform(0.0, 0.05), at.compass()) for _ in range(300)]
     assert np.mean([draw.error_deg <= draw.bound_deg for draw in draws]) >= 0.95
     said = "exact heading unknown: gyro sigma widened (near the magnetic pole)"
     assert all(said in draw.solution.warnings for draw in draws)

@@ -26,7 +26,7 @@ from tests.support.component import (
     IN_PROGRESS,
     PREFLIGHT,
     UNDO,
-    Bench,
+    ComponentBench,
     Ground,
     bench,
     command_message,
@@ -53,7 +53,7 @@ def acks_in(raw: list[bytes]) -> list[Ack]:
     return found
 
 
-def tap(b: Bench) -> list[bytes]:
+def tap(b: ComponentBench) -> list[bytes]:
     """Messages of the component before the wire loses or doubles them."""
     sent: list[bytes] = []
     transmit = b.link._transmit
@@ -67,7 +67,7 @@ def tap(b: Bench) -> list[bytes]:
     return sent
 
 
-def watch_starts(b: Bench) -> list[str]:
+def watch_starts(b: ComponentBench) -> list[str]:
     """Jobs that were started by a packet that should not have started one: a copy, or an answered retransmission."""
     wrong: list[str] = []
     last_final_s: dict[Key, float] = {}
@@ -99,7 +99,7 @@ def watch_starts(b: Bench) -> list[str]:
     return wrong
 
 
-async def play_service(b: Bench, dice: random.Random) -> None:
+async def play_service(b: ComponentBench, dice: random.Random) -> None:
     """Jobs that end in every way and at any time, and refusals in between."""
     while True:
         await asyncio.sleep(dice.choice((0.0, 0.05, 0.3, 1.0, 2.5)))
@@ -148,7 +148,7 @@ class Press(NamedTuple):
     gave_up: bool
 
 
-async def press(b: Bench, sender: Ground, command: int, dice: random.Random) -> Press:
+async def press(b: ComponentBench, sender: Ground, command: int, dice: random.Random) -> Press:
     """A ground station by the protocol's book: retransmit on silence, stop at the first final result."""
     key = (sender.system_id, sender.component_id, command)
     results: list[int] = []

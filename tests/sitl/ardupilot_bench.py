@@ -41,7 +41,7 @@ ACCEL_LIMIT_MG = 0.2
 
 
 @dataclass
-class Bench:
+class ArduPilotBench:
     """A binary with a ground station, a link that can be spoilt, and what the firmware listed at the start."""
 
     vehicle: ArduPilotSitl
@@ -79,7 +79,7 @@ class Bench:
 
 
 @contextlib.asynccontextmanager
-async def bench(tmp_path: Path, *, gyr_cal: bool = False, script: bool = False) -> AsyncIterator[Bench]:
+async def bench(tmp_path: Path, *, gyr_cal: bool = False, script: bool = False) -> AsyncIterator[ArduPilotBench]:
     reason = missing("ardupilot-sitl")
     if reason is not None:
         pytest.skip(reason)
@@ -93,7 +93,7 @@ async def bench(tmp_path: Path, *, gyr_cal: bool = False, script: bool = False) 
         async with vehicle, ground_station(vehicle) as ground:
             await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")
             await asyncio.sleep(SETTLE_S)
-            result = Bench(vehicle, ground, link, tmp_path / "daemon")
+            result = ArduPilotBench(vehicle, ground, link, tmp_path / "daemon")
             result.before = await ground.whole_list()
             yield result
 

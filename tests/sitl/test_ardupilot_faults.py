@@ -21,7 +21,7 @@ from tests.sitl.ardupilot_bench import (
     GYRO_LIMIT_DEG_H,
     OUR_ACCELS,
     OUR_GYROS,
-    Bench,
+    ArduPilotBench,
     asks_for_ahrs,
     assert_as_recorded,
     bench,
@@ -39,33 +39,33 @@ PHASE_WITHIN_S = 120.0
 
 # --- phases of a calibration, in order; each waits until it has come
 
-Phase = Callable[[Bench, CompanionProcess], Awaitable[None]]
+Phase = Callable[[ArduPilotBench, CompanionProcess], Awaitable[None]]
 
 
-async def measuring(bench: Bench, daemon: CompanionProcess) -> None:
+async def measuring(bench: ArduPilotBench, daemon: CompanionProcess) -> None:
     await until_status(daemon, lambda s: s["still_s"] > 3 and s["progress"] is not None)
 
 
-async def writing(bench: Bench, daemon: CompanionProcess) -> None:
+async def writing(bench: ArduPilotBench, daemon: CompanionProcess) -> None:
     await bench.link.sent(sets(*OUR_GYROS, *OUR_ACCELS))
 
 
-async def firmware_calibrating(bench: Bench, daemon: CompanionProcess) -> None:
+async def firmware_calibrating(bench: ArduPilotBench, daemon: CompanionProcess) -> None:
     await bench.link.sent(calibrates)
     await asyncio.sleep(0.1)
 
 
-async def writing_fine_offsets(bench: Bench, daemon: CompanionProcess) -> None:
+async def writing_fine_offsets(bench: ArduPilotBench, daemon: CompanionProcess) -> None:
     await bench.link.sent(calibrates)
     await bench.link.sent(sets(*OUR_GYROS))
 
 
-async def verifying(bench: Bench, daemon: CompanionProcess) -> None:
+async def verifying(bench: ArduPilotBench, daemon: CompanionProcess) -> None:
     await writing_fine_offsets(bench, daemon)
     await asyncio.sleep(2.5)
 
 
-async def settling(bench: Bench, daemon: CompanionProcess) -> None:
+async def settling(bench: ArduPilotBench, daemon: CompanionProcess) -> None:
     await writing_fine_offsets(bench, daemon)
     await bench.link.sent(asks_for_ahrs)
     await asyncio.sleep(0.5)
@@ -129,7 +129,7 @@ def test_a_restart_of_the_autopilot_leaves_new_values_or_old_ones(tmp_path: Path
     asyncio.run(main())
 
 
-def _true_accels(b: Bench) -> dict[str, float]:
+def _true_accels(b: ArduPilotBench) -> dict[str, float]:
     return dict(zip(OUR_ACCELS, b.vehicle.true_bias(1, b.vehicle.now_s).accel_m_s2.tolist(), strict=True))
 
 

@@ -38,7 +38,7 @@ FOLLOWS_DEG = 3.0
 Kind = Literal["ardupilot-sitl", "px4-sitl"]
 
 
-class Bench:
+class AttitudeBench:
     """A binary, the daemon with the serial IMU and a compass that lies, and a ground station."""
 
     def __init__(self, vehicle: SitlVehicle, ground: GroundStation, daemon: CompanionProcess) -> None:
@@ -129,7 +129,7 @@ class Bench:
 
 
 @contextlib.asynccontextmanager
-async def bench(kind: Kind, folder: Path, **options: Any) -> AsyncIterator[Bench]:
+async def bench(kind: Kind, folder: Path, **options: Any) -> AsyncIterator[AttitudeBench]:
     """Everything running, nothing calibrated."""
     reason = missing(kind)
     if reason is not None:
@@ -146,7 +146,7 @@ async def bench(kind: Kind, folder: Path, **options: Any) -> AsyncIterator[Bench
         await vehicle.sleep(25.0)
         async with devices(vehicle.scenario, daemon_folder), CompanionProcess(daemon_folder) as daemon:
             await daemon.ready(READY_WITHIN_S)
-            yield Bench(vehicle, ground, daemon)
+            yield AttitudeBench(vehicle, ground, daemon)
 
 
 def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("script", [True, False], ids=["script", "command"])
 def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, script: bool) -> None:
-    """By the script within a second, even after kill -9; without one, by the companion's own request."""
+    """The script does it within a second, even after kill -9; without a script the companion asks for it."""
 
     async def main() -> None:
         if script:

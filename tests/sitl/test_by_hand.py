@@ -51,7 +51,7 @@ class Accelerometer(NamedTuple):
     scale_percent: Array
 
 
-class Bench:
+class ByHandBench:
     """One firmware, hands that hold its aircraft, and a ground station that judges its telemetry by the truth."""
 
     def __init__(self, vehicle: SitlVehicle, ground: GroundStation, folder: Path) -> None:
@@ -126,7 +126,7 @@ def test_a_bare_board_is_right_after_stands_by_hand_and_as_it_was_after_undo(kin
         vehicle = Px4Sitl(*what) if kind == "px4-sitl" else ArduPilotSitl(*what)
         async with vehicle, ground_station(vehicle) as ground:
             await vehicle.sleep(SETTLE_S)
-            bench = Bench(vehicle, ground, tmp_path)
+            bench = ByHandBench(vehicle, ground, tmp_path)
             before, level = await bench.values(NAMES[kind]), await bench.values(TRIM[kind])
             await bench.type("setup", "--yes", "--udp", vehicle.url.rsplit(":", 1)[1])
             async with bench.companion as daemon:

@@ -85,7 +85,7 @@ def _estimate(_message: mavlink.MAVLink_message, _t_s: float) -> None:
 
 
 @dataclass
-class Stage:
+class ArmedWriteStage:
     """One run: the autopilot at its end of the wire, and the witness."""
 
     chance: random.Random
@@ -150,7 +150,7 @@ class Stage:
                 self.socket.sendto(data, self._peer)
 
 
-async def starve(stage: Stage, seconds: float, share: float) -> None:
+async def starve(stage: ArmedWriteStage, seconds: float, share: float) -> None:
     """Let the child run for 5 to 20 ms at a time, and no more than `share` of the time."""
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
@@ -162,7 +162,7 @@ async def starve(stage: Stage, seconds: float, share: float) -> None:
     os.kill(stage.child, signal.SIGCONT)
 
 
-async def some_write(stage: Stage, within_s: float = 120.0) -> None:
+async def some_write(stage: ArmedWriteStage, within_s: float = 120.0) -> None:
     """Wait until the child is in the middle of its writes, at a random one."""
     seen = asyncio.Event()
     left = stage.chance.randint(7, 18)
@@ -179,7 +179,7 @@ async def some_write(stage: Stage, within_s: float = 120.0) -> None:
     stage.on_set = lambda: None
 
 
-async def starved(stage: Stage) -> None:
+async def starved(stage: ArmedWriteStage) -> None:
     """Arm while the child has 3 % of the processor."""
     await some_write(stage)
     starving = asyncio.create_task(starve(stage, 12.0, 0.03))
@@ -188,9 +188,9 @@ async def starved(stage: Stage) -> None:
     await starving
 
 
-async def run(seed: int) -> Stage:
+async def run(seed: int) -> ArmedWriteStage:
     """Starve a writing child to 3 % of the processor, and arm in the middle."""
-    stage = Stage(random.Random(seed))
+    stage = ArmedWriteStage(random.Random(seed))
     stage.open()
     flying = asyncio.create_task(stage.double.run())
     child = await asyncio.create_subprocess_exec(

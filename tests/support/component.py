@@ -187,7 +187,7 @@ class ScriptedGate:
         return self.says
 
 
-class Bench(NamedTuple):
+class ComponentBench(NamedTuple):
     link: MavlinkLink
     component: MavlinkComponent
     service: ScriptedService
@@ -208,7 +208,7 @@ async def bench(
     ground: Ground | None = None,
     parameters: Sequence[Parameter] = (),
     allow: Sequence[str] = EVERYBODY,
-) -> AsyncIterator[Bench]:
+) -> AsyncIterator[ComponentBench]:
     """The component running at one end of a wire."""
     link, ground = MavlinkLink(), ground or Ground()
     service, gate = ScriptedService(), ScriptedGate()
@@ -220,7 +220,7 @@ async def bench(
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
     task = asyncio.create_task(component.run())
     try:
-        yield Bench(link, component, service, ground, wire, task, gate, texts)
+        yield ComponentBench(link, component, service, ground, wire, task, gate, texts)
     finally:
         task.cancel()
         with suppress(asyncio.CancelledError):

@@ -1,8 +1,8 @@
 """Every line that the companion's code can say to people, as templates: read from the source, not from a run.
 
-A template is a text of the program in which each value that is filled in is one `FILLED`. What counts is every text of
-at least two words, and whatever is handed to one of the functions that speak (`SPEAKERS`), save what `NOT_FOR_PEOPLE`
-and the rooms in `ELSEWHERE` take out. A new message is therefore found without being registered anywhere.
+A template is a text of the program in which each value that is filled in is one `FILLED`. Every text of at
+least two words counts, and every argument of the functions in `SPEAKERS`. `NOT_FOR_PEOPLE` and `ELSEWHERE` name the
+exceptions. A new message is therefore found without being registered anywhere.
 """
 
 from __future__ import annotations
@@ -94,17 +94,17 @@ class Message:
         return re.compile(".*?".join(map(re.escape, self._parts)))
 
     def is_in(self, line: str) -> bool:
-        """Whether a line shows this message, with any values."""
+        """Return True where a line shows this message, with any values."""
         # Most lines lack most parts: finding that out first is 20 times as fast.
         return all(part in line for part in self._parts) and self._pattern.search(line) is not None
 
     def has(self, words: str) -> bool:
-        """Whether this message contains words of a document, in which … is a wildcard."""
+        """Return True where this message contains words of a document, in which … is a wildcard."""
         parts, shown = [part.strip() for part in words.split("…")], self.shown()
         return all(part in shown for part in parts) and re.search(".*?".join(map(re.escape, parts)), shown) is not None
 
     def explains_itself(self) -> bool:
-        """Whether the text names a remedy, the allowed values or the action, so that it needs no row."""
+        """Return True where the text names a remedy, the allowed values or the action, so that it needs no row."""
         return _REMEDY.search(self.template) is not None or _PROGRESS.match(self.template) is not None
 
     def shown(self) -> str:

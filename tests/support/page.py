@@ -145,7 +145,7 @@ class Viewer:
         return hello
 
     async def is_ended(self) -> bool:
-        """Whether the other side closes the connection, after any rest of its output."""
+        """Wait for the other side to close the connection, after any rest of its output."""
         with contextlib.suppress(ConnectionError):
             async with asyncio.timeout(30.0):
                 await self.reader.read()

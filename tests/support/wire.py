@@ -59,7 +59,7 @@ class Wire:
         self._carry(data, self._ends[0])
 
     def has_room(self, size: int, to: End) -> bool:
-        """Whether so many bytes fit into the buffer of the sender's UART."""
+        """Return True where so many bytes fit into the buffer of the sender's UART."""
         loop = asyncio.get_running_loop()
         return self._free_s.get(id(to), 0.0) - loop.time() + size / self.bytes_per_s <= BUFFER_BYTES / self.bytes_per_s
 

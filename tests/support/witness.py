@@ -11,7 +11,7 @@ from tests.support.rig import Rig
 M = TypeVar("M", bound=mavlink.MAVLink_message)
 
 
-class Witness:
+class WriteWitness:
     """Stands before a rig's autopilot and keeps what comes; make it before the rig runs."""
 
     def __init__(self, rig: Rig) -> None:

@@ -66,8 +66,8 @@ MAX_GYRO_RESIDUAL_RAD_S: Final = 5.0 * DEG
 deg/s between two gyros for a fault ("Gyros inconsistent"), and current MEMS gyros start within 1 deg/s."""
 
 MAX_ACCEL_RESIDUAL_M_S2: Final = 1.0
-"""The worst accelerometers still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis), ArduPilot refuses
-to arm at 0.75 m/s^2 between two accelerometers, and a wrong mounting or gradienter law soon exceeds it."""
+"""The worst accelerometers still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis). ArduPilot refuses
+to arm at 0.75 m/s^2 between two accelerometers. A wrong mounting or gradienter law soon exceeds the limit."""
 
 MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG  # the loosest zero-rate specification still flown (MPU-6000)
 

@@ -37,8 +37,8 @@ def vision_position_estimate(
 ) -> mavlink.MAVLink_vision_position_estimate_message:
     """Attitude in NED against true north, and no position.
 
-    ArduPilot throws the whole message away for a position that is not a number, and takes the root of the sum of all
-    three angles' variances for the sigma of yaw, so roll's and pitch's are left out. PX4 must not be given a position.
+    ArduPilot discards the whole message where the position is not a number. Its sigma of yaw is the root of the sum of
+    all three angles' variances, so those of roll and pitch are left out. PX4 must not be given a position.
     """
     sigma_roll, sigma_pitch, sigma_yaw = attitude.sigma_rad
     covariance = [0.0] * 21

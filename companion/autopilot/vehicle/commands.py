@@ -45,7 +45,7 @@ class Commands:
         self._queues: dict[int, deque[_Request]] = {}
         self._in_flight: dict[int, _Request] = {}
         self._timers: dict[int, asyncio.TimerHandle] = {}
-        """By command that is in flight, or was refused just now."""
+        """End of each request in flight, or of the pause after a refusal; by command."""
         self._last_ack = (0, 0, 0, -math.inf)
         link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 

@@ -1,7 +1,7 @@
 """The autopilot's own estimator: its gyro biases, its attitude (ATTITUDE, #30), and whether its yaw is a heading.
 
-ArduPilot tells its gyro biases in AHRS (#163): omegaI is minus the estimate. After a step in the offsets EKF3 goes on
-with its old estimate, is wrong by minus the step, and turns the heading by that times 17 to 25 s before it has learned
+ArduPilot tells its gyro biases in AHRS (#163): omegaI is minus the estimate. After a step in the offsets EKF3 keeps its
+old estimate, which is now wrong by minus the step. The heading turns by that times 17 to 25 s before EKF3 has learned
 (autopilots 1.7, 9.3.1). With right offsets nothing is left to estimate, so omegaI shows how far it is from settled.
 
 No message gives a sigma of the yaw. It is a heading while the autopilot has a healthy magnetometer (SYS_STATUS) and

@@ -1,9 +1,9 @@
 """ArduPilot's own gyro calibration, by command, for what only it can do: reset the EKF's gyro bias (autopilots 1.7).
 
-It also (autopilots 1.5, 3, 9.3.1) measures the gyros of all instances to some 10 deg/h with the Earth's rotation in
-them, writes their offsets, calibration temperatures and device ids, and sets to zero what belongs to no gyro. It is
-answered at its end, after 0.5 to 30 s; while it runs the offsets read zero. A second command meanwhile is answered
-early, as if all were done: so the command leaves once, and its end shows in the offsets.
+It also (autopilots 1.5, 3, 9.3.1) measures the gyros of all instances to some 10 deg/h, the Earth's rotation included.
+It writes their offsets, calibration temperatures and device ids, and zeros the values of absent gyros. The answer comes
+at its end, after 0.5 to 30 s; while it runs the offsets read zero. A second command meanwhile is answered early,
+as if all were done. So the command is sent once, and the offsets show its end.
 """
 
 from __future__ import annotations

@@ -138,8 +138,8 @@ def as_good(
 ) -> frozenset[Triad]:
     """Find the triads whose offsets are as good as new ones, so that a write would only add noise.
 
-    They are as good where the last calibration wrote them, and the residual is within the errors of both estimates or
-    adds little to what the next minutes do to old and new offsets alike.
+    Two conditions hold for them: the last calibration wrote them, and the residual is small. Small means within the
+    errors of both estimates, or little beside what the next minutes do to old and new offsets alike.
     """
     if before is None:
         return frozenset()

@@ -5,9 +5,9 @@ is gravity: what waves do to it comes and goes (`waves`), so a level that drifts
 The compass does the same for the vertical one. Everything is linear in what is unknown once the attitude is near, so it
 is weighted least squares, repeated until it is: that gives for constants what a Kalman smoother gives.
 
-Unknown: the attitude at the start (3), the gyro bias (3), what the accelerometers' bias is still believed to be wrong
-by (3), how the compass' error changes with the heading (2: sine and cosine, as iron carried along makes it), and where
-it is plain to see a ramp of the gyro bias (3). The Earth's rotation is taken off later, where the latitude is known;
+Unknown: the attitude at the start (3), the gyro bias (3) and the error of the accelerometers' bias (3). Also the sine
+and cosine of the heading in the compass' error (2): iron carried along makes them. And a ramp of the gyro bias where
+one is plain to see (3). The Earth's rotation is taken off later, where the latitude is known;
 `by_earth` says what it has done to the bias.
 """
 

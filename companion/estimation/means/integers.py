@@ -4,7 +4,7 @@ A truncated stream shows n for every value of [n, n + 1) LSB, -n for (-n - 1, -n
 of the integers is off by up to half a step, and by up to a whole one around zero, however long it is averaged; the
 share of every integer still shows mean and sigma of the Gaussian noise underneath (autopilots 9.3.1 "Integer
 messages": 102 deg/h against 3.5). The log-likelihood of grouped normal data is concave in h = 1 / sigma and
-a = mean / sigma (Burridge, Biometrika 68 (1981) 41-45), so scoring with shortened steps finds the one maximum.
+a = mean / sigma (Burridge, Biometrika 68 (1981) 41-45). Scoring with shortened steps therefore finds the one maximum.
 
 The fit uses the counts of all good seconds together. The influence of each integer on the fitted mean then turns the
 counts of one second into the mean of that second, to first order. Robust means, ramps and Allan deviations work on
@@ -30,8 +30,8 @@ Integers = NDArray[np.int64]
 MIN_BEYOND_TWO: Final = 5.0
 """Readings that must lie outside the two commonest integers for both mean and sigma to be known. With two integers
 alone every sigma has a mean that fits. Simulated over 0.2 to 0.5 LSB, means of -2 to 2 and a minute: with five or more
-the error is within 15 deg/h and its rms 0.93 to 1.05 of the stated one, also where a 20 Hz filter makes readings of
-250 Hz come in clumps; with one to four it is 0.9 to 1.3 of it, and up to 17 deg/h."""
+the error is within 15 deg/h and its rms 0.93 to 1.05 of the stated one. That holds behind a 20 Hz filter, too, which
+makes readings of 250 Hz come in clumps. With one to four the rms is 0.9 to 1.3 of it, the error up to 17 deg/h."""
 EDGE_RMS: Final = 0.05
 """LSB by which the integers' edges may be displaced unseen: by a sensor's own steps (2000 deg/s in 16 bits are 1.07
 mrad/s), by a filter and by noise that is not quite Gaussian."""

@@ -9,8 +9,8 @@ A line's slope may be a warm-up, whose end counts, or chance and the part's own 
 line costs more than it saves: its end has four times the variance of a mean, and a part that wanders comes back. So a
 slope must exceed what white noise makes and what the flicker and walk of the part make.
 
-The slope of a turn (`fit_slope`) is uncertain by the white noise of the seconds, by slow wander, which the Allan
-deviation of the readings shows, and by coarse steps, which may hide a slope (method 2.6).
+The slope of a turn (`fit_slope`) has three uncertainties (method 2.6): the white noise of the seconds; slow wander,
+known from the Allan deviation of the readings; coarse steps, which may hide a slope.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from companion.physics.statistics import MAD_TO_SIGMA, student_quantile
 
 HUBER_C: Final = 1.345
 BIWEIGHT_C: Final = 6.0
-"""Scales beyond which a value does not count at all in `robust_mean`. Simulated, 60 values: 2.2 % of variance is lost
-on clean data (Huber's mean alone 5 %), and a knock in 5 % of them costs 4 % of sigma instead of 26 %."""
+"""Scales beyond which a value does not count at all in `robust_mean`. Simulated, 60 values: clean data lose
+2.2 % of variance (with Huber's mean alone 5 %). A knock in 5 % of the values costs 4 % of sigma instead of 26 %."""
 _MEAN_ABS_TO_SIGMA: Final = 1.2533
 _EQUAL: Final = 1e-6
 _ROUNDS: Final = 30

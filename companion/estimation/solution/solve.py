@@ -1,8 +1,8 @@
 """Estimates biases with covariances from the averages of one still stretch.
 
 A bias is the mean reading less what the attitude, gravity and the Earth's rate make. It is the effective one at this
-pose: a scale error times 1 g on the vertical axis cannot be told from a bias in one pose (method 2.3) and is what the
-autopilot's offset has to carry here; it is not part of sigma.
+pose: in one pose a scale error times 1 g on the vertical axis looks like a bias (method 2.3). The autopilot's offset
+has to carry it here; it is not part of sigma.
 
 The equations are those of the paper with its errata mended (method 1.3): an accelerometer's bias is mean - g * up, a
 gyro's mean - C_n^b w_ie^n. Everything is FRD and NED; `up` is the unit vector of specific force at rest.

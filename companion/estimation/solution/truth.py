@@ -1,8 +1,8 @@
 """Attitude of the aircraft from everything but its gyros: the reference for every sensor.
 
-A gradienter tells the tilt and a compass the heading. Without a gradienter, accelerometers whose bias, scale and shear
-are known from all sides (`alignment.faces`) show up by themselves, f = (I + S)^-1 (read - b), if the length of f still
-is gravity; the tilt of the board in the aircraft stays in it. Without a compass the autopilot's yaw is the heading.
+A gradienter measures the tilt, a compass the heading. Without a gradienter, accelerometers show the tilt if their bias,
+scale and shear are known from all sides (`alignment.faces`): f = (I + S)^-1 (read - b). The length of f must still be
+gravity; the tilt of the board in the aircraft stays in it. Without a compass the autopilot's yaw is the heading.
 """
 
 from __future__ import annotations

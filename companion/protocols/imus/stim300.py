@@ -12,9 +12,9 @@ apart. Until either is known, samples that are far from 1 g in the assumed range
 *Time*: a sample is older than its datagram by the latency. *Counter*: internal samples, 2000 a second, modulo 256.
 
 *Axes* are those of figure 6-4; a cluster reads +1 g on the axis that points up. The inclinometers become a
-`TiltSample` of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity, so y,
-nose up, is asin(X / |g|) and x, right side down, is -asin(Y / |g|) with Z down, where Y is right, and +asin(Y / |g|)
-with Z up, where Y is left: the unit may lie on either side, with X forward. Beyond 60 degrees it gives none. Rates and
+`TiltSample` of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity. So y,
+nose up, is asin(X / |g|). And x, right side down, is -asin(Y / |g|) with Z down, where Y is right, or +asin(Y / |g|)
+with Z up, where Y is left. The unit may lie on either side, with X forward. Beyond 60 degrees it gives none. Rates and
 forces stay in the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
 
 Datagrams: tables 5-13 to 5-23. Those with AUX (0x98 to 0x9C, 0xAD to 0xAF) are those

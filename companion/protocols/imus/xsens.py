@@ -3,9 +3,9 @@
     FA FF 36  length  (id, size, data)...  checksum        big-endian; all bytes after FA sum to 0 modulo 256
 
 A length of 255 means that the true one follows in 16 bits. The low nibble of an id names the number format: 0 float32,
-1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Used are 0x1020 packet counter, 0x1060
-SampleTimeFine (ticks of 0.1 ms), 0x0810 temperature (sent once a second at most, and held), 0x4020 acceleration in
-m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate), 0xE020 status word. Sources:
+1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Used are 0x1020 packet counter,
+0x1060 SampleTimeFine (ticks of 0.1 ms), 0x0810 temperature (sent once a second at most, and held), 0xE020 status word.
+Also 0x4020 acceleration in m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate). Sources:
 MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
 
 Axes: X forward, Y left, Z up; level and at rest it reads z = +9.8. The axes are the device's own: an MTi that lies on

@@ -28,7 +28,7 @@ FLIP = np.array([1.0, -1.0, -1.0])
 """Forward-left-up and east-north-up into forward-right-down and a frame with its third axis down."""
 
 
-class Trial(NamedTuple):
+class RecordingTrial(NamedTuple):
     t_s: Floats
     rate: Floats
     force: Floats
@@ -42,7 +42,7 @@ class Trial(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def trial() -> Trial:
+def trial() -> RecordingTrial:
     h5py = pytest.importorskip("h5py", reason="h5py reads this recording")
     with h5py.File(shared("broad/02_undisturbed_slow_rotation_B.hdf5")) as file:
         rate, force = file["imu_gyr"][:] * FLIP, file["imu_acc"][:] * FLIP
@@ -58,7 +58,7 @@ def trial() -> Trial:
     up = attitude[rest].transpose(0, 2, 1) @ np.array([0.0, 0.0, -GRAVITY])
     start = int(moving[0] - 0.5 / step_s)
     assert seen[start]
-    return Trial(
+    return RecordingTrial(
         np.arange(len(rate), dtype=np.float64) * step_s,
         rate,
         force,
@@ -70,7 +70,7 @@ def trial() -> Trial:
     )
 
 
-def samples(trial: Trial) -> list[ImuSample]:
+def samples(trial: RecordingTrial) -> list[ImuSample]:
     last = int(trial.judged[-1])
     rows = zip(
         trial.t_s[trial.start + 1 : last + 1].tolist(),
@@ -81,7 +81,7 @@ def samples(trial: Trial) -> list[ImuSample]:
     return [ImuSample(t_s, (a, b, c), (d, e, f)) for t_s, (a, b, c), (d, e, f) in rows]
 
 
-def judge(trial: Trial, found: list[Quaternion]) -> tuple[float, float]:
+def judge(trial: RecordingTrial, found: list[Quaternion]) -> tuple[float, float]:
     """Rms of the whole error and of the inclination, degrees."""
     estimated = Rotation.from_quat(np.array(found)[trial.judged - trial.start - 1][:, [1, 2, 3, 0]])
     truth = Rotation.from_matrix(trial.attitude[trial.judged])
@@ -91,7 +91,7 @@ def judge(trial: Trial, found: list[Quaternion]) -> tuple[float, float]:
     return float(np.sqrt(np.mean(whole**2))), float(np.sqrt(np.mean(leaning**2)))
 
 
-def gyros_only(trial: Trial, bias: Floats) -> float:
+def gyros_only(trial: RecordingTrial, bias: Floats) -> float:
     strapdown = Strapdown()
     x, y, z = bias.tolist()
     strapdown.bias_rad_s = (x, y, z)
@@ -103,13 +103,13 @@ def gyros_only(trial: Trial, bias: Floats) -> float:
     return judge(trial, found)[0]
 
 
-def test_rates_alone_hold_three_times_better_after_a_calibration_at_rest(trial: Trial) -> None:
+def test_rates_alone_hold_three_times_better_after_a_calibration_at_rest(trial: RecordingTrial) -> None:
     calibrated, raw = gyros_only(trial, trial.gyro_bias), gyros_only(trial, np.zeros(3))
     assert raw > 10.0
     assert calibrated < raw / 3.0
 
 
-def test_levelled_it_leans_by_less_than_a_degree_as_vqf_does(trial: Trial) -> None:
+def test_levelled_it_leans_by_less_than_a_degree_as_vqf_does(trial: RecordingTrial) -> None:
     gx, gy, gz = trial.gyro_bias.tolist()
     ax, ay, az = trial.accel_bias.tolist()
     estimator = AttitudeEstimator(

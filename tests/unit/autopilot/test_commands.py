@@ -11,7 +11,7 @@ from companion.links.mavlink.link import MavlinkLink
 SET_INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 
 
-class Peer:
+class CommandPeer:
     """Decodes what is sent and answers by hand."""
 
     def __init__(self, link: MavlinkLink) -> None:
@@ -30,7 +30,7 @@ class Peer:
 
 async def test_the_answer_of_the_right_sender_to_the_right_command_for_us() -> None:
     link = MavlinkLink()
-    peer = Peer(link)
+    peer = CommandPeer(link)
     commands = Commands(link, lambda: (1, 1))
     answer = commands.send(SET_INTERVAL, 105, 10000)
     for who, command, to in (
@@ -48,7 +48,7 @@ async def test_the_answer_of_the_right_sender_to_the_right_command_for_us() -> N
 
 async def test_one_of_a_kind_is_in_flight_and_silence_lets_the_next_go() -> None:
     link = MavlinkLink()
-    peer = Peer(link)
+    peer = CommandPeer(link)
     commands = Commands(link, lambda: (1, 1))
     first, second = commands.send(SET_INTERVAL, 105), commands.send(SET_INTERVAL, 26)
     other = commands.send(mavlink.MAV_CMD_REQUEST_MESSAGE, 148)
@@ -63,7 +63,7 @@ async def test_one_of_a_kind_is_in_flight_and_silence_lets_the_next_go() -> None
 
 async def test_a_request_that_was_brought_and_refused_twice_does_not_refuse_the_next_one() -> None:
     link = MavlinkLink()
-    peer = Peer(link)
+    peer = CommandPeer(link)
     commands = Commands(link, lambda: (1, 1))
     first, second = commands.send(SET_INTERVAL, 105), commands.send(SET_INTERVAL, 26)
     for _ in range(2):
@@ -78,7 +78,7 @@ async def test_a_request_that_was_brought_and_refused_twice_does_not_refuse_the_
 
 async def test_in_progress_starts_the_time_anew() -> None:
     link = MavlinkLink()
-    peer = Peer(link)
+    peer = CommandPeer(link)
     commands = Commands(link, lambda: (1, 1))
     answer = commands.send(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1, timeout_s=1.0)
     for _ in range(5):
@@ -91,7 +91,7 @@ async def test_in_progress_starts_the_time_anew() -> None:
 
 async def test_the_queue_is_bounded_and_an_unknown_target_or_an_end_is_answered_at_once() -> None:
     link = MavlinkLink()
-    Peer(link)
+    CommandPeer(link)
     commands = Commands(link, lambda: (1, 1))
     answers = [commands.send(SET_INTERVAL, i) for i in range(MAX_WAITING + 2)]
     assert answers[-1].done()
@@ -104,7 +104,7 @@ async def test_the_queue_is_bounded_and_an_unknown_target_or_an_end_is_answered_
 
 async def test_whoever_gave_up_is_skipped() -> None:
     link = MavlinkLink()
-    peer = Peer(link)
+    peer = CommandPeer(link)
     commands = Commands(link, lambda: (1, 1))
     first, second = commands.send(SET_INTERVAL, 105), commands.send(SET_INTERVAL, 26)
     third = commands.send(SET_INTERVAL, 27)

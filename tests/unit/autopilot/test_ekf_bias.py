@@ -24,7 +24,7 @@ UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 
 
 @dataclass
-class Aboard:
+class EkfDouble:
     double: PX4Double
     ekf_bias: EkfBias
     stream: ImuStream
@@ -49,7 +49,7 @@ async def aboard(
     part: str = "white_only",
     loss: float = 0.0,
     **more: bool,
-) -> AsyncIterator[Aboard]:
+) -> AsyncIterator[EkfDouble]:
     aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0))
     biases = ((500.0, -700.0, 1000.0), (-400.0, 300.0, 800.0))
     models = [
@@ -68,7 +68,7 @@ async def aboard(
     Wire(link, double, seed=1, loss=loss, duplicate=loss)
     vehicle = Vehicle(link)
     ekf_bias = EkfBias(Px4Console(link, vehicle), vehicle)
-    found = Aboard(double, ekf_bias, None)  # type: ignore[arg-type]
+    found = EkfDouble(double, ekf_bias, None)  # type: ignore[arg-type]
     found.stream = ImuStream(
         link, vehicle, instance, found.samples.append, rate_hz=rate_hz, ekf_bias=ekf_bias,
         on_kind_change=lambda kind: found.kinds.append(None if kind is None else kind.name),

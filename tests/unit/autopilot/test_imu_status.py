@@ -24,14 +24,16 @@ BIASES = ((100.0, -60.0, 170.0), (-80.0, 40.0, 150.0))
 
 
 @dataclass
-class Aboard:
+class ImuStatusDouble:
     double: PX4Double
     ekf_bias: EkfBias
     heard: list[tuple[int, int, int, ImuSample]]
 
 
 @contextlib.asynccontextmanager
-async def aboard(wanted: tuple[int, ...] = (1, 2), *, slow: bool = False, **more: bool) -> AsyncIterator[Aboard]:
+async def aboard(
+    wanted: tuple[int, ...] = (1, 2), *, slow: bool = False, **more: bool
+) -> AsyncIterator[ImuStatusDouble]:
     aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0))
     models = [
         ImuModel(
@@ -53,7 +55,7 @@ async def aboard(wanted: tuple[int, ...] = (1, 2), *, slow: bool = False, **more
     try:
         async with asyncio.timeout(20.0):
             await vehicle.found.wait()
-        yield Aboard(double, ekf_bias, heard)
+        yield ImuStatusDouble(double, ekf_bias, heard)
     finally:
         for task in tasks:
             task.cancel()

@@ -23,7 +23,7 @@ HIGHRES, SCALED, SCALED2, SCALED3 = 105, 26, 116, 129
 DENIED, UNSUPPORTED = mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED
 
 
-class Heard:
+class HeardStream:
     def __init__(self) -> None:
         self.samples: list[ImuSample] = []
         self.kinds: list[str | None] = []
@@ -39,10 +39,10 @@ def kind_of(stream: ImuStream) -> str | None:
 @contextlib.asynccontextmanager
 async def aboard(
     autopilot: ScriptedAutopilot, instance: int = 1, *, rate_hz: float = 100.0, **wire: float
-) -> AsyncIterator[tuple[ImuStream, Heard, Wire]]:
+) -> AsyncIterator[tuple[ImuStream, HeardStream, Wire]]:
     link = MavlinkLink()
     vehicle = Vehicle(link)
-    heard = Heard()
+    heard = HeardStream()
     ekf_bias = EkfBias(Px4Console(link, vehicle), vehicle)
     ekf_bias.settled.set()  # nobody asks for it
     stream = ImuStream(

@@ -31,7 +31,7 @@ SIM = 1310988  # the simulator's: bus type 4
 CAN = 3 | 5 << 3 | 9 << 8  # bus type 3: always external
 
 
-class Aboard(NamedTuple):
+class Px4ClientBench(NamedTuple):
     px4: ScriptedPx4
     vehicle: Vehicle
     client: ParameterClient
@@ -39,14 +39,14 @@ class Aboard(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def aboard(px4: ScriptedPx4) -> AsyncIterator[Aboard]:
+async def aboard(px4: ScriptedPx4) -> AsyncIterator[Px4ClientBench]:
     link = MavlinkLink()
     vehicle = Vehicle(link)
     client = ParameterClient(link, vehicle)
     async with flying_on(link, px4):
         await vehicle.found.wait()
         await asyncio.sleep(1.0)
-        yield Aboard(px4, vehicle, client, ParameterWriter(client, vehicle))
+        yield Px4ClientBench(px4, vehicle, client, ParameterWriter(client, vehicle))
     vehicle.close()
 
 

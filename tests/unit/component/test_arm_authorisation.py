@@ -11,26 +11,34 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import ArmAnswer
-from tests.support.component import ACCEPTED, DENIED, TEMPORARILY_REJECTED, Bench, Ground, bench, command_message
+from tests.support.component import (
+    ACCEPTED,
+    DENIED,
+    TEMPORARILY_REJECTED,
+    ComponentBench,
+    Ground,
+    bench,
+    command_message,
+)
 
 AUTHORISE = 3001
 VEHICLE = 7
 
 
 @asynccontextmanager
-async def asked_by_px4(**more: object) -> AsyncIterator[Bench]:
+async def asked_by_px4(**more: object) -> AsyncIterator[ComponentBench]:
     """The component with PX4 (system 7, component 1) at the other end of the wire."""
     async with bench(system_id=VEHICLE, ground=Ground(VEHICLE, 1)) as b:
         await asyncio.sleep(0.1)
         yield b
 
 
-async def ask(b: Bench, target: tuple[int, int] = (VEHICLE, 0), confirmation: int = 0) -> None:
+async def ask(b: ComponentBench, target: tuple[int, int] = (VEHICLE, 0), confirmation: int = 0) -> None:
     b.ground.command(AUTHORISE, target=target, confirmation=confirmation)
     await asyncio.sleep(0.1)
 
 
-def answers(b: Bench) -> list[tuple[int, int, int]]:
+def answers(b: ComponentBench) -> list[tuple[int, int, int]]:
     """One for each question; each comes twice."""
     every = [(ack.result, ack.progress, ack.result_param2) for ack in b.ground.ack_messages()]
     assert every[0::2] == every[1::2]
@@ -153,7 +161,7 @@ async def test_the_answer_leaves_in_the_same_pass_of_the_loop_as_the_question_ca
         assert len(sent) == before + 1
 
 
-def tunnels(b: Bench) -> list[bytes]:
+def tunnels(b: ComponentBench) -> list[bytes]:
     return [
         bytes(m.payload[: m.payload_length])
         for _, m in b.ground.received

@@ -21,7 +21,7 @@ from tests.support.component import (
     DENIED,
     PREFLIGHT,
     UNDO,
-    Bench,
+    ComponentBench,
     Ground,
     bench,
     command_message,
@@ -29,7 +29,7 @@ from tests.support.component import (
 from tests.unit.config.test_config import GOOD
 
 
-def allowing(*entries: str) -> AbstractAsyncContextManager[Bench]:
+def allowing(*entries: str) -> AbstractAsyncContextManager[ComponentBench]:
     return bench(allow=entries, parameters=[Parameter("CMP_PUSH", 1.0, 0.0, 1.0, lambda _value: None)])
 
 
@@ -111,7 +111,7 @@ async def test_a_stranger_cannot_cancel_what_another_has_started() -> None:
         assert b.component.permission.refused == {(77, 190): 1}
 
 
-def push(b: Bench) -> float:
+def push(b: ComponentBench) -> float:
     return b.component.parameters.get("CMP_PUSH")
 
 

@@ -82,7 +82,7 @@ def test_every_text_of_the_code_is_cut_between_words_wherever_it_is_shown(field:
 
 
 def begins(text: str, shown: str, most: int) -> bool:
-    """Whether `shown` is the first words of a text; of a word longer than a line, its beginning."""
+    """Return True where `shown` is the first words of a text, or the beginning of a word longer than a line."""
     words, first = ([word.rstrip(":;,") for word in each.split()] for each in (text, shown))
     return words[: len(first)] == first or any(len(word) > most for word in words)
 

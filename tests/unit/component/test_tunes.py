@@ -23,7 +23,7 @@ def beat(*, armed: bool) -> mavlink.MAVLink_heartbeat_message:
     return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, mode, 0, 3, 3)
 
 
-class Bench:
+class TuneBench:
     """Tunes at one end of a wire, an autopilot (system 7) that only beats and listens at the other."""
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class Bench:
 
 
 async def test_it_is_sent_to_the_autopilot_at_once_and_the_next_when_the_first_is_over() -> None:
-    bench = Bench()
+    bench = TuneBench()
     await bench.run(1.0)
     bench.tunes.play(Tune.HOLD_STILL)
     await bench.run(0.2)
@@ -75,7 +75,7 @@ async def test_it_is_sent_to_the_autopilot_at_once_and_the_next_when_the_first_i
 
 
 async def test_nothing_is_played_armed_nor_unknown_nor_unwanted_nor_afterwards() -> None:
-    bench = Bench()
+    bench = TuneBench()
     bench.tunes.play(Tune.NEXT)
     await bench.run(0.0)
     bench.tunes.step(asyncio.get_running_loop().time())  # before its first heartbeat
@@ -97,7 +97,7 @@ async def test_nothing_is_played_armed_nor_unknown_nor_unwanted_nor_afterwards()
 
 
 async def test_one_that_had_to_wait_too_long_is_no_news() -> None:
-    bench = Bench()
+    bench = TuneBench()
     await bench.run(1.0)
     bench.tunes.play(Tune.FAILED)
     await asyncio.sleep(TUNE_STALE_S)  # the loop of the component stood still

@@ -30,7 +30,7 @@ law = "slope"
 FTDI_ID = "/dev/serial/by-id/usb-FTDI_FT232R_A5-if00-port0"
 
 
-class Board(UsbTree):
+class CheckedBoard(UsbTree):
     """An FTDI bridge with a serial number, a CH340 without, and an on-board port; processes as a test needs them."""
 
     def __init__(self, root: Path) -> None:
@@ -75,13 +75,13 @@ class Board(UsbTree):
 
 
 @pytest.fixture
-def board(tmp_path: Path) -> Board:
-    made = Board(tmp_path)
+def board(tmp_path: Path) -> CheckedBoard:
+    made = CheckedBoard(tmp_path)
     made.timer("ttyUSB0", 1)
     return made
 
 
-def faults(board: Board, port: str) -> list[str]:
+def faults(board: CheckedBoard, port: str) -> list[str]:
     return [str(fault) for fault in port_faults(port, root=board.root)]
 
 
@@ -93,14 +93,14 @@ def config(
     return parse(CONFIG.format(imu=imu, gradienter=gradienter, autopilot=autopilot), "test.toml")
 
 
-def test_a_board_in_order_has_nothing_to_say(board: Board) -> None:
+def test_a_board_in_order_has_nothing_to_say(board: CheckedBoard) -> None:
     assert system_findings(config(), [], board.root) == []
     board.process(412, "agetty", "--noclear", "tty1", "linux", opened=("/dev/tty1",))
     board.process(900, "companion", "run", opened=("/dev/ttyUSB0", "/dev/ttyUSB1"))
     assert system_findings(config(), [900], board.root) == []
 
 
-def test_a_login_console_is_named_with_what_ends_it(board: Board) -> None:
+def test_a_login_console_is_named_with_what_ends_it(board: CheckedBoard) -> None:
     board.process(412, "agetty", "-o", "-p", "--keep-baud", "115200,57600", "ttyS0", "vt220", opened=("/dev/ttyS0",))
     (line,) = [line for line in faults(board, "/dev/ttyS0") if "console" in line]
     assert line == (
@@ -113,7 +113,7 @@ def test_a_login_console_is_named_with_what_ends_it(board: Board) -> None:
     assert "remove console=ttyS0,... from the kernel's command line" in line
 
 
-def test_modem_manager_is_named_with_what_keeps_it_away(board: Board) -> None:
+def test_modem_manager_is_named_with_what_keeps_it_away(board: CheckedBoard) -> None:
     board.process(600, "ModemManager")
     assert not any("Modem" in line for line in faults(board, "/dev/ttyUSB1")), "it leaves the port alone"
     (board.root / "proc/600/fd/7").symlink_to("/dev/ttyUSB1")
@@ -123,7 +123,7 @@ def test_modem_manager_is_named_with_what_keeps_it_away(board: Board) -> None:
     assert sum("in use" in line for line in lines) == 1, "one line is enough"
 
 
-def test_a_second_reader_is_named_unless_it_is_ours(board: Board) -> None:
+def test_a_second_reader_is_named_unless_it_is_ours(board: CheckedBoard) -> None:
     board.process(900, "companion", "run", opened=("/dev/ttyUSB0",))
     board.process(1234, "gpsd", "-n", opened=("/dev/null", "/dev/ttyUSB0"))
     found = system_findings(config(), [900], board.root)
@@ -135,7 +135,7 @@ def test_a_second_reader_is_named_unless_it_is_ours(board: Board) -> None:
     assert len(system_findings(config(), [], board.root)) == 2
 
 
-def test_the_ftdi_timer_is_wrong_for_an_imu_and_a_remark_for_a_gradienter(board: Board) -> None:
+def test_the_ftdi_timer_is_wrong_for_an_imu_and_a_remark_for_a_gradienter(board: CheckedBoard) -> None:
     board.timer("ttyUSB0", 16)
     (fault,) = port_faults(FTDI_ID, is_fast=True, root=board.root)
     assert not fault.good
@@ -147,7 +147,7 @@ def test_the_ftdi_timer_is_wrong_for_an_imu_and_a_remark_for_a_gradienter(board:
     assert (finding.name, finding.good) == ("own", False)
 
 
-def test_a_name_that_changes_is_told_the_one_that_stays(board: Board) -> None:
+def test_a_name_that_changes_is_told_the_one_that_stays(board: CheckedBoard) -> None:
     (fault,) = port_faults("/dev/ttyUSB0", root=board.root)
     assert fault.good, "it works today"
     assert fault.remedy == f'set port = "{FTDI_ID}"'
@@ -160,7 +160,7 @@ def device(name: str, speaks: str | None, trouble: str | None = "undecodable") -
     return {"name": name, "trouble": trouble, "speaks": speaks}
 
 
-def test_one_port_under_two_names(board: Board) -> None:
+def test_one_port_under_two_names(board: CheckedBoard) -> None:
     assert same_ports({"own": FTDI_ID, "gradienter": "/dev/ttyUSB0"}, board.root) == [
         ("own", "gradienter", "/dev/ttyUSB0")
     ]

@@ -59,7 +59,7 @@ async def undone_and_then(ledger: Ledger) -> None:
     raise WriteFailedError("no answer", "after the end", {}, NAMES[:1])
 
 
-class Disk:
+class LedgerDisk:
     """Runs the ledger's calls at once, and refuses what it shall."""
 
     def __init__(self) -> None:
@@ -73,8 +73,8 @@ class Disk:
         return function(*arguments)
 
 
-def opened(folder: Path, disk: Disk | None = None) -> Ledger:
-    ledger = Ledger(ChangeLog(folder), (disk or Disk()).offload)
+def opened(folder: Path, disk: LedgerDisk | None = None) -> Ledger:
+    ledger = Ledger(ChangeLog(folder), (disk or LedgerDisk()).offload)
     ledger.load()
     return ledger
 
@@ -165,7 +165,7 @@ def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: 
 
 def test_nothing_is_written_whose_old_values_cannot_be_kept(tmp_path: Path) -> None:
     async def main() -> None:
-        disk, called = Disk(), []
+        disk, called = LedgerDisk(), []
         ledger = opened(tmp_path, disk)
         disk.refuses = {"write"}
 
@@ -184,7 +184,7 @@ def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_
     tmp_path: Path, refused: str
 ) -> None:
     async def main() -> None:
-        disk = Disk()
+        disk = LedgerDisk()
         ledger = opened(tmp_path, disk)
 
         async def block(ledger: Ledger) -> None:

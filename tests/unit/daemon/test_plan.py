@@ -28,7 +28,7 @@ CALIBRATION = ImuCalibration(
 
 
 def is_left(residual_deg_h: float, estimated_deg_h: float = ESTIMATED_DEG_H, written_rad_s: float = 1e-3) -> bool:
-    """Whether gyros with this residual keep the offsets of an earlier calibration as good as this one."""
+    """Return True where gyros with this residual keep the offsets of an earlier calibration as good as this one."""
     sigma = NEXT_MINUTES_DEG_H * DEG_H
     found = ImuSolution(
         name="fc",

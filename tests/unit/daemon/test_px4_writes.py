@@ -32,7 +32,7 @@ BMI = 6684682
 BOSCH = 9_109_514
 
 
-class Stage(NamedTuple):
+class Px4WriteStage(NamedTuple):
     px4: ScriptedPx4
     client: ParameterClient
     writer: ParameterWriter
@@ -56,7 +56,7 @@ def planned(found: ImuCalibration) -> ImuPlan:
 
 
 @contextlib.asynccontextmanager
-async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Stage]:
+async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Px4WriteStage]:
     link = MavlinkLink()
     vehicle = Vehicle(link)
     client, memory = ParameterClient(link, vehicle), SlotMemory()
@@ -71,7 +71,7 @@ async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Stage]:
     async with flying_on(link, px4):
         await vehicle.found.wait()
         await asyncio.sleep(1.0)
-        yield Stage(px4, client, writer, writes, memory)
+        yield Px4WriteStage(px4, client, writer, writes, memory)
     vehicle.close()
 
 

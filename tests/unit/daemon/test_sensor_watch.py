@@ -21,7 +21,7 @@ from tests.support.virtual_time import run_virtual
 START_S = 1000.0
 
 
-class Bench:
+class SensorWatchBench:
     """One pose sensor and an IMU, both fed by hand; the sensor's port counts as open."""
 
     def __init__(self, kind: Literal["gradienter", "compass"]) -> None:
@@ -100,7 +100,7 @@ def on_the_clock(test: Callable[[], None]) -> None:
 
 def test_a_gradienter_that_repeats_its_digits_while_all_stands_still_is_left_in_peace() -> None:
     def check() -> None:
-        bench = Bench("gradienter")
+        bench = SensorWatchBench("gradienter")
         assert bench.run(120.0, tilt) is None
         assert bench.resets == []
 
@@ -113,7 +113,7 @@ def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
     caplog.set_level(logging.INFO)
 
     def check() -> None:
-        bench = Bench("gradienter")
+        bench = SensorWatchBench("gradienter")
         bench.run(10.0, tilt)
         assert bench.run(2.0, tilt, pitch_deg=2.0) is None, "one second may be a jolt"
         found = bench.run(8.0, tilt, pitch_deg=8.0)
@@ -140,7 +140,7 @@ def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
 
 def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_biased() -> None:
     def check() -> None:
-        bench = Bench("compass")
+        bench = SensorWatchBench("compass")
         assert bench.run(60.0, heading, bias_deg_s=8.0) is None, "480 deg of bias"
         assert bench.run(10.0, heading, pitch_deg=10.0) is None, "a heading may stay when it tilts"
         found = bench.run(4.0, heading, turn_deg_s=30.0)
@@ -153,7 +153,7 @@ def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_bias
 
 def test_new_offsets_and_another_orientation_are_no_tilt() -> None:
     def check() -> None:
-        bench = Bench("gradienter")
+        bench = SensorWatchBench("gradienter")
         bench.run(10.0, tilt)
         bench.offset = None
         bench.run(6.0, tilt)
@@ -169,7 +169,7 @@ def test_new_offsets_and_another_orientation_are_no_tilt() -> None:
 
 def test_one_imu_that_is_broken_convicts_nobody() -> None:
     def check() -> None:
-        bench = Bench("gradienter")
+        bench = SensorWatchBench("gradienter")
         add = bench.one.collector.add_imu
         bench.one.collector.set_imu(imu("second"))
 

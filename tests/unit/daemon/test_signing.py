@@ -35,7 +35,7 @@ MARGIN = 2 * TICKS_PER_S
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
 
 
-class Board:
+class SigningBoard:
     """A companion computer: its clocks, its disk, and how often it was started."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, *, wall_s: float) -> None:
@@ -85,7 +85,7 @@ def test_in_1970_time_goes_on_behind_what_was_used_whatever_ends_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def main() -> None:
-        board = Board(tmp_path, monkeypatch, wall_s=0.0)
+        board = SigningBoard(tmp_path, monkeypatch, wall_s=0.0)
         async with board.daemon() as first:
             assert first.signing is not None
             first.signing.clock.heard(NOW)
@@ -118,7 +118,7 @@ def test_a_clock_once_20_years_ahead_is_not_followed_in_that_boot(
     """A board without a battery-backed clock has the time from a signed message instead."""
 
     async def main() -> None:
-        board = Board(tmp_path, monkeypatch, wall_s=wall_at_start_s)
+        board = SigningBoard(tmp_path, monkeypatch, wall_s=wall_at_start_s)
         async with board.daemon() as first:
             assert first.signing is not None
             first.signing.clock.heard(NOW)
@@ -141,7 +141,7 @@ def test_a_clock_once_20_years_ahead_is_not_followed_in_that_boot(
 
 def test_a_kept_time_far_ahead_is_named_with_the_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
-        board = Board(tmp_path, monkeypatch, wall_s=NOW_S + 20 * YEAR_S)
+        board = SigningBoard(tmp_path, monkeypatch, wall_s=NOW_S + 20 * YEAR_S)
         async with board.daemon():
             await asyncio.sleep(1.0)
         board.wall_at_boot_s = NOW_S
@@ -172,7 +172,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def main() -> None:
-        board = Board(tmp_path, monkeypatch, wall_s=NOW_S)
+        board = SigningBoard(tmp_path, monkeypatch, wall_s=NOW_S)
 
         def full(*_: Any) -> None:
             raise StorageError("disk full")

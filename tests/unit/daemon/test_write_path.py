@@ -36,7 +36,7 @@ class Writer:
         return {}
 
 
-class Aircraft:
+class WritePathAircraft:
     """A write path over a real journal; writer and vehicle are stand-ins."""
 
     def __init__(self, folder: Path) -> None:
@@ -71,7 +71,7 @@ class Aircraft:
 
 def test_a_verified_write_can_be_undone_with_all_that_it_changed(tmp_path: Path) -> None:
     async def main() -> None:
-        aircraft = Aircraft(tmp_path)
+        aircraft = WritePathAircraft(tmp_path)
         await aircraft.commit()
         (step,) = aircraft.ledger.steps(1)
         assert step.names == [change.parameter for change in MADE]
@@ -94,7 +94,7 @@ def test_a_write_that_must_not_stay_is_restored_at_once(
     tmp_path: Path, verdict: Exception | None, full: bool, raised: type[Exception]
 ) -> None:
     async def main() -> None:
-        aircraft = Aircraft(tmp_path)
+        aircraft = WritePathAircraft(tmp_path)
         with pytest.raises(raised, match=r"; old values back$"):
             await aircraft.commit(verdict, full=full)
         assert aircraft.writer.restored == MADE
@@ -106,7 +106,7 @@ def test_a_write_that_must_not_stay_is_restored_at_once(
 
 def test_values_that_could_not_be_restored_are_named_and_left_to_the_recovery(tmp_path: Path) -> None:
     async def main() -> None:
-        aircraft = Aircraft(tmp_path)
+        aircraft = WritePathAircraft(tmp_path)
         aircraft.writer.fails = WriteFailedError("armed in the middle", "armed", {}, ("INS_GYROFFS_X",))
         with pytest.raises(AutopilotError, match="old values NOT back in INS_GYROFFS_X: restored once disarmed"):
             await aircraft.commit(AutopilotError("not followed"))

@@ -115,7 +115,7 @@ def test_counts_become_gauss_only_with_a_scale() -> None:
 # ------------------------------------------------------------------------------------------------- in the collector
 
 
-class Stand:
+class FieldStand:
     """A still aircraft whose compass gives its field; what disturbs it can be changed."""
 
     def __init__(self) -> None:
@@ -134,7 +134,7 @@ class Stand:
 
 
 def test_a_field_alone_is_a_compass_to_the_collector() -> None:
-    stand = Stand()
+    stand = FieldStand()
     stand.feed.run(20.0)
     assert stand.feed.waiting_for() is None
     window = stand.collector.window(stand.feed.now_s)
@@ -148,7 +148,7 @@ def test_a_field_alone_is_a_compass_to_the_collector() -> None:
 
 
 def test_iron_that_comes_while_nothing_turns_is_seen_across_the_stretch_that_it_breaks() -> None:
-    stand = Stand()
+    stand = FieldStand()
     stand.feed.run(20.0)
     stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
     stand.feed.run(2.0)
@@ -160,7 +160,7 @@ def test_iron_that_comes_while_nothing_turns_is_seen_across_the_stretch_that_it_
 
 
 def test_a_turn_of_the_aircraft_is_no_wandering() -> None:
-    stand = Stand()
+    stand = FieldStand()
     stand.feed.run(15.0)
     turning = np.array([0.0, 0.0, 10.0 * DEG, 0.0, 0.0, 0.0])
     stand.feed.change = lambda _name, _times, rows: rows + turning

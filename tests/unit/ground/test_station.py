@@ -14,7 +14,7 @@ from companion.estimation.machine import What
 from companion.ground.heard import Address
 from companion.ground.link import GroundLink
 from companion.ground.station import Display, Station
-from tests.support.component import Bench, bench
+from tests.support.component import ComponentBench, bench
 from tests.support.ground_wire import StationOnTheWire, is_final
 from tests.support.virtual_time import run_virtual
 
@@ -44,7 +44,7 @@ def beat(wire: StationOnTheWire, system_id: int, component_id: int, kind: int, a
     wire.heard.update("HEARTBEAT", Address(system_id, component_id), fields, asyncio.get_running_loop().time())
 
 
-async def until_started(b: Bench, jobs: int = 1) -> None:
+async def until_started(b: ComponentBench, jobs: int = 1) -> None:
     while len(b.service.started) < jobs:
         await asyncio.sleep(0.05)
 

@@ -1,4 +1,4 @@
-"""From recordings at rest to an honest profile: seconds, stretches, drifts, and the next minute."""
+"""Profiles from recordings at rest: seconds, stretches, drifts, and the next minute."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def plugged(link: Path) -> Iterator[Pty]:
         pty.unplug()
 
 
-class Port:
+class ScriptedPort:
     """A running ByteLink and what it has told so far."""
 
     def __init__(self, url: str, baud: int = 19200) -> None:
@@ -92,8 +92,8 @@ class Port:
 
 
 @asynccontextmanager
-async def running(url: str | Path, baud: int = 19200) -> AsyncIterator[Port]:
-    port = Port(str(url), baud)
+async def running(url: str | Path, baud: int = 19200) -> AsyncIterator[ScriptedPort]:
+    port = ScriptedPort(str(url), baud)
     task = asyncio.create_task(port.link.run())
     try:
         yield port
@@ -140,7 +140,7 @@ def test_bytes_arrive_with_the_time_of_the_loop(path: Path) -> None:
     asyncio.run(main())
 
 
-async def collecting(port: Port, pty: Pty) -> None:
+async def collecting(port: ScriptedPort, pty: Pty) -> None:
     """Bytes one by one, each after the last has been read, until the link no longer wakes for each."""
     reads = 0
     while port.link._collecting is None:

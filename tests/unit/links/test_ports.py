@@ -14,7 +14,7 @@ CH340_ID = "/dev/serial/by-id/usb-1a86_USB_Serial-if00-port0"
 CUBE_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_1E0041-if00"
 
 
-class Machine:
+class PortsMachine:
     """A tree that looks like /sys, /dev and /proc; links are relative as the kernel's and udev's are."""
 
     def __init__(self, root: Path) -> None:
@@ -63,8 +63,8 @@ class Machine:
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Machine:
-    pi = Machine(tmp_path)
+def machine(tmp_path: Path) -> PortsMachine:
+    pi = PortsMachine(tmp_path)
     ftdi = pi.usb("1-1.1", vendor="0403", product="6001", serial="A50285BI", maker="FTDI", words="FT232R USB UART")
     pi.tty("ttyUSB0", f"{ftdi}/1-1.1:1.0/ttyUSB0", "ftdi_sio")
     pi.write(f"{ftdi}/1-1.1:1.0/ttyUSB0/latency_timer", "16\n")
@@ -98,16 +98,16 @@ def machine(tmp_path: Path) -> Machine:
     return pi
 
 
-def ports_of(machine: Machine) -> dict[str, SerialPort]:
+def ports_of(machine: PortsMachine) -> dict[str, SerialPort]:
     return {port.device: port for port in list_ports(machine.root)}
 
 
-def test_ports_with_hardware_are_listed_and_no_others(machine: Machine) -> None:
+def test_ports_with_hardware_are_listed_and_no_others(machine: PortsMachine) -> None:
     expected = ["/dev/ttyACM0", "/dev/ttyAMA0", "/dev/ttyS0", "/dev/ttyUSB0", "/dev/ttyUSB1", "/dev/ttyUSB2"]
     assert [port.device for port in list_ports(machine.root)] == expected
 
 
-def test_everything_about_one_port(machine: Machine) -> None:
+def test_everything_about_one_port(machine: PortsMachine) -> None:
     assert ports_of(machine)["/dev/ttyUSB0"] == SerialPort(
         device="/dev/ttyUSB0",
         stable_name=FTDI_ID,
@@ -125,7 +125,7 @@ def test_everything_about_one_port(machine: Machine) -> None:
     )
 
 
-def test_chips_without_a_serial_number_are_named_by_their_place(machine: Machine) -> None:
+def test_chips_without_a_serial_number_are_named_by_their_place(machine: PortsMachine) -> None:
     ports = ports_of(machine)
     assert ports["/dev/ttyUSB1"].stable_name == "/dev/serial/by-path/usb-1.2-port0"
     assert ports["/dev/ttyUSB2"].stable_name == "/dev/serial/by-path/usb-1.3-port0"
@@ -135,7 +135,7 @@ def test_chips_without_a_serial_number_are_named_by_their_place(machine: Machine
     assert ports["/dev/ttyUSB1"].latency_timer_ms is None
 
 
-def test_without_udev_a_usb_port_has_no_stable_name_and_an_on_board_one_has_its_own(machine: Machine) -> None:
+def test_without_udev_a_usb_port_has_no_stable_name_and_an_on_board_one_has_its_own(machine: PortsMachine) -> None:
     for link in (machine.root / "dev/serial/by-path").iterdir():
         link.unlink()
     ports = ports_of(machine)
@@ -144,7 +144,7 @@ def test_without_udev_a_usb_port_has_no_stable_name_and_an_on_board_one_has_its_
     assert ports["/dev/ttyAMA0"].stable_name == "/dev/ttyAMA0"
 
 
-def test_the_driver_is_that_of_the_hardware(machine: Machine) -> None:
+def test_the_driver_is_that_of_the_hardware(machine: PortsMachine) -> None:
     drivers = {device: port.driver for device, port in ports_of(machine).items()}
     assert drivers == {
         "/dev/ttyACM0": "cdc_acm",
@@ -156,20 +156,20 @@ def test_the_driver_is_that_of_the_hardware(machine: Machine) -> None:
     }
 
 
-def test_a_console_is_seen_through_its_alias(machine: Machine) -> None:
+def test_a_console_is_seen_through_its_alias(machine: PortsMachine) -> None:
     ports = ports_of(machine)
     assert [device for device, port in ports.items() if port.is_console] == ["/dev/ttyAMA0"]
     assert ports["/dev/ttyAMA0"].aliases == ("/dev/serial0",)
     assert ports["/dev/ttyAMA0"].description == "on-board port (uart-pl011)"
 
 
-def test_holders_are_found_by_link_and_by_device(machine: Machine) -> None:
+def test_holders_are_found_by_link_and_by_device(machine: PortsMachine) -> None:
     assert find_holders("/dev/gradienter", machine.root) == (Holder(812, "gpsd"),)
     assert find_holders(FTDI_ID, machine.root) == (Holder(77, "picocom"),)
     assert find_holders("/dev/ttyACM0", machine.root) == ()
 
 
-def test_what_a_device_says_of_itself_is_cut_and_cleaned(machine: Machine) -> None:
+def test_what_a_device_says_of_itself_is_cut_and_cleaned(machine: PortsMachine) -> None:
     place = "sys/devices/platform/soc/usb1/1-1.4"
     (machine.root / place / "manufacturer").write_bytes(b"\x1b[2JBad\x00\xff" + b"x" * 500)
     (machine.root / place / "idProduct").write_text("zz\n")

@@ -1,7 +1,7 @@
 """The catalogue of messages: complete, used, and shown to people.
 
-A text of the code needs an entry unless it says itself what to do or what is being done (`Message.explains_itself`), or
-it is printed by a command that somebody has just typed (`AT_A_DESK`).
+A text of the code needs an entry, with two exceptions. It says itself what to do or what is being done
+(`Message.explains_itself`), or a command prints it that somebody has just typed (`AT_A_DESK`).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def said() -> list[Message]:
 
 
 def is_explained(message: Message, rows_shown: list[str]) -> bool:
-    """Whether a row shows words of the message, or of a message it is composed with."""
+    """Return True where a row shows words of the message, or of a message composed with it."""
     return any(message.has(shown) or message.is_in(shown) for shown in rows_shown)
 
 
@@ -128,7 +128,7 @@ def test_the_page_is_that_of_the_catalogue() -> None:
 
 @pytest.mark.parametrize("name", catalogue())
 def test_a_line_with_its_values_is_found_again(name: str) -> None:
-    """As a pilot would copy it: behind its speaker, with values in the places of fields."""
+    """The line is as a pilot would copy it: behind its speaker, with values in the places of fields."""
     for pattern in catalogue()[name].patterns:
         if len(pattern.replace("…", "").strip()) >= 8:
             assert explain(f"Not armed: {pattern.replace('…', '12.5')}") is not None

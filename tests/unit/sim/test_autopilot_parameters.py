@@ -24,7 +24,7 @@ CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
 ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
 
 
-class Stage:
+class ParameterStage:
     """A double, a companion (1/191) and a ground station (255/190), each on its own wire."""
 
     def __init__(self, **options: Any) -> None:
@@ -53,7 +53,7 @@ class Stage:
 
 
 async def test_a_gyro_calibration_writes_temperatures_and_all_instances_and_announces_them() -> None:
-    async with Stage(imus=2, auxiliary=True, parameters={"INS_GYR3OFFS_Y": 0.2, "INS_GYR3_ID": 7}) as stage:
+    async with ParameterStage(imus=2, auxiliary=True, parameters={"INS_GYR3OFFS_Y": 0.2, "INS_GYR3_ID": 7}) as stage:
         double = stage.double
         assert await stage.companion.command(CALIBRATE, 1, wait_s=2.0) == 0
         names = [name for instance in (1, 2, 4) for name in offset_names(instance, "gyro")]
@@ -66,7 +66,7 @@ async def test_a_gyro_calibration_writes_temperatures_and_all_instances_and_anno
 
 
 async def test_a_gyro_calibration_that_does_not_converge_is_stored_and_blocks_arming_until_a_boot() -> None:
-    async with Stage() as stage:
+    async with ParameterStage() as stage:
         stage.double.faults.gyro_calibration_fails = True
         stage.companion.send(mavlink.MAVLink_command_long_message(1, 1, CALIBRATE, 0, 1, 0, 0, 0, 0, 0, 0))
         await asyncio.sleep(31.0)
@@ -82,7 +82,7 @@ async def test_a_gyro_calibration_that_does_not_converge_is_stored_and_blocks_ar
 
 @pytest.mark.parametrize("version", ["4.3", "4.6"])
 async def test_before_4_7_an_unknown_name_is_answered_with_silence(version: str) -> None:
-    async with Stage(version=version) as stage:
+    async with ParameterStage(version=version) as stage:
         assert await stage.companion.read_parameter("NO_SUCH") == []
         assert await stage.companion.set_parameter("NO_SUCH", 1.0) == []
         assert stage.companion.all(mavlink.MAVLink_param_error_message) == []
@@ -90,7 +90,7 @@ async def test_before_4_7_an_unknown_name_is_answered_with_silence(version: str)
 
 @pytest.mark.parametrize(("version", "renamed"), [("4.3", False), ("4.6", False), ("4.7", True), ("4.8", True)])
 def test_4_7_renamed_sysid_thismav_sr_and_arming_check(version: str, renamed: bool) -> None:
-    double = Stage(version=version, auxiliary=True).double
+    double = ParameterStage(version=version, auxiliary=True).double
     old = {"SYSID_THISMAV", "SYSID_MYGCS", "SR0_RAW_SENS", "ARMING_CHECK"}
     new = {"MAV_SYSID", "MAV_GCS_SYSID", "MAV1_RAW_SENS", "ARMING_SKIPCHK"}
     names = set(double.parameters.names)
@@ -103,13 +103,13 @@ def test_4_7_renamed_sysid_thismav_sr_and_arming_check(version: str, renamed: bo
     ("version", "word", "armed"), [("4.5", 21196, False), ("4.5", 2989, True), ("4.6", 21196, True)]
 )
 async def test_arming_is_forced_by_2989_and_from_4_6_on_by_21196(version: str, word: int, armed: bool) -> None:
-    async with Stage(version=version, parameters=dict.fromkeys(offset_names(1, "accel"), 0.0)) as stage:
+    async with ParameterStage(version=version, parameters=dict.fromkeys(offset_names(1, "accel"), 0.0)) as stage:
         await stage.ground.command(ARM, 1, word)
         assert stage.double.armed == armed
 
 
 async def test_writes_while_armed_are_accepted_and_witnessed() -> None:
-    async with Stage() as stage:
+    async with ParameterStage() as stage:
         await stage.companion.set_parameter("INS_GYROFFS_X", 0.001)
         stage.double.arm()
         assert await stage.ground.set_parameter("INS_GYROFFS_Z", 0.002) == [pytest.approx(0.002)]
@@ -120,7 +120,7 @@ async def test_writes_while_armed_are_accepted_and_witnessed() -> None:
 
 async def test_a_calibration_waits_for_stillness_and_is_refused_while_armed() -> None:
     aircraft = VirtualAircraft(POSE, motions=[Handling(start_s=0.0, duration_s=8.0)])
-    async with Stage(aircraft=aircraft) as stage:
+    async with ParameterStage(aircraft=aircraft) as stage:
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         assert await stage.companion.command(CALIBRATE, 1, wait_s=40.0) == 0
@@ -131,7 +131,7 @@ async def test_a_calibration_waits_for_stillness_and_is_refused_while_armed() ->
 
 
 async def test_two_imus_that_differ_too_much_do_not_arm() -> None:
-    async with Stage(imus=2) as stage:
+    async with ParameterStage(imus=2) as stage:
         await stage.companion.set_parameter("INS_ACC2OFFS_X", 1.0)
         assert await stage.ground.command(ARM, 1) == mavlink.MAV_RESULT_FAILED
         assert "Arm: Accels inconsistent" in stage.ground.texts()

@@ -43,7 +43,7 @@ class Port:
 
 
 def hung_up(descriptor: int) -> bool:
-    """Whether a port is dead: an error, or an empty read, after the rest of its data."""
+    """Return True where a port is dead: an error, or an empty read, after the rest of its data."""
     try:
         while os.read(descriptor, 65536):
             pass
