@@ -22,7 +22,7 @@ MAX_SHOWN: Final = 60  # The most characters of a value in a refusal
 
 
 class Interface(enum.Flag):
-    """The ways by which a command reaches the daemon; the control socket is open to all of them."""
+    """The interfaces through which a command reaches the daemon; the control socket serves all of them."""
 
     COMMAND_LINE = enum.auto()
     GROUND = enum.auto()  # `companion ground` over MAVLink
@@ -42,12 +42,12 @@ class Field(NamedTuple):
     by: Interface = _SHELL  # The interfaces that may set the field
     metavar: str | None = None
     allowed_words: str = ""
-    """The allowed values in words, where the type does not tell them."""
+    """Allowed values in words, if the type does not define them."""
     flags: Mapping[str, str] = {}
-    """Values that the command line takes as options of their own (--gyros), with their help."""
-    positional: bool = False  # True: the command line takes a value that is none of `flags` without an option
+    """Values with an option of their own on the command line (--gyros), and the help of each."""
+    positional: bool = False  # True: on the command line, values that are not in `flags` are positional
     short: str = ""
-    default: Any = None  # The value for the command line where none is given
+    default: Any = None  # Value used by the command line if none is given
     group: str = ""  # Options of the same group exclude each other
     type: Any = None
 
@@ -65,7 +65,7 @@ class Field(NamedTuple):
 
     @property
     def allowed(self) -> str:
-        """The allowed values in words, as of the type where `allowed_words` says none."""
+        """Allowed values in words: `allowed_words`, otherwise derived from the type."""
         if self.type is bool:
             return "true or false"
         return self.allowed_words or ", ".join(map(shown, self.values))
@@ -75,9 +75,9 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
     """One request to the daemon. The tag is its name."""
 
     help: ClassVar[str] = ""
-    by: ClassVar[Interface] = _SHELL  # The interfaces that may ask for it
+    by: ClassVar[Interface] = _SHELL  # The interfaces that may send the command
     urgent: ClassVar[bool] = False
-    """True: the control socket keeps places free for it."""
+    """True: the control socket reserves connections for the command."""
 
     @classmethod
     def name(cls) -> str:
@@ -90,7 +90,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
 
     @classmethod
     def read(cls, request: Object) -> Self:
-        """Read a request; keys that are no fields are ignored, and null counts as not given.
+        """Parse a request; unknown keys are ignored, and null counts as not given.
 
         Raises:
             CalibrationRefusedError: a value is not allowed.

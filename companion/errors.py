@@ -1,6 +1,6 @@
-"""The errors, one for each kind of cause, with one root: an interface catches that and shows one line.
+"""Errors, one class for each kind of cause, with one root class: an interface catches that and shows one line.
 
-The text of an error is for a tired pilot: where, what was found, what is allowed.
+The text of an error is for a tired pilot: the place, the value found, and the values allowed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ class CompanionError(Exception):
 
 
 class ConfigError(CompanionError):
-    """The configuration cannot be used; one line that names file, key, what was found and what is allowed."""
+    """The configuration cannot be used; the text is one line with file, key, value found and values allowed."""
 
 
 class LinkError(CompanionError):
@@ -27,7 +27,7 @@ class DaemonDeniedError(DaemonUnreachableError):
 
 
 class NobodyHeardError(CompanionError):
-    """No vehicle or no companion answers on a ground station's link."""
+    """No vehicle, or no companion, answers on a ground station's link."""
 
 
 class StorageError(CompanionError):
@@ -39,7 +39,7 @@ class CalibrationRefusedError(CompanionError):
 
 
 class RequestRefusedError(CalibrationRefusedError):
-    """A request was not started; `kind` says why in one word, as in docs/mqtt.md (armed, busy, moving, ...)."""
+    """A request was not started; `kind` is the reason in one word, as in docs/mqtt.md (armed, busy, moving, ...)."""
 
     def __init__(self, kind: str, reason: str) -> None:
         super().__init__(reason)

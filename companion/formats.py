@@ -1,4 +1,4 @@
-"""JSON files of ours, requests, and words from outside: checked on the way in, made printable on the way out."""
+"""Parsing and checking of JSON files and requests, and text from outside made printable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 
 
 def decode(data: bytes, kind: Any, newest: int | None) -> Any:
-    """Parse JSON as a type; raise msgspec.MsgspecError for any other, and for a `format_version` above `newest`."""
+    """Parse JSON as type `kind`; raise msgspec.MsgspecError if it differs, or has a `format_version` above `newest`."""
     if newest is not None:
         said = msgspec.json.decode(data, type=dict[str, msgspec.Raw]).get("format_version")
         if said is not None and (version := msgspec.json.decode(said, type=int)) > newest:
@@ -29,7 +29,7 @@ Value = str | int | float | bool | None
 
 
 def parse_request(data: bytes) -> dict[str, Any]:
-    """Read an object of texts, numbers, true, false and null; raise ValueError, in one line, for anything else."""
+    """Parse an object of strings, numbers, true, false and null; raise ValueError with one line for anything else."""
     found = msgspec.json.decode(data, type=dict[str, Value])
     for key, value in found.items():
         if isinstance(value, str) and "\0" in value:
@@ -38,9 +38,9 @@ def parse_request(data: bytes) -> dict[str, Any]:
 
 
 def printable(text: str) -> str:
-    """Return a text from outside in one line, with an escape for each letter that moves the cursor or is invisible.
+    """Return a text from outside as one line; escape control characters and invisible ones.
 
-    `ascii` and not a codec: Python loads a codec from a file at its first use, which fails without a free descriptor.
+    Uses `ascii`, not a codec: Python loads a codec from a file at first use, which needs a free file descriptor.
     """
     if text.isprintable():
         return text

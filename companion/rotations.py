@@ -1,12 +1,12 @@
 """MAVLink's sensor orientations by name and number.
 
 The angles are intrinsic yaw, then pitch, then roll (aerospace 3-2-1) of the sensor's axes seen from the vehicle's
-FRD axes. Numbers are those of MAV_SENSOR_ORIENTATION, which ArduPilot's AHRS_ORIENTATION shares.
+FRD axes. The numbers are those of MAV_SENSOR_ORIENTATION and of ArduPilot's AHRS_ORIENTATION.
 """
 
 from __future__ import annotations
 
-# The two that are not what their name says are spelt out: number 38 is 68.8 and 293.3 degrees in both firmwares.
+# `_FINE_DEG` has the two angles that names round: number 38 is pitch 68.8, yaw 293.3 degrees in both firmwares.
 _NAMES = (
     "NONE", "YAW_45", "YAW_90", "YAW_135", "YAW_180", "YAW_225", "YAW_270", "YAW_315", "ROLL_180", "ROLL_180_YAW_45",
     "ROLL_180_YAW_90", "ROLL_180_YAW_135", "PITCH_180", "ROLL_180_YAW_225", "ROLL_180_YAW_270", "ROLL_180_YAW_315",

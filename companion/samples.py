@@ -1,8 +1,8 @@
-"""The words for what sensors say: one frozen structure a kind, units in the field names.
+"""Sensor samples: one frozen structure per kind of sensor, with units in the field names.
 
-`t_s` is when the quantity was sampled, by the host's monotonic clock (the event loop's `time()`), in seconds. It comes
-from the device's own clock. Without one it is the time of the read, less the line time of the frame and of the bytes
-after it (`protocols.decoding.clock`).
+`t_s` is the sampling time on the host's monotonic clock (the event loop's `time()`), in seconds. It comes from the
+device's clock. Without one, it is the time of the read, minus the line time of the frame and of the bytes after it
+(`protocols.decoding.clock`).
 Vectors are in the sensor's own axes until a `mounting` has turned them into the vehicle's FRD.
 """
 
@@ -36,13 +36,13 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     t_device_s: float | None = None
     """The device's own clock, None where the protocol has none; unwrapped by `Decoder.receive`."""
     breaks: int = 0
-    """Number of restarts and clock jumps of the device so far; after each, its biases may be new ones."""
+    """Number of restarts and clock jumps of the device so far; each may have changed its biases."""
     shared_variance: tuple[float, ...] | None = None
-    """(6,) of an error that it has in common with those around it, gyro then accelerometer; None: there is none."""
+    """Variance (6,) of an error common to neighbouring samples, gyro then accelerometer; None: no such error."""
 
 
 class TiltSample(msgspec.Struct, frozen=True, gc=False):
-    """The two readings of a gradienter, in its own axes and by its own law (physics.gradienter)."""
+    """Both readings of a gradienter, in its own axes and by its own law (`physics.gradienter`)."""
 
     t_s: float
     x_deg: float
@@ -58,7 +58,7 @@ class CompassSample(msgspec.Struct, frozen=True, gc=False):
     pitch_deg: float | None = None
     roll_deg: float | None = None
     north: Literal["magnetic", "true"] | None = None
-    """The north that the device states; None: the configuration says it."""
+    """North that the device reports; None: the configuration gives it."""
     temperature_degc: float | None = None
 
 

@@ -1,4 +1,4 @@
-"""The daemon's status in one summary: the rows that every interface shows of it."""
+"""Summary of the daemon's status: the rows that every interface shows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _HEARTBEAT_S: Final = 2.0  # an older heartbeat is a lost link
 
 
 StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str, str]
-"""One part that the companion is connected to, or one warning: verdict, name, words, and the remedy if there is one."""
+"""One connected part, or one warning: verdict, name, text, and the remedy (empty if there is none)."""
 
 
 def headline(status: Object) -> str:
@@ -19,7 +19,7 @@ def headline(status: Object) -> str:
 
 
 def rows(status: Object) -> list[StatusRow]:
-    """List what the companion is connected to, then what needs attention; a reply of `status` or `monitor`."""
+    """List the connected parts, then the problems, from a reply of `status` or `monitor`."""
     vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]
     heartbeat_s, signing = vehicle["heartbeat_age_s"], vehicle["signing"]
     found = [_row(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]

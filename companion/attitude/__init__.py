@@ -1,1 +1,1 @@
-"""Attitude through the flight, from calibrated rates: no I/O, no clock; time comes in with the samples."""
+"""Attitude estimation in flight from calibrated rates: no I/O, no clock; time comes in with the samples."""

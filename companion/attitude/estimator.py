@@ -1,6 +1,6 @@
 """Attitude of the aircraft from one calibrated IMU, a compass and the site (method 3.7).
 
-Strapdown integration of calibrated rates less the Earth's rotation, a slow leveller, and a scalar heading correction.
+Integrates calibrated rates minus the Earth's rotation, with a slow leveller and a scalar heading correction.
 Gyro biases are refined at rest only: in flight a manoeuvre looks like a bias.
 
 Levelling has the form of VQF (Laidig and Seel, Information Fusion 91:187-204, 2023): specific force is low-passed in a
@@ -47,17 +47,17 @@ Phase = Literal["ground", "flight"]
 
 LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
-"""Largest deviation of specific force from g, as a share, at which a self-levelling compass is used."""
+"""Largest deviation of specific force from g, as a share of g, at which a self-levelling compass is used."""
 STEADY_RAD_S: Final = math.radians(20.0)  # Largest rate at which the compass is used
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
-REST_SIGMAS: Final = 5.0  # Threshold beyond which a rest was a movement that began unnoticed
-KEPT_S: Final = 2.0  # Orientations kept for compass readings that come late
+REST_SIGMAS: Final = 5.0  # Threshold above which a rest counts as an undetected movement
+KEPT_S: Final = 2.0  # Span of orientations kept for late compass readings
 FORCE_SMOOTHED_S: Final = 1.0
 """Averaging time of the length of specific force, longer than vibration and gusts."""
 DOUBTED_SHARE: Final = 0.03
-"""Deviation from g, as a share, that halves the weight: three times the scale error of accelerometers. Beyond (15
-degrees of bank) a turn tilts more than a calibrated gyro drifts in its time."""
+"""Deviation from g, as a share of g, that halves the weight: three times the scale error of accelerometers. In a turn
+beyond 15 degrees of bank, levelling would add more tilt error than a calibrated gyro's drift."""
 _UP: Final = (0.0, 0.0, -1.0)
 
 TAU_S: Final = 9.0
@@ -65,16 +65,16 @@ TAU_S: Final = 9.0
 GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
-FIRST_S: Final = 0.1  # Time that the first reading counts for
+FIRST_S: Final = 0.1  # Time span assigned to the first reading
 BADLY: Final = 1.5
-"""Sigma of a poorly known heading, in sigmas of the compass."""
+"""Heading sigma, in compass sigmas, above which the heading counts as poorly known."""
 REFUSED_S: Final = 20.0
-"""Time outside the gate after which the push stops."""
+"""Duration of rejected compass readings after which the companion stops sending the heading."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class AttitudeSettings:
-    """Results of a calibration and data of the site; vehicle FRD, the covariance (3, 3)."""
+    """Calibration results and site data for the estimator; vehicle FRD."""
 
     vehicle_from_sensor: Matrix
     gravity_m_s2: float
@@ -152,7 +152,7 @@ class HeadingAid:
         self._refused_since_s: float | None = None
 
     def gain(self, t_s: float, innovation_rad: float, sigma_rad: float, compass_sigma_rad: float) -> float:
-        """Return the gain for an innovation, with the sigma of our heading; 0: rejected by the gate."""
+        """Return the gain for an innovation; `sigma_rad`: of the estimated heading; 0: rejected by the gate."""
         gate = max(GATE_LEAST_RAD, GATE_SIGMAS * math.hypot(sigma_rad, compass_sigma_rad))
         if not abs(innovation_rad) <= gate:
             if self._refused_since_s is None:
@@ -160,8 +160,8 @@ class HeadingAid:
             return 0.0
         since_s = FIRST_S if self._last_s is None else max(0.0, t_s - self._last_s)
         self._last_s, self._refused_since_s = t_s, None
-        # A poorly known heading is set by the first reading; after that the time constant applies. A heading held by
-        # the compass has its sigma and what the gyros add meanwhile: that is not poorly known.
+        # The first reading sets a poorly known heading; after that the time constant applies. A heading that the
+        # compass corrects has the compass sigma plus gyro drift since then: it is not poorly known.
         badly_rad = BADLY * compass_sigma_rad
         trust = 1.0 - (badly_rad / sigma_rad) ** 2 if sigma_rad > badly_rad else 0.0
         return max(trust, min(1.0, since_s / TAU_S))
@@ -171,7 +171,7 @@ class HeadingAid:
 
 
 class AttitudeEstimator:
-    """Attitude estimator; one call per batch of samples, and no sample makes it raise."""
+    """Estimates the attitude; one call per batch of samples. No sample value raises an exception."""
 
     def __init__(self, settings: AttitudeSettings) -> None:
         self._strapdown = Strapdown()
@@ -186,7 +186,7 @@ class AttitudeEstimator:
         self._leveller = Leveller(settings.gravity_m_s2)
 
     def settle(self, settings: AttitudeSettings) -> None:
-        """Use a newer calibration; the attitude stays, the bias sigma restarts."""
+        """Use a newer calibration; keep the attitude and restart the bias sigma."""
         kept = self._uncertainty.attitude
         self._settle(settings)
         self._leveller.gravity_m_s2 = settings.gravity_m_s2
@@ -304,7 +304,7 @@ class AttitudeEstimator:
             self._forget_rest()
             return
         gain = self._uncertainty.rest(self._still_s)
-        # Both states are truth less estimate: add the correction to the bias, and turn the attitude by it.
+        # Both states are truth minus estimate: add the correction to the bias, and turn the attitude by it.
         found = gain @ left
         bx, by, bz = self._strapdown.bias_rad_s
         self._strapdown.bias_rad_s = (bx + float(found[3]), by + float(found[4]), bz + float(found[5]))
@@ -335,7 +335,7 @@ class AttitudeEstimator:
         return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return the last step before `t_s` and the attitude then, body to NED, by the present level; None: too old."""
+        """Return time and attitude (body to NED, at the present level) of the last step up to `t_s`; None: too old."""
         for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:
                 return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)

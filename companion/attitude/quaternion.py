@@ -36,7 +36,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def normalised(q: Quaternion) -> Quaternion:
-    """Scale to length 1; raise ValueError where the length is zero or not finite."""
+    """Scale to length 1; raise ValueError if the length is zero or not finite."""
     w, x, y, z = q
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.0 < length < math.inf:
@@ -59,7 +59,7 @@ def from_rotation_vector(v: Triple) -> Quaternion:
 
 
 def shortest_arc(a: Triple, b: Triple) -> Quaternion:
-    """Return the smallest rotation from direction `a` to `b`; the identity where either has no length."""
+    """Return the smallest rotation from direction `a` to `b`; the identity if either has length zero."""
     length_a, length_b = math.hypot(*a), math.hypot(*b)
     if not (length_a > _NO_LENGTH and length_b > _NO_LENGTH):
         return IDENTITY
@@ -91,7 +91,7 @@ def to_matrix(q: Quaternion) -> Matrix:
 
 
 def roll_pitch_yaw(q: Quaternion) -> Triple:
-    """Aerospace angles in radians of a quaternion body FRD to NED; yaw in [-pi, pi].
+    """Return the aerospace angles, rad, of a quaternion from body FRD to NED; yaw in [-pi, pi].
 
     At pitch +-90 degrees roll and yaw are not separable; then roll is 0 and yaw carries both.
     """
@@ -108,6 +108,6 @@ def roll_pitch_yaw(q: Quaternion) -> Triple:
 
 
 def from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
-    """Return body FRD to NED from aerospace angles."""
+    """Return the quaternion from body FRD to NED for aerospace angles."""
     roll, pitch = from_rotation_vector((roll_rad, 0.0, 0.0)), from_rotation_vector((0.0, pitch_rad, 0.0))
     return multiply(from_rotation_vector((0.0, 0.0, yaw_rad)), multiply(pitch, roll))

@@ -1,10 +1,10 @@
 """Quaternion strapdown: integrate calibrated rates to attitude, rotate the specific force, propagate the covariance.
 
-Frame E is fixed to the Earth and near NED; leveller and heading hold the rest. Rotation vectors with two-sample coning,
+Frame E is fixed to the Earth and close to NED; `estimator` holds E to NED. Rotation vectors with two-sample coning,
 phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method 3.7). Plain floats: at these sizes ten times faster than arrays.
 
-The covariance is for the gains in use, which are not a Kalman filter's (Joseph's form). Six states: attitude error in
-NED (rad) and gyro bias error in the sensor's axes (rad/s). Method 2.2 and 3.7.
+The covariance is updated in Joseph's form, because the gains in use are not a Kalman filter's. Six states: attitude
+error in NED (rad) and gyro bias error in the sensor's axes (rad/s). Method 2.2 and 3.7.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ STEP_S: Final = 0.02  # Length of the steps over which specific force is average
 TURN_S: Final = 0.004
 """Longest time between rotations of the specific force into E: 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
-"""Silence beyond which the integration is a guess, counted as `missing_s`."""
+"""Longest gap between samples that is integrated as usual; a longer one counts as `missing_s`."""
 _ROUNDING_S: Final = 1e-6
 _ANGLE_SQUARE: Final = 1e6
 _FORCE_SQUARE: Final = 1e8
-"""Limits of one sample, squared: ten times those of the decoders, so that nothing overflows."""
+"""Largest squared norms of one sample: ten times the decoders' limits, so that nothing overflows."""
 LOST_S: Final = 1.0
-"""Silence after which the attitude is lost."""
+"""Gap between samples after which the attitude is lost."""
 
 
 class MotionStep(NamedTuple):
-    """Motion in about `STEP_S`: mean force in E, mean rate without bias in the sensor's axes, and those axes to E."""
+    """Motion over about `STEP_S`: mean force in E, mean rate in the sensor's axes, and orientation at the end."""
 
     t_s: float
     span_s: float
@@ -145,7 +145,7 @@ SCALE_SHARE: Final = 0.003
 GAP_RATE_RAD_S: Final = math.radians(20.0)
 """Error of the rate while samples were missing."""
 MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
-"""Horizontal acceleration after averaging that does not show in the length of the force."""
+"""Horizontal acceleration that remains after averaging and does not change the length of the force."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
 _BIAS_WANDERS_S: Final = 300.0
@@ -155,7 +155,7 @@ _BIAS_WANDERS_S: Final = 300.0
 class Uncertainty:
     """Covariance of attitude and gyro bias.
 
-    `bias_covariance`: (3, 3) of the gyro bias, sensor axes, by sigma_use. The accelerometer bias adds a constant tilt.
+    `bias_covariance`: (3, 3) of the gyro bias from sigma_use, sensor axes. An accelerometer bias adds a constant tilt.
     """
 
     def __init__(
@@ -211,11 +211,11 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
-        """Return the sigma of the mean rate of a rest, (3,), sensor axes."""
+        """Return one sigma (3,) of the mean rate over a rest of `seconds`, sensor axes."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:
-        """Add a rest; return the gain (6, 3) for its mean rate, sensor axes."""
+        """Update with a rest of `seconds`; return the gain (6, 3) for its mean rate, sensor axes."""
         variance = self._rest_variance(seconds)
         part = self._covariance[:, 3:]
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T

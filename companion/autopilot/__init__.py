@@ -1,1 +1,1 @@
-"""The autopilot over MAVLink: its state, its parameters, its IMUs."""
+"""The autopilot over MAVLink: its state, its parameters and its IMUs."""

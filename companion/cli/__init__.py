@@ -2,7 +2,7 @@
 
 Exit codes of every command: 0 done, 1 failed or refused (the reason in `reason`), 2 usage or configuration error (one
 line on stderr), 3 no daemon answers (`companion ground`: no vehicle or no companion is heard). With --json stdout holds
-exactly one JSON object; words go to stderr.
+exactly one JSON object; texts go to stderr.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_lines(error, error=True)
         return USAGE
     except (DaemonUnreachableError, NobodyHeardError) as error:
-        # Who may not ask it need not start it, and from the ground nobody can.
+        # No hint to start the daemon if it denies access (it runs), nor from the ground (out of reach).
         starts = "" if isinstance(error, DaemonDeniedError | NobodyHeardError) else how_to_start(options)
         _fail(options, "unreachable", str(error) + starts)
         return NO_DAEMON
@@ -52,14 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return FAILED
     except BrokenPipeError:
-        # The reader of our output is gone (| head): nothing is left to say, and nobody to say it to.
+        # The reader of our output has ended (| head): print no error.
         sys.stderr.close()
         return FAILED
 
 
 def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
     print_lines(f"companion: {reason}", error=True)
-    if state != "failed" and (remedy := messages.remedy(reason)):  # what the daemon says; a desk's errors say all
+    if state != "failed" and (remedy := messages.remedy(reason)):  # errors of offline tools contain their remedy
         print_lines(f"-> {remedy}", error=True)
     if options.json:
         print_json({"state": state, "reason": reason})
@@ -68,7 +68,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 def _parser() -> Parser:
     from companion.cli import client, desk, ground, local, profile
 
-    # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
+    # -c and --json may come before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
     common.add_argument("--json", action="store_true", help="print one JSON object on stdout")

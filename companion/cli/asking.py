@@ -19,11 +19,11 @@ from companion.setup.draft import Question, one_of
 _MOST_BYTES: Final = 4096
 OPEN_WITHIN_S: Final = 5.0
 EVERY_S: Final = 0.5
-SHOWN_S: Final = 1.0  # A page that is open shows the last state within this time
+SHOWN_S: Final = 1.0  # Time in which an open page has displayed the last state
 
 
 class Asking:
-    """Asks on stdout, or on stderr where stdout is for JSON; reads answers from stdin. `yes`: nobody is asked."""
+    """Questions on stdout, or on stderr if stdout is for JSON; answers from stdin. `yes`: keep all present answers."""
 
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
@@ -34,7 +34,7 @@ class Asking:
         print_lines(*lines, error=self._error)
 
     async def ask(self, question: Question) -> None:
-        """Ask until an answer is accepted; an empty one, or `yes`, means the present one.
+        """Ask until an answer is accepted; an empty answer, or `yes`, keeps the present one.
 
         Raises:
             CompanionError: stdin has ended; or, with `yes`, the present answer is not accepted.
@@ -68,7 +68,7 @@ class Asking:
         return found
 
     async def _line(self) -> str:
-        """Read a line; Ctrl-C ends the wait at once, unlike in `input`."""
+        """Read a line; unlike with `input`, Ctrl-C ends the wait at once."""
         while b"\n" not in self._rest and len(self._rest) < _MOST_BYTES:
             chunk = await _read(sys.stdin.fileno())
             if not chunk:
@@ -85,7 +85,7 @@ async def _read(descriptor: int) -> bytes:
     try:
         loop.add_reader(descriptor, ready.set)
     except PermissionError:
-        return os.read(descriptor, _MOST_BYTES)  # a file, which is always ready
+        return os.read(descriptor, _MOST_BYTES)  # a regular file is always ready
     try:
         await ready.wait()
     finally:
@@ -94,10 +94,10 @@ async def _read(descriptor: int) -> bytes:
 
 
 class PageAsking(Asking):
-    """Asks on a page too; `async with` opens it. `storage` is the daemon's, whose page has the same token."""
+    """Questions on a web page too; `async with` opens it. `storage` is the daemon's: its page uses the same token."""
 
     def __init__(self, bind: str, storage: Path) -> None:
-        from companion.web.server import Page  # the web server is needed here alone
+        from companion.web.server import Page  # no other command needs the web server
 
         super().__init__(yes=False, error=False)
         self._echoes = True
@@ -151,7 +151,7 @@ class PageAsking(Asking):
         return await self._answered
 
     async def _answer(self, request: Object) -> AsyncGenerator[Object, None]:
-        """Answer the page as a daemon's control socket would: with a status, and to the operator's answer."""
+        """Reply to the page as the daemon's control socket does: with the status, and to the operator's answer."""
         if request.get("command") == "status":
             yield {"kind": "result", "status": self._status()}
             return

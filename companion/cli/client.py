@@ -1,4 +1,4 @@
-"""The commands that talk to the running daemon."""
+"""Commands that send requests to the running daemon."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from companion.cli.terminal import (
 from companion.formats import Object
 from companion.links.system.connection import ask
 
-SILENT_S: Final = 2.0  # Silence after which the command says that it waits for an answer
+SILENT_S: Final = 2.0  # Silence after which the command reports that it waits for an answer
 
 
 CANCEL: Final = {"command": "cancel"}
@@ -52,11 +52,11 @@ async def request(
 ) -> Object:
     """Send a request, show its progress on stderr, return its result.
 
-    Ctrl-C, once the daemon has answered, sends `at_interrupt` instead; None: the daemon goes on. `in_place`: progress
-    that only counts, on one line.
+    Ctrl-C after the first reply sends the request `at_interrupt`; None: the daemon continues. `in_place`: show progress
+    on one line, if it only counts.
 
     Raises:
-        DaemonRefusedError: the daemon refuses it.
+        DaemonRefusedError: the daemon refuses the request.
     """
     reply: Object = {}
     shown = ""
@@ -87,7 +87,7 @@ async def request(
 
 
 def _conclude(options: argparse.Namespace, answer: Object, lines: Sequence[str], *, good: bool) -> int:
-    """Print an answer of the daemon, and what to do about a failure."""
+    """Print an answer of the daemon, with the remedy after a failure."""
     remedy = "" if good else messages.remedy(answer.get("reason") or "")
     return conclude(options, answer, [*lines, *([f"{show.REMEDY}{remedy}"] if remedy else [])], good=good)
 
@@ -213,7 +213,7 @@ _FIGURES: Final = {
     "gyro_bias_deg_h": ("gyro bias", "deg/h", "+.1f", 1.0),
 }
 _SHOWN: Final = {"faces": ("accel_bias_mg", "accel_scale", "accel_shear"), "turn": ()}
-"""Figures by kind of alignment; other kinds show all that are known but the shear."""
+"""Figures to show by kind of alignment; other kinds show all known figures except the shear."""
 
 
 def _figure_line(
@@ -223,7 +223,7 @@ def _figure_line(
 
 
 def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float], sigma: Sequence[float]) -> list[str]:
-    """Show the whole bias, and its change by a write: the part that was left in the output."""
+    """Format the whole bias, and its change by a write: the residual bias in the output."""
     if words == "slant when level" or whole is None:
         return [_figure_line(words, "mg", left, sigma, "+.3f")]
     return [_figure_line(words, "mg", whole, sigma, "+.3f"), _figure_line("  change", "mg", left, None, "+.3f")]
@@ -250,7 +250,7 @@ def stands_lines(record: Object) -> list[str]:
         lines.append(f"{imu['name']}:{scatter}")
         whole = imu.get("whole_bias_mg")
         if "level_bias_mg" in imu:
-            # Of accelerometers that are known from all sides this is no bias, but how the board sits.
+            # After a six-position calibration this figure is the tilt of the board, not a bias.
             words = "bias when level" if record.get("board") is None else "slant when level"
             lines += _bias_lines(words, whole, imu["level_bias_mg"], imu["level_sigma_mg"])
         known = [key for key in _FIGURES if key != "accel_shear" and key in imu and all(imu[key]["known"])]

@@ -1,4 +1,4 @@
-"""`companion replay`: a recording, or anybody's log of an IMU at rest; `companion flight`: a log of the autopilot."""
+"""Commands `replay` (a recording, or any log of an IMU at rest) and `flight` (a log of the autopilot)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from companion.lab.still_log import StillLog
     from companion.storage.records import FlightStore
 
-# --json has them all.
+# Only for people: --json lists all differences.
 MOST_DIFFERENCES: Final = 20
 MOST_REASONS: Final = 12
 
@@ -84,7 +84,7 @@ def _replay_recording(options: argparse.Namespace) -> int:
 
 
 def _lines(result: Replay) -> list[str]:
-    """Describe the result; the last line is the verdict."""
+    """Describe the result in lines; the last one is the verdict."""
     from companion.lab.replay import TOLERANCE_SIGMAS
 
     lines: list[str] = []
@@ -261,7 +261,7 @@ async def flight(options: argparse.Namespace) -> int:
 
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
-    """Read the records and learned biases on this computer, and its store of flights; None: no permission."""
+    """Read the records and learned biases on this computer, and its store of flights (None: no permission)."""
     from companion.storage.records import BiasStore, FlightStore, RecordStore
 
     directory = storage_path(options)
@@ -336,5 +336,5 @@ def _table(imu: ImuFlight) -> list[str]:
 def _term(term: Term | None, unit: float, digits: int) -> str:
     if term is None:
         return "?"
-    # Adding zero leaves no minus sign before a zero.
+    # Adding zero avoids "-0".
     return f"{round(term.value / unit, digits) + 0.0:+.{digits}f} ± {term.sigma / unit:.{digits}f}"

@@ -1,4 +1,4 @@
-"""Commands for the ground and not for an aircraft: `companion ground ...` on the laptop, `companion fleet ...`."""
+"""Commands that do not run on an aircraft: `companion ground ...` on a laptop, and `companion fleet ...`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
 
     key = None if options.signing_key_file is None else _key(options.signing_key_file)
     heard = GroundListener(options.component)
-    # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
+    # MAVSDK prints some of its errors on stdout, which is reserved for the answer.
     with contextlib.redirect_stdout(sys.stderr):
         async with open_link(options.url, heard, key) as link:
             station = Station(link, options.url, Display())
@@ -89,7 +89,7 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
 
 @contextlib.asynccontextmanager
 async def _interruptible(station: Station) -> AsyncIterator[None]:
-    """Let Ctrl-C and SIGTERM cancel the station's request at the companion, not only the wait for it."""
+    """Make Ctrl-C and SIGTERM cancel the station's request at the companion, not only the wait for it."""
     loop = asyncio.get_running_loop()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
@@ -169,7 +169,7 @@ async def _acl(options: argparse.Namespace) -> int:
 
 
 async def _until_stopped(runs: Sequence[Coroutine[Any, Any, None]]) -> None:
-    """Run until Ctrl-C, SIGTERM or a failure, which is raised once all have ended."""
+    """Run until Ctrl-C, SIGTERM or a failure; raise a failure after all have ended."""
     from companion.fleet.collector import stop
 
     tasks = [asyncio.ensure_future(run) for run in runs]

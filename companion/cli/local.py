@@ -1,4 +1,4 @@
-"""The commands that need no daemon: run it, check what it would find, list ports, install it, make a report."""
+"""Commands that need no running daemon: run it, check its devices, list ports, install it, make a report."""
 
 from __future__ import annotations
 
@@ -99,21 +99,21 @@ def _absolute(text: str) -> Path:
 
 
 FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
-"""Options of the `setup` that `run` starts without a configuration; its output has the token of the page."""
+"""Options of the `setup` that `run` starts without a configuration. Its output contains the token of the page."""
 
 
 async def run(options: argparse.Namespace) -> int:
-    """Run the daemon; without a configuration a page asks for it first."""
+    """Run the daemon; if there is no configuration, create one on a web page first."""
     if not hasattr(options, "config") and not config_path(options).exists():
         await _first_run(config_path(options))
     load_config(options, profiles=True, forgiving=True)
-    # In the place of this process, whose command line and page the daemon needs no memory for.
+    # Replace this process: the daemon then needs no memory for the command line and the page.
     daemon = [sys.executable, "-m", "companion.daemon", str(config_path(options)), *(["-v"] if options.verbose else [])]
     os.execv(sys.executable, daemon)  # noqa: S606
 
 
 async def _first_run(path: Path) -> None:
-    """Ask for the configuration on a page; without the right to write it, the daemon names the missing file."""
+    """Ask for the configuration on a page. If it cannot be written, ask nothing: the daemon reports the lack of it."""
     from companion.cli import setup as session
     from companion.setup.draft import is_writable
 
@@ -240,7 +240,7 @@ async def report(options: argparse.Namespace) -> int:
     skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
     path: Path | None = None
     if options.output == "-":
-        # In the encoding that the file names, whatever the terminal's is.
+        # Write bytes: the file has its own encoding, which may differ from the terminal's.
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
     else:

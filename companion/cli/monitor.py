@@ -1,7 +1,7 @@
-"""`companion monitor`: the state, its reason, the devices and the last result, until Ctrl-C.
+"""Command `monitor`: the state, its reason, the devices and the last result, until Ctrl-C.
 
-A terminal is redrawn in place with escape sequences that every terminal since the VT100 knows. Elsewhere (TERM=dumb, a
-pipe) a line is printed whenever the state, a device, a warning or the last result changes.
+A terminal is redrawn in place with VT100 escape sequences. For other outputs (TERM=dumb, a pipe) a line is printed
+whenever the state, a device, a warning or the last result changes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from companion.formats import Object, printable
 from companion.links.system.connection import ask
 
 SILENT_S: Final = 5.0
-"""A daemon that is silent for longer hangs."""
+"""Longest silence of a daemon that is not hung."""
 AGAIN_S: Final = 1.0
 
 _FIGURES: Final = re.compile(r"\d+([.,:]\d+)*")
@@ -60,7 +60,7 @@ async def monitor(options: argparse.Namespace) -> int:
                 view.gone(f"the daemon has said nothing for {SILENT_S:g} s")
             await asyncio.sleep(AGAIN_S)
     except asyncio.CancelledError:
-        return DONE  # Ctrl-C is how one leaves
+        return DONE  # Ctrl-C is the normal end
     finally:
         if isinstance(view, _Screen):
             view.close()
@@ -75,7 +75,7 @@ class _Json:
 
 
 class _Lines:
-    """Prints a line with the time of day whenever its words change; a change of figures alone is ignored."""
+    """Output for a pipe: prints a line, with the time of day, when its words change; changed figures are ignored."""
 
     def __init__(self) -> None:
         self._before: set[tuple[object, ...]] = set()
@@ -132,5 +132,5 @@ class _Screen:
 
 
 def _wrapped(line: str, width: int) -> list[str]:
-    """Wrap a line; control characters from outside are escaped."""
+    """Wrap a line; escape control characters in received text."""
     return textwrap.wrap(printable(line), max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]

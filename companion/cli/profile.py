@@ -1,4 +1,4 @@
-"""`companion profile`: the noise of an IMU, from recordings of it at rest."""
+"""Command `profile`: noise of an IMU, estimated from recordings of it at rest."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ async def profile(options: argparse.Namespace) -> int:
 def _learn(
     imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float
 ) -> tuple[SavedProfile, list[str], Object]:
-    """Estimate the noise of one IMU; return it for the disk, as lines for people, and as JSON.
+    """Estimate the noise of one IMU; return the profile to save, lines for people, and JSON.
 
     Raises:
         CalibrationRefusedError: the recordings do not show the noise.
@@ -153,7 +153,7 @@ def _learn(
         "profile": msgspec.to_builtins(learned),
         "compared": msgspec.to_builtins(against),
         "kept": kept,
-        # An upper limit that nobody knows is infinite; msgspec writes null for it.
+        # An unknown upper limit is infinite; msgspec writes null for it.
         "axes": [{"fit": msgspec.json.decode(msgspec.json.encode(fit))} for fit in fits],
         "notes": notes,
     }
@@ -176,7 +176,7 @@ def _table(fits: Sequence[AxisFit], learned: NoiseProfile, compared: NoiseProfil
 
 
 def _cell(fit: AxisFit, which: int, unit: float, digits: int) -> str:
-    """Format a figure with its standard error, or its upper limit where the recordings do not show it."""
+    """Format a figure with its standard error, or its upper limit if the recordings do not show the figure."""
     from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit

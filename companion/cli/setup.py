@@ -1,4 +1,4 @@
-"""`companion setup`: makes a configuration that works from the connected devices and three answers."""
+"""Command `setup`: makes a working configuration from the connected devices and three answers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ WITHOUT: Final = {
 }
 CHECK_S: Final = 10.0
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
-"""1 mrad/s and 1 mg are the steps of SCALED_IMU2 and SCALED_IMU3."""
+"""Warning for SCALED_IMU2 and SCALED_IMU3, which have a resolution of 1 mrad/s and 1 mg."""
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
@@ -84,7 +84,7 @@ class _Session:
         }  # fmt: skip
 
     async def run(self) -> None:
-        """Ask, write and check; whatever ends it, say what was written so far."""
+        """Ask, write and check; after any failure report what was written so far."""
         try:
             await self._run()
         except asyncio.CancelledError:
@@ -181,7 +181,7 @@ class _Session:
         return found
 
     async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
-        """Choose the url: the configured one if it is heard or held, else one that is heard, else a typed one."""
+        """Choose the url: the configured one if it is heard or in use, else another that is heard, else a typed one."""
         say, was = self.asking.say, draft.url
         heard = found.autopilots
         if self._options.mavlink is not None:
@@ -205,7 +205,7 @@ class _Session:
             await self.asking.ask(Question("Autopilot", "", draft.take_url))
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
-        """Choose a heard device; keep a configured one whose port somebody holds."""
+        """Choose a heard device; keep a configured one whose port another program has open."""
         section, heard = draft.section(kind), found.devices(kind)
         if section is not None:
             port = section["port"]
@@ -314,7 +314,7 @@ class _Session:
 
 
 def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
-    """List the next steps; `is_old`: the running daemon has another configuration."""
+    """List the operator's next steps; `is_old`: the running daemon has another configuration."""
     is_service = command == "companion"
     if not good:
         yield f"mend what is wrong above, then: {command} check"
@@ -353,7 +353,7 @@ def _named_values(option: str, given: Sequence[str], allowed: str, names: Sequen
 
 
 async def _daemon_status(config: Config) -> Object | None:
-    """Ask the running daemon for its status; None: none runs; empty: one refuses to answer."""
+    """Return the status of the running daemon; None: none runs; empty: it refuses to answer."""
     from companion.links.system.connection import ask
 
     found: Object = {}
@@ -366,9 +366,9 @@ async def _daemon_status(config: Config) -> Object | None:
 
 
 async def _ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
-    """Offer the autopilot's IMUs that are not configured; return the parts of all that answer, by name.
+    """Offer the autopilot's IMUs that are not configured; return the parts of all IMUs that answer, by name.
 
-    Nothing is written to the autopilot. `by_default`: the answer to the offer where nobody gives one.
+    Nothing is written to the autopilot. `by_default`: default answer to the offer.
     """
     asking.say("", "Asking the autopilot which IMUs it has: up to half a minute. Nothing is changed.")
     from companion.daemon.process.check import answering_imus  # takes seconds on a small board
@@ -377,7 +377,7 @@ async def _ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> d
     mine = [msgspec.structs.replace(imu, profile=None) for imu in config.imu if imu.source == "autopilot"]
     others = {one["name"]: one for one in draft.other_imus()}
     asked = [*mine, *(Imu(**one) for one in others.values())]
-    logging.disable(logging.WARNING)  # the IMUs that do not exist fail to answer
+    logging.disable(logging.WARNING)  # requests to IMUs that do not exist fail, as expected
     try:
         parts = await answering_imus(config, asked)
     finally:

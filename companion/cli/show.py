@@ -1,4 +1,4 @@
-"""Records and states in words and tables, for people."""
+"""Text output for people: records and states as lines and tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from companion.links.serial.ports import SerialPort
 
 
-REMEDY = "-> "  # Beginning of a line that says what to do about the one before
+REMEDY = "-> "  # Prefix of a line with the remedy for the line before
 _BAR = 40
 _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 

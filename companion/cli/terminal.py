@@ -1,4 +1,4 @@
-"""Parts that all commands share: exit codes, printing, the configuration, arguments."""
+"""Common parts of all commands: exit codes, printing, the configuration, arguments."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ NO_DAEMON: Final = 3
 
 Command = Callable[[argparse.Namespace], Coroutine[Any, Any, int]]
 AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
-"""Adds a command to a parser: its name, function and line of help."""
+"""Function that adds a command to a parser by its name, function and line of help."""
 
 
 class DaemonRefusedError(CompanionError):
-    """The daemon has refused a request."""
+    """Refusal of a request by the daemon."""
 
 
 def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
@@ -58,7 +58,7 @@ def print_address(url: str, token: str | None) -> None:
             print_lines(f"or make this window {wide} columns wide, and its camera reads a code here")
             return
         print_lines("or let its camera read this:")
-        # Dark on light, whatever the terminal's colours are.
+        # Black on white, independent of the terminal's colours.
         sys.stdout.write("".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn))
         sys.stdout.flush()
 
@@ -74,7 +74,7 @@ def _code(text: str) -> list[str]:
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:
     """Load the configuration, with or without the saved noise profiles that it names.
 
-    A client of the daemon may not be allowed to read those. `forgiving`: load without a damaged one.
+    A client of the daemon may lack the right to read profiles. `forgiving`: replace a damaged profile by a default.
     """
 
     def saved(directory: Path, name: str) -> NoiseProfile | str:
@@ -86,7 +86,7 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False, forgivin
 
 
 def storage_path(options: argparse.Namespace) -> Path:
-    """Return the storage directory of the configuration; without any configuration, the default one."""
+    """Return the storage directory of the configuration, or the default one if there is no configuration."""
     try:
         return load_config(options).storage.path
     except ConfigError:
@@ -118,7 +118,7 @@ class _Removed(argparse.Action):
 
 
 class Parser(argparse.ArgumentParser):
-    """Says a usage error in one line, and what was probably meant."""
+    """Argument parser that reports a usage error in one line, with the probable meaning."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
@@ -151,7 +151,7 @@ def adder(to: argparse._SubParsersAction[Parser], *parents: Parser) -> AddComman
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
-    """Make the type of an argument: a number within limits; with int a whole one."""
+    """Make the type of an argument: a number within limits; for `kind` int, a whole number."""
 
     def parsed(text: str) -> float:
         try:
@@ -165,7 +165,7 @@ def within(least: float, most: float, kind: type[float] = float, unit: str = "")
     return parsed
 
 
-seconds: Final = within(1e-3, 1e6, unit=" s")  # The type of an argument that is a time in seconds
+seconds: Final = within(1e-3, 1e6, unit=" s")  # Type of an argument for a time in seconds
 _ARGUMENTS: Final = {float: seconds, int: within(1, 1e6, int)}
 
 

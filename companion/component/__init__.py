@@ -1,1 +1,1 @@
-"""Component 191: what the companion is to the rest of the MAVLink network."""
+"""MAVLink component 191: the companion as the rest of the network sees it."""

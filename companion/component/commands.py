@@ -1,18 +1,18 @@
 """The command server of component 191: parses and checks requests, and sends one final COMMAND_ACK for each.
 
-A request is (sender's system, sender's component, command), because a COMMAND_ACK tells no more apart. Three kinds
-of repeat must be told apart too:
+A request is identified by sender's system, sender's component and command: a COMMAND_ACK carries nothing else. The
+server handles three kinds of repeat:
 
-- the network's copy of a packet (two routes, a duplicated datagram): equal to the last byte, sequence number
-  included, within half a second. It is no new request.
-- the sender's own repeat while the job runs: IN_PROGRESS and no second job, since ground stations take any other
-  result for the end.
-- a retransmission (confirmation > 0) of a request that was answered within the last seconds: the final ACK was
-  lost or crossed it on the way. It gets the same result again, and may do so until none has come for 3 s; anything
-  else would calibrate twice for one press of a button. A request with confirmation 0 is a new press and starts anew.
+- The network copies a packet (two routes, a duplicated datagram). A packet that equals one of the last half second in
+  every byte, sequence number included, is ignored.
+- The sender repeats its request while the job runs. The answer is IN_PROGRESS and no second job starts: ground
+  stations treat any other result as the end.
+- The sender retransmits (confirmation > 0) a request that was answered: the final ACK was lost or crossed it on the
+  way. It gets that result again, until no retransmission has come for 3 s; otherwise one press of a button would
+  calibrate twice. A request with confirmation 0 is a new press and starts a new job.
 
-Who may ask is what `mavlink.allow` says; reading is everybody's. A sender's ids are what it says they are: against
-impostors only signatures help (`links/mavlink/signing.py`).
+`mavlink.allow` lists the senders that may request jobs; everybody may read. Sender ids can be forged: only signatures
+protect against that (`links/mavlink/signing.py`).
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from companion.links.mavlink.link import MavlinkLink
 logger = logging.getLogger(__name__)
 
 MAV_RESULT_CANCELLED = 6
-"""In MAVLink's common messages; ArduPilot's dialect lacks the name."""
+"""Value from MAVLink's common messages; ArduPilot's dialect lacks the name."""
 ACK_PERIOD_S = 0.4
-"""QGroundControl gives up 1.2 s after the last IN_PROGRESS, so that two may be lost in a row."""
+"""Interval of IN_PROGRESS: QGroundControl gives up 1.2 s after the last one, so two in a row may be lost."""
 NOTHING_RAN: Final = 1  # `result_param2` of a cancel's ACK when there was nothing to cancel
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
@@ -49,7 +49,7 @@ _REFUSALS: Final = {
     "busy": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
     "unsupported": mavlink.MAV_RESULT_UNSUPPORTED,
 }
-"""Result by the kind of a refusal; the others are DENIED."""
+"""ACK result for each kind of refusal; other kinds are DENIED."""
 _RESULTS = {
     "done": mavlink.MAV_RESULT_ACCEPTED,
     "failed": mavlink.MAV_RESULT_FAILED,
@@ -84,7 +84,7 @@ class Permission:
         self.refused: Counter[tuple[int, int]] = Counter()  # Refusals of the first 32 senders
 
     def refuses(self, sender: tuple[int, int], what: str) -> str:
-        """Return why a sender (system, component) may not request this; empty when it may."""
+        """Return the reason to refuse a sender (system, component); empty: it is allowed."""
         if sender in self.senders:
             return ""
         system, component = sender
@@ -111,7 +111,7 @@ class _Final(NamedTuple):
 class CommandServer:
     """Handles commands addressed to this component; `step` must be called at the times it returns.
 
-    Commands to other components and to component 0 (everyone) are ignored: our ACK would be taken for the autopilot's.
+    Commands to other components and to component 0 (everyone) are ignored: our ACK would pass for the autopilot's.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class CommandServer:
         )
 
     def step(self, now_s: float) -> float:
-        """Acknowledge the running job; return when to do so next (infinity: nothing runs)."""
+        """Acknowledge the running job; return the time of the next call (infinity: no job runs)."""
         retry_s = self._send_unsent(now_s)
         running = self._running
         if running is None:
@@ -143,7 +143,7 @@ class CommandServer:
         return min(retry_s, self._next_ack_s)
 
     def close(self, now_s: float) -> None:
-        """Handle no more commands, and answer the one that runs: no requester must wait for ever."""
+        """Stop handling commands, and send the running one's final ACK: no requester must wait for ever."""
         for unsubscribe in self._subscriptions:
             unsubscribe()
         if self._running is None:
@@ -161,14 +161,14 @@ class CommandServer:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._link.system_id, self._link.component_id):
             return
         if message.command == mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
-            return  # a verdict, not a job, and silence is one of its answers
+            return  # `ArmAuthoriser` answers it: a verdict, not a job, and silence is a valid answer
         key = Key(message.get_srcSystem(), message.get_srcComponent(), message.command)
         request = self._permit(key, judge(message))
         copy = self._is_copy(bytes(message.get_msgbuf()), now_s)
         running = self._running
         if running is not None and running.key == key and not isinstance(request, Refusal):
             if request != running.request:
-                # Not by an ACK, which would be taken for the end of the running job.
+                # Reported as text: ground stations would treat an ACK as the end of the running job.
                 before = running.request
                 doing = "undoing" if isinstance(before, Undo) else f"calibrating {_WORDS[before.biases]}"
                 self._say(Severity.WARNING, f"Still {doing}", Weight.REFUSAL)
@@ -177,10 +177,10 @@ class CommandServer:
         if copy:
             return
         final = self._finals.get(key)
-        # COMMAND_INT has no such field, and is always new.
+        # COMMAND_INT has no confirmation field: each one is a new request.
         confirmation = 0 if isinstance(message, mavlink.MAVLink_command_int_message) else message.confirmation
         if confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
-            # Remembered anew: this copy of the ACK may be lost as well.
+            # The 3 s start again: this copy of the ACK may be lost as well.
             self._finally(key, final.result, now_s, final.detail)
             return
         self._obey(key, request, now_s)
@@ -211,7 +211,7 @@ class CommandServer:
                     self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
                     self._link.send(autopilot_version())
                 case Refusal():
-                    # Ground stations try out by themselves what a component supports: that is worth no warning.
+                    # Ground stations probe by themselves which commands a component supports: no warning for that.
                     severity = Severity.INFO if request.kind == "unsupported" else Severity.WARNING
                     self._refuse(key, request, now_s, severity)
         except Exception:
@@ -267,7 +267,7 @@ class CommandServer:
             self._woken.set()
 
     def _send_unsent(self, now_s: float) -> float:
-        """Send final ACKs again that the transport did not take, while their requesters may still wait."""
+        """Resend final ACKs that the transport did not accept, while their requesters may still wait."""
         retry_s = math.inf
         for key, final in self._finals.items():
             if not final.sent and now_s - final.at_s <= REMEMBER_FINAL_S:
@@ -290,7 +290,7 @@ CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     # Our parameters are all REAL32, the same in both encodings; the flags tell every client to send the number
-    # itself. PARAM_FLOAT is what Mission Planner decides by, ENCODE_C_CAST what the protocol now asks for.
+    # itself. Mission Planner checks PARAM_FLOAT; the present protocol requires ENCODE_C_CAST.
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
 )
@@ -313,7 +313,7 @@ def encode_version(version: str) -> int:
 
 
 def judge(message: CommandMessage) -> Request | Refusal:
-    """Return the request of a command. NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
+    """Parse and check a command. Values are not rounded: where 0, 1 and 2 are allowed, NaN, 0.5 and 3 are refused."""
     if isinstance(message, mavlink.MAVLink_command_int_message):
         last = float(message.x), float(message.y), message.z
     else:
@@ -341,7 +341,7 @@ def judge(message: CommandMessage) -> Request | Refusal:
 
 
 def _calibrate(which: float, reboot: float) -> Calibrate | Refusal:
-    # NaN stands for "not given" with some ground stations.
+    # Some ground stations send NaN for "not given".
     if reboot not in (0.0, 1.0) and not math.isnan(reboot):
         return _denied(f"Calibration refused: param2 {reboot:g}, allowed 0, 1")
     for what in What:
@@ -353,7 +353,7 @@ def _calibrate(which: float, reboot: float) -> Calibrate | Refusal:
 def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refusal:
     """Parse MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers.
 
-    Mission Planner's button always sets param3, ground pressure, too: it is ignored beside gyros or accelerometers.
+    Mission Planner's button always sets param3 (ground pressure): it is ignored beside gyros or accelerometers.
     """
     for number, value in enumerate(parameters, start=1):
         if value != 0 and not (number in (1, 3, 5) and value == 1):

@@ -1,4 +1,4 @@
-"""MAVLink component 191: one loop sends heartbeats, ACKs, texts, tunes and parameters; arming requests are answered."""
+"""MAVLink component 191: answers arming requests; one loop sends heartbeats, ACKs, texts, tunes and parameters."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ VALID_S: Final = 10
 TOLD_BY_US: Final = 1
 """MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot stays silent; our STATUSTEXT has the reason."""
 REPEAT_S: Final = 0.05
-"""Delay of a second, equal answer: links lose packets, and PX4 drops an answer with the time of its question, as
-happens in SITL's lockstep."""
+"""Delay before the same answer is sent again: links lose packets, and PX4 drops an answer that has the same time as
+its request, as happens in SITL's lockstep."""
 ATTEMPT_S: Final = 1.5
-"""Time after which a request that is no retransmission begins a new attempt."""
+"""Time from the start of an arming attempt after which a request begins another one; retransmissions: thrice that."""
 _RESULTS: Final = {
     "accept": mavlink.MAV_RESULT_ACCEPTED,
     "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
@@ -34,12 +34,12 @@ _RESULTS: Final = {
 
 
 class ArmAuthoriser:
-    """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST of our autopilot (PX4) at once, and of nobody else.
+    """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST from our autopilot (PX4) at once; ignores other senders.
 
     The protocol was observed on the firmware (autopilots 9.2) and differs from the message definitions: the validity
-    goes into result_param2, the reason into progress, and an answer that is not addressed to the vehicle's own system
-    id is ignored. An attempt brings two requests, and retransmissions of both; each is answered, but people are told
-    once.
+    goes into result_param2, the reason into progress, and PX4 ignores an answer that is not addressed to its own
+    system id. One attempt to arm sends two requests and retransmissions of both. Each gets an answer, but only one
+    text goes to the pilot.
     """
 
     def __init__(self, link: MavlinkLink, gate: ArmGate, say: Say) -> None:
@@ -56,7 +56,7 @@ class ArmAuthoriser:
             return
         target = (message.target_system, message.target_component)
         if target not in ((self._link.system_id, 0), (self._link.system_id, self._link.component_id)):
-            return  # PX4 asks on every link; whom it asks is checked with its parameters
+            return  # PX4 sends requests on every link; `GateSetup` checks the parameters that name the authoriser
         if self._gate.at_arm == "off":
             return
         answer, gate = self._gate.answer(), self._gate.at_arm == "gate"
@@ -82,7 +82,7 @@ class ArmAuthoriser:
 SCRIPT_PERIOD_S: Final = 0.5
 MARK: Final = b"CMPA\x01"
 REASON_BYTES: Final = 41 - len("Companion: ")
-"""Length of the reason that ArduPilot shows (autopilots 5.3), less the prefix of the script."""
+"""Longest reason that ArduPilot shows (autopilots 5.3), after the script's prefix."""
 VERDICTS: Final = {"wait": 0, "accept": 1, "refuse": 2}
 NOT_GATING: Final = 3
 
@@ -90,10 +90,10 @@ NOT_GATING: Final = 3
 class ArmingScript:
     """Sends the verdict to ArduPilot's arming script (companion/lua/companion_arming.lua) twice a second.
 
-    The component's loop sends it: the script closes the gate after 3 s without it, so that a loop that hangs closes it
-    too. TUNNEL carries it: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the
+    The component's loop sends the verdict; the script closes the gate after 3 s without one, so a hanging loop closes
+    it too. The message is TUNNEL: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the
     autopilot alone, and it has room for the reason as text. Payload: "CMPA", version 1, verdict (0 wait, 1 accept,
-    2 refuse, 3 nothing is gated any more), then the reason, ASCII.
+    2 refuse, 3 the gate is off), then the reason, ASCII.
     """
 
     def __init__(self, link: MavlinkLink, gate: ArmGate) -> None:
@@ -101,7 +101,7 @@ class ArmingScript:
         self._next_s = -math.inf
 
     def step(self, now_s: float) -> float:
-        """Send what is due; return when to send next (infinity: not needed until the next heartbeat)."""
+        """Send the verdict if due; return the time of the next one (infinity: ask again at the next heartbeat)."""
         autopilot = self._link.autopilot
         if autopilot is None or not self._link.connected or not self._gate.asks_script:
             return math.inf
@@ -115,8 +115,8 @@ class ArmingScript:
 
 HEARTBEAT_PERIOD_S = 1.0
 _RETRY_S = 0.05
-PROGRESS: Final = "CMP_PROG"  # Progress of the calibration under way in percent; 100 where none is
-READY: Final = "CMP_READY"  # 1: it may arm; 0: not now
+PROGRESS: Final = "CMP_PROG"  # Progress of the running calibration in percent; 100: none runs
+READY: Final = "CMP_READY"  # 1: the aircraft may arm; 0: not now
 IDLE_BEATS: Final = 5
 
 
@@ -164,19 +164,19 @@ class MavlinkComponent:
 
     def _step(self, now_s: float) -> float:
         if self._link.system_id != self._known_as:
-            # Be heard under the vehicle's system id as soon as the link belongs to it.
+            # Announce the vehicle's system id as soon as the link belongs to that vehicle.
             self._known_as, self._next_heartbeat_s = self._link.system_id, -math.inf
         if now_s >= self._next_heartbeat_s:
             if self._link.connected:
                 kind = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
                 self._link.send(mavlink.MAVLink_heartbeat_message(*kind, 0, 0, self._service.mav_state, 3))
                 self._send_values(now_s)
-                # The rhythm is kept, but what a stall has missed is not made up for.
+                # Keep the rhythm, but do not send the heartbeats that a stall has missed.
                 next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
                 self._next_heartbeat_s = next_s if next_s > now_s else now_s + HEARTBEAT_PERIOD_S
             else:
-                # The first heartbeat on a new connection must not wait for its turn: ArduPilot executes itself
-                # what is addressed to a component that it has not heard.
+                # Retry soon, as the first heartbeat on a new connection is urgent: ArduPilot executes by itself
+                # a command for a component that it has not heard.
                 self._next_heartbeat_s = now_s + _RETRY_S
         return min(
             self._next_heartbeat_s,
@@ -188,7 +188,7 @@ class MavlinkComponent:
         )
 
     def _send_values(self, now_s: float) -> None:
-        """Send progress and readiness, at every heartbeat of a calibration, else at every fifth.
+        """Send progress and readiness: at every heartbeat during a calibration, otherwise at every fifth.
 
         Mission Planner shows them in its Quick tab (`propagateNamedFloats`), QGroundControl in its MAVLink inspector.
         """

@@ -1,10 +1,9 @@
 """Parameters of component 191: a small server of the MAVLink parameter protocol.
 
-All are REAL32, for which the two encodings of autopilots (number, or bytes of an integer) are the same. All names begin
-with CMP_: ArduPilot executes a PARAM_SET for component 191 itself when it cannot forward it, so that none may be one of
-an autopilot's.
+All are REAL32: both autopilot encodings (number, or bytes of an integer) are the same for it. All names begin with
+CMP_, which no autopilot's name does: ArduPilot executes a PARAM_SET for component 191 itself if it cannot forward it.
 
-PARAM_SET is answered at once, with the old value where the new one is not allowed. Other requests are answered from one
+A PARAM_SET is answered at once, with the old value if the new one is not allowed. Other requests are answered from one
 pending set, at a pace for slow telemetry links: a flood of requests costs neither memory nor bandwidth.
 """
 
@@ -29,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 VALUES_PER_S = 40.0
 AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")  # CMP_AT_ARM
-RESULTS: Final = ("none", "done", "failed", "cancelled")  # CMP_STATE: end of the last calibration since the start
+RESULTS: Final = ("none", "done", "failed", "cancelled")  # CMP_STATE: outcome of the last calibration of this run
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
@@ -38,7 +37,7 @@ class Parameter:
     """One parameter; its limits are rounded to float32, as every value is."""
 
     name: str
-    """CMP_ and at most 12 more of A-Z, 0-9 and _ (16 in all, the protocol's limit)."""
+    """CMP_ and at most 12 more characters from A-Z, 0-9 and _ (16 in all is the protocol's limit)."""
     value: float
     minimum: float
     maximum: float
@@ -69,7 +68,7 @@ class OwnParameters:
         return self._values[name]
 
     def set(self, name: str, value: float) -> None:
-        """Set a value from inside and send a new one to everyone; raise ValueError where it is out of the limits."""
+        """Set a value from inside the daemon and send a changed one to everyone; raise ValueError beyond the limits."""
         parameter = self._by_name[name]
         value = float32(value)
         if not parameter.allows(value):
@@ -80,7 +79,7 @@ class OwnParameters:
 
     def step(self, now_s: float) -> float:
         if not self._pending or not self._link.connected:
-            # Changes are sent once there is a transport again.
+            # Changes stay pending until there is a transport again.
             return math.inf
         if now_s >= self._next_s:
             name = next(iter(self._pending))
@@ -123,7 +122,7 @@ class OwnParameters:
             return
         parameter = self._by_name.get(message.param_id)
         if parameter is None:
-            # To component 0 the name may be any other component's.
+            # A request to component 0 (everyone) may name another component's parameter: stay silent.
             if message.target_component == self._link.component_id:
                 self._send_unknown(message, -1)
             return
@@ -143,7 +142,7 @@ class OwnParameters:
         if parameter.on_set is None:
             return "it is read only"
         if message.param_type != _REAL32:
-            # The bytes could be a number or an integer's bits; which one depends on the sender's habits.
+            # The bytes could be a number or an integer's bits, depending on the sender.
             return f"its type is REAL32 (9), not {message.param_type}"
         if not parameter.allows(value):
             return f"{value:g} is not in {parameter.minimum:g} .. {parameter.maximum:g}"

@@ -15,11 +15,11 @@ from companion.estimation.machine import What
 MEASURED_PERCENT: Final = 70.0
 """Progress at which measuring ends, and estimating and writing begin."""
 WRITTEN_PERCENT: Final = 80.0
-"""Progress from which on the telemetry is watched for the new values, and the autopilot settles."""
+"""Progress at which writing ends, and the check of the telemetry and the autopilot's settling begin."""
 
 
 class Refusal(msgspec.Struct, frozen=True):
-    """Refusal of a request; `reason` is one line for people, without a leading "refused"."""
+    """Refusal of a request; `reason` is one line for people and does not begin with "refused"."""
 
     kind: Literal["armed", "unknown", "busy", "nothing_to_undo", "unsupported", "other"]
     reason: str
@@ -33,7 +33,7 @@ class JobResult(msgspec.Struct, frozen=True):
 
 
 class AcceptedJob(Protocol):
-    """A calibration or an undo under way."""
+    """A running calibration or undo."""
 
     progress_percent: int
     """0 to 100; never falls."""
@@ -43,8 +43,8 @@ class AcceptedJob(Protocol):
 class CalibrationService(Protocol):
     """The calibration service. Every method returns at once.
 
-    The service itself says (`StatusText.say`) that a job starts, what it waits for and how it ended, as jobs are also
-    requested by others than MAVLink. The component says refusals.
+    The service itself reports (`StatusText.say`) the start, the waiting and the outcome of a job, as jobs are also
+    requested through other interfaces than MAVLink. The component reports refusals.
     """
 
     def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal: ...
@@ -52,11 +52,11 @@ class CalibrationService(Protocol):
     def start_undo(self, requester: str) -> AcceptedJob | Refusal: ...
 
     def cancel(self, requester: str) -> bool:
-        """Cancel the running job, whoever requested it; False where there was none."""
+        """Cancel the running job, whoever requested it; return False if there was none."""
 
     @property
     def progress_percent(self) -> int:
-        """Progress of the calibration or undo under way; 100 where none is."""
+        """Progress of the running calibration or undo; 100: none runs."""
 
     @property
     def mav_state(self) -> int:
@@ -66,17 +66,17 @@ class CalibrationService(Protocol):
 class ArmAnswer(msgspec.Struct, frozen=True):
     """The arm gate's answer at this moment.
 
-    "accept": it may arm. "wait": soon, by itself or by holding still. "refuse": not until somebody acts. `words` give
-    reason and remedy, in at most 41 characters where possible (the length that ArduPilot shows).
+    "accept": the aircraft may arm. "wait": it may soon, by itself or once held still. "refuse": somebody has to act
+    first. `words` give reason and remedy, in at most 41 characters where possible (the length that ArduPilot shows).
     """
 
     verdict: Literal["accept", "wait", "refuse"]
     words: str
     hold_still_s: int | None = None
-    """Time to hold still, where nothing else is needed."""
-    meanwhile: str = ""  # Activity while it is held still
+    """Time to hold still, if nothing else is needed."""
+    meanwhile: str = ""  # Activity while the aircraft is held still
     against: str = ""
-    """Reason why it would arm uncalibrated; empty where the reason is another."""
+    """Reason why the aircraft counts as uncalibrated; empty: `words` give another reason against arming."""
 
     @classmethod
     def hold_still(cls, seconds: float, meanwhile: str = "", against: str = "") -> ArmAnswer:
@@ -86,7 +86,7 @@ class ArmAnswer(msgspec.Struct, frozen=True):
 
 
 class ArmGate(Protocol):
-    """The arm gate; it answers at once."""
+    """The arm gate. Every method returns at once."""
 
     @property
     def at_arm(self) -> Literal["gate", "warn", "off"]: ...

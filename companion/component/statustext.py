@@ -1,14 +1,14 @@
-"""For people: STATUSTEXT, short lines; and tunes on the autopilot's buzzer.
+"""Messages for people: short STATUSTEXT lines, and tunes on the autopilot's buzzer.
 
 Three limits protect a slow telemetry link: a text is not repeated within seconds unless a result came in between, a
-token bucket bounds the lines per second, and the queue is bounded. A full queue drops the oldest of the lightest texts,
-so that news and refused commands never displace a result.
+token bucket bounds the lines per second, and the queue is bounded. A full queue drops the oldest of the texts with the
+least weight, so that news and refused commands never displace a result.
 
-Texts must not begin with "[cal]": QGroundControl takes such lines as the progress of PX4's own calibration.
+Texts must not begin with "[cal]": QGroundControl reads such lines as the progress of PX4's own calibration.
 
-Tunes are for an operator who looks at no screen. Both firmwares take PLAY_TUNE (258) in QBasic's notes (ArduPilot
-`AP_Notify/ToneAlarm.cpp` and `MMLPlayer.cpp`, PX4 `mavlink_receiver.cpp` and `lib/tunes`). Neither acknowledges a tune,
-and both play it in flight too: no tune is sent then. PX4 garbles a tune that comes before the last one has ended.
+Tunes are for an operator who looks at no screen. Both firmwares accept PLAY_TUNE (258) in QBasic's notes (ArduPilot
+`AP_Notify/ToneAlarm.cpp` and `MMLPlayer.cpp`, PX4 `mavlink_receiver.cpp` and `lib/tunes`). Neither acknowledges a tune.
+Both would play it in flight too, so none is sent then. PX4 garbles a tune that arrives before the last one has ended.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ _ASCII = str.maketrans(
 
 
 class Severity(enum.IntEnum):
-    """MAV_SEVERITY. CRITICAL: act this second. ERROR: a request has failed. WARNING: the pilot has to know this fault.
+    """MAV_SEVERITY. CRITICAL: act this second. ERROR: a request has failed. WARNING: a fault the pilot has to know.
 
-    NOTICE: a request or a success, spoken to an operator who looks at no screen, hence short. INFO: to be read.
-    QGroundControl speaks NOTICE and worse aloud (`Vehicle.cc`: `severity <= MAV_SEVERITY_NOTICE`), as our page does,
-    and opens a window for ERROR and worse. Mission Planner speaks and shows on its HUD WARNING and worse, unless its
-    user has chosen NOTICE (`MAVLinkInterface.cs`: setting "severity", 4 by default).
+    NOTICE: a request to the operator or a success; it is spoken aloud, hence short. INFO: text to read.
+    QGroundControl and our page speak NOTICE and worse (`Vehicle.cc`: `severity <= MAV_SEVERITY_NOTICE`).
+    QGroundControl opens a window for ERROR and worse. Mission Planner speaks WARNING and worse and shows it on its HUD,
+    unless its user has chosen NOTICE (`MAVLinkInterface.cs`: setting "severity", 4 by default).
     """
 
     CRITICAL = 2
@@ -79,17 +79,17 @@ Say = Callable[[Severity, str, Weight], object]  # Sends a text to the ground st
 
 
 def to_ascii(text: str) -> str:
-    # Ground stations disagree on everything else.
+    # Ground stations show other characters differently.
     text = unicodedata.normalize("NFKD", " ".join(text.translate(_ASCII).split()))
     text = "".join(character for character in text if not unicodedata.combining(character))
     return "".join(character if " " <= character <= "~" else "?" for character in text)
 
 
 def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
-    """Split a text into lines of one message each, of which only the first is spoken.
+    """Split a text into lines of one message each; only the first is spoken.
 
-    Lines end at the last pause that fits, else between two words; a NOTICE ends before its first figure, which is for
-    readers. MAVLink's own split of long texts (`chunk_seq`) cuts words, and some receivers speak all of it.
+    A line ends at the last pause that fits, otherwise between two words. The first line of a NOTICE ends before the
+    first figure, as figures are to be read. MAVLink's `chunk_seq` cuts words, and some receivers speak every chunk.
     """
     found: list[tuple[Severity, str]] = []
     rest = text
@@ -125,7 +125,7 @@ def _end_of_line(text: str, *, figures: bool, most: int = LINE_BYTES) -> int:
 
 
 class StatusText:
-    """Queue of texts; `step` sends what may be sent now."""
+    """Queue of texts; `step` sends as many as the limits allow."""
 
     def __init__(self, link: MavlinkLink) -> None:
         self.woken = asyncio.Event()  # Set when there is something new to send, for the caller of `step`
@@ -141,7 +141,7 @@ class StatusText:
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
         """Queue a text; return False when it repeats one of the last seconds, or when the queue is full.
 
-        A result is never a repeat: each ends a request of its own, and texts before it may be repeated for the next.
+        A result is never a repeat, as each ends another request; texts before it may be repeated for the next request.
         """
         text = to_ascii(text)
         now_s = asyncio.get_running_loop().time()
@@ -162,9 +162,9 @@ class StatusText:
         return True
 
     def step(self, now_s: float) -> float:
-        """Send what the bucket allows; return when there is more to do (infinity: nothing waits)."""
+        """Send as many lines as the token bucket allows; return the time of the next call (infinity: none pending)."""
         if not self._link.connected:
-            # Texts wait; the heartbeat, which is due as soon as there is a transport, brings us back here.
+            # Texts stay pending: the heartbeat is due as soon as there is a transport, and `step` follows it.
             return math.inf
         while self._lines.left(now_s) >= 1.0 - 1e-9:
             if not self._sending:
@@ -189,14 +189,14 @@ class StatusText:
 
 
 TUNES_APART_S: Final = 1.5
-"""Time between the beginnings of two tunes: the longest takes 1.1 s."""
+"""Least time between the starts of two tunes: the longest tune takes 1.1 s."""
 TUNE_STALE_S: Final = 3.0  # Age at which a tune that could not be played is dropped
 
 
 class Tune(enum.Enum):
-    """Tunes by meaning; their notes are at most 29 characters, the first field of PLAY_TUNE.
+    """Tunes by meaning. The notes fit the first field of PLAY_TUNE: at most 29 characters.
 
-    HOLD_STILL is one long note, NEXT goes up (this pose is done), WRONG to and fro (not the requested pose).
+    HOLD_STILL: one long note. NEXT, this pose is done: rising notes. WRONG, not the requested pose: alternating notes.
     """
 
     HOLD_STILL = "MFT200O4A2"
@@ -207,7 +207,7 @@ class Tune(enum.Enum):
 
 
 class Tunes:
-    """Plays while disarmed and `wanted`; `step` sends what is due, and `woken` is set when there is something."""
+    """Plays tunes while disarmed and `wanted`; `step` sends a due tune, and `play` sets `woken` for its caller."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, wanted: Callable[[], bool], woken: asyncio.Event) -> None:
         self._link, self._vehicle, self._wanted, self._woken = link, vehicle, wanted, woken

@@ -1,7 +1,7 @@
-"""The configuration: what may be set, what it means, and one clear line for every mistake.
+"""Configuration: parser of the TOML file, with a one-line error for every mistake.
 
 A TOML file becomes frozen structures with units in their names. Unknown keys are errors (with the nearest known
-key), so that a misspelt limit is never silently a default.
+key), so that a misspelt limit never silently becomes a default.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from companion.errors import ConfigError, StorageError
 
 DEFAULT_PATH = Path("/etc/companion/companion.toml")
 MOST_BYTES: Final = 64 * 1024
-"""The longest configuration file; the sample, which has every key, is a ninth of that."""
+"""Longest configuration file; the sample, which has every key, is a ninth of that."""
 MOST_LINE: Final = 4096
-"""The most characters of a line: the time that TOML takes for a key grows with the square of its dots."""
+"""Most characters of a line: the time to parse a TOML key grows with the square of its dots."""
 CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
 _Kind = typing.TypeVar("_Kind", bound=msgspec.Struct)
 
 Saved = Callable[[Path, str], NoiseProfile | str]
-"""Looks up a saved profile by storage directory and name, or returns the name.
+"""Function that looks up a saved profile by storage directory and name, or returns the name.
 
 Raises:
-    ConfigError, StorageError: there is none, or it cannot be read; in words that follow "found".
+    ConfigError, StorageError: there is no such profile, or it cannot be read; the text continues "found".
 """
 
 
@@ -47,13 +47,13 @@ def _none(_directory: Path, wanted: str) -> NoiseProfile:
 
 
 def load(path: Path, saved: Saved = _none) -> Config:
-    """Read and check a configuration file; raise ConfigError in one line as `parse`."""
+    """Read and check a configuration file; raise ConfigError with one line (see `parse`)."""
     text = read(path, "companion setup makes it (or give another with -c FILE)")
     return parse(text, str(path), saved)
 
 
 def read(path: Path, missing: str) -> str:
-    """Read the text of a configuration file; `missing`: the remedy in the ConfigError if there is none."""
+    """Read the text of a configuration file; `missing`: remedy in the ConfigError if there is no file."""
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES + 1).decode()
@@ -64,7 +64,7 @@ def read(path: Path, missing: str) -> str:
 
 
 def parse(text: str, name: str, saved: Saved = _none) -> Config:
-    """Check the text of a configuration file; `name` stands for the file in messages.
+    """Check the text of a configuration file; messages call the file `name`.
 
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
@@ -75,7 +75,7 @@ def parse(text: str, name: str, saved: Saved = _none) -> Config:
 
 
 def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
-    """Convert the text of a file without the rules that span several keys; raise ConfigError as `parse`."""
+    """Convert the text of a file without the rules that span several keys; raise ConfigError (see `parse`)."""
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{name}: found more than {MOST_BYTES} bytes; allowed: a configuration file")
     for number, line in enumerate(text.split("\n"), 1):
@@ -85,7 +85,7 @@ def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
         raw = tomllib.loads(text)
     except RecursionError:
         raise ConfigError(f"{name}: not valid TOML: brackets within brackets, too deep") from None
-    except ValueError as error:  # TOML's own errors, and what Python says of a number with thousands of digits
+    except ValueError as error:  # also raised by Python for a number with thousands of digits
         raise ConfigError(f"{name}: not valid TOML: {brief(str(error))}") from None
     refuse_unknown_keys(raw, kind, "", name)
     try:

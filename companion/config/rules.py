@@ -1,4 +1,4 @@
-"""Rules that span several keys of the configuration file; a check yields its complaints in words."""
+"""Rules that span several keys of the configuration file; each check yields its complaints as text."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _port(port: str, here: str) -> Iterator[str]:
 
 
 def _ports_differ(config: Config) -> Iterator[str]:
-    """Check that each port has one user; the roles of one device share theirs, and agree on the line."""
+    """Check that each port has one user; roles of one device share a port and must agree on its line setting."""
     used: dict[str, list[tuple[str, Imu | Gradienter | Compass]]] = {}
     for here, device in _serial_devices(config):
         for before, other in (sharing := used.setdefault(device.port or "", [])):
@@ -145,7 +145,7 @@ def _shared(
         yield _wrong(f"{here}.port", f"{device.port!r}, which {before}.port has already", "a port of its own")
     for key in ("protocol", "baud", "parity"):
         ours, theirs = getattr(device, key, None), getattr(other, key, None)
-        # A section may leave open what another one of the same device says.
+        # A section may omit a setting that another section of the device has.
         if ours is not None and theirs is not None and ours != theirs:
             found = f"{ours!r} on {device.port}, where {before}.{key} is {theirs!r}"
             yield _wrong(f"{here}.{key}", found, f"{theirs!r} (one device serves both), or a port of its own")
@@ -165,9 +165,9 @@ _BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<por
 
 
 def bind_problem(bind: str, name: str) -> str | None:
-    """Return why a page cannot be bound there, or None.
+    """Return the reason why a page cannot be bound to an address, or None.
 
-    Numbers only: what a name stands for may change with the network, and with it who can reach the page.
+    Only numeric addresses are allowed: a name's address, and so who can reach the page, may change with the network.
     """
     match = _BIND.fullmatch(bind)
     host = (match["six"] or match["host"]) if match else ""
@@ -199,7 +199,7 @@ def _mounting(mounting: Mounting, here: str) -> Iterator[str]:
 
 
 def _upright(mounting: Mounting, here: str) -> Iterator[str]:
-    """Refuse a gradienter or compass on its side or head: it does not work there, and cannot tell."""
+    """Refuse a gradienter or compass on its side or upside down: it does not work there, and reports no fault."""
     roll_deg, pitch_deg, _ = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
     if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
         yield _wrong(here, f"{mounting!r}, on its side or upside down", "within 60 degrees of upright")

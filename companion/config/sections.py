@@ -1,4 +1,4 @@
-"""The sections of the configuration file and what may stand in them."""
+"""Sections of the configuration file, their keys and allowed values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _IDS: Final = re.compile(r"(?:\*|([0-9]{1,3})(?:-([0-9]{1,3}))?)")
 
 
 class Senders:
-    """Senders named by a list such as "255", "255:190", "250-255", "*:190", "*"; raise ValueError for another entry."""
+    """MAVLink senders from a list such as "255", "255:190", "250-255", "*:190", "*"; ValueError for another entry."""
 
     def __init__(self, entries: Iterable[str]) -> None:
         self._pairs = [_pair(entry) for entry in entries]
@@ -51,7 +51,7 @@ ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "sti
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
 """Profiles of the catalogue; others are learned and saved (`companion profile --save`)."""
 UNKNOWN: Final[Profile] = "unknown"
-"""The profile of a part that nobody has named: the figures of the worst common parts."""
+"""Profile of an unknown part: the figures of the worst common parts."""
 GradienterProtocol = Literal[
     "inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000", "rion", "pni", "witmotion", "stim300"
 ]
@@ -79,7 +79,7 @@ Mounting = str | tuple[float, float, float]
 
 
 def secret_path(name: str) -> Path:
-    """Return the path of a secret; a name without a folder is one of systemd's credentials."""
+    """Return the path of a secret; a name without a folder is a systemd credential."""
     return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / name
 
 
@@ -87,7 +87,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class VehicleSection(Section, frozen=True):
-    """Place and system id of the aircraft, where the autopilot is not to be asked, and what it stands on."""
+    """Place and system id of the aircraft, if they should not come from the autopilot, and the platform under it."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
@@ -100,15 +100,15 @@ class VehicleSection(Section, frozen=True):
 class Mavlink(Section, frozen=True):
     url: NonEmpty
     component_id: Annotated[int, Meta(ge=2, le=255)] = 191
-    """0 means everybody, and 1 is the autopilot."""
+    """MAVLink component id; 0 (broadcast) and 1 (autopilot) are reserved."""
     allow: tuple[str, ...] = EVERYBODY
-    """Senders that may calibrate, cancel, undo and set our parameters, as `Senders` reads them."""
+    """Senders that may calibrate, cancel, undo and set our parameters, in the format of `Senders`."""
     signing: Signing | None = None
     signing_key_file: NonEmpty | None = None
 
     @property
     def signing_mode(self) -> Signing:
-        """The configured mode, else "require" with a key and "off" without."""
+        """Signing mode: as configured, else "require" with a key and "off" without."""
         return self.signing or ("off" if self.signing_key_file is None else "require")
 
     @property
@@ -129,14 +129,14 @@ class AllanModel(msgspec.Struct, frozen=True):
 
 
 class NoiseProfile(msgspec.Struct, frozen=True):
-    """Noise of one make of IMU: of the catalogue, or saved. A recording keeps the saved one of each IMU."""
+    """Noise of one IMU model, from the catalogue or saved. A recording contains the saved profile of each IMU."""
 
     name: NonEmpty
     gyro: AllanModel
     accel: AllanModel
-    origin: str = ""  # Words: the recordings that a saved profile was learned from
+    origin: str = ""  # Text: recordings from which a saved profile was learned
     warm_up: tuple[float, float] | None = None
-    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: not known."""
+    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: unknown."""
 
     def of(self, triad: Triad) -> AllanModel:
         return self.gyro if triad == "gyro" else self.accel
@@ -157,8 +157,8 @@ class Imu(Section, frozen=True):
     protocol: ImuProtocol | None = None
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
-    read_only: bool = False  # True: nothing is ever sent to the device on that port
-    profile: str | NoiseProfile | None = None  # One of the catalogue (`Profile`), or a saved one
+    read_only: bool = False  # True: nothing is ever sent to the device on this port
+    profile: str | NoiseProfile | None = None  # Profile of the catalogue (`Profile`), or a saved one
 
 
 class Gradienter(Section, frozen=True):
@@ -170,7 +170,7 @@ class Gradienter(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: tuple[float, float] = (0.0, 0.0)
     sigma_deg: PositiveFloat | None = None
-    """None: the protocol's (protocols/registry.py), else 0.05."""
+    """Sigma of the tilt; None: the protocol's (protocols/registry.py), else 0.05."""
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
     """Time constant of fluid and filters; None: the protocol's."""
@@ -185,13 +185,13 @@ class Compass(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
     sigma_deg: PositiveFloat | None = None
-    """None: the protocol's, else 3."""
+    """Sigma of the heading; None: the protocol's, else 3."""
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
     heading: Literal["device", "field"] = "device"
-    """field: computed from the device's field vector and the gradienter's tilt, not the device's own heading."""
+    """Source of the heading. device: the device; field: the device's field vector and the gradienter's tilt."""
     counts_per_gauss: PositiveFloat | None = None
-    """Scale of a field in counts; None: its strength is not checked."""
+    """Scale of a field in counts; None: the field's strength is not checked."""
 
 
 class Calibration(Section, frozen=True):
@@ -201,13 +201,13 @@ class Calibration(Section, frozen=True):
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
     max_age_min: PositiveFloat = 30.0
-    """Time after the last confirmation at which a calibration is out of date (method 3.2)."""
+    """Age since the last confirmation at which a calibration is out of date (method 3.2)."""
     max_temperature_change_degc: PositiveFloat = 3.0
-    """Change of temperature since then at which it is out of date (method 3.2)."""
+    """Change of temperature since the last confirmation at which a calibration is out of date (method 3.2)."""
     prior: bool = True
-    """True: earlier calibrations guard new ones, and are combined with them (docs/calibration.md)."""
+    """True: check new calibrations against earlier ones, and combine them (docs/calibration.md)."""
     any_bias: bool = False
-    """True: accept biases beyond those of any part, and gravity along another axis than the tilt says."""
+    """True: accept biases beyond those of any part, and gravity along another axis than the tilt shows."""
 
 
 class Push(Section, frozen=True):
@@ -215,7 +215,7 @@ class Push(Section, frozen=True):
     attitude: Literal["off", "yaw", "full"] = "off"
     attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
     stop_rivals: bool = False
-    """True: switch off what in the autopilot overwrites our biases; an undo switches it on again."""
+    """True: switch off functions of the autopilot that overwrite our biases; an undo switches them on again."""
 
 
 class ComponentSection(Section, frozen=True):
@@ -229,7 +229,7 @@ class Mqtt(Section, frozen=True):
     base_topic: NonEmpty | None = None
     """Beginning of all topics; None: "companion/" and the vehicle's system id."""
     client_id: NonEmpty | None = None
-    """None: the base topic with "-" for "/"."""
+    """Client id; None: the base topic with "-" for "/"."""
     username: NonEmpty | None = None
     password_file: NonEmpty | None = None
     tls: bool = False
@@ -248,24 +248,24 @@ class Mqtt(Section, frozen=True):
 
 
 class Fleet(Section, frozen=True):
-    """Items for a fleet's collector, kept and sent over `mqtt`; without the section there are none."""
+    """Items for a fleet's collector, saved and sent over `mqtt`; without this section there are none."""
 
     name: NonEmpty | None = None  # Name of the aircraft
-    location: Location = "off"  # Precision of the place in the items
+    location: Location = "off"  # Precision of the location in the items
 
 
 class Control(Section, frozen=True):
     socket: NonEmpty | None = None
-    group: NonEmpty | None = None  # Group whose members may use it, besides the daemon's own user and root
+    group: NonEmpty | None = None  # Group whose members may use the socket, besides the daemon's user and root
 
     @property
     def group_name(self) -> str | None:
-        """The group: as configured, else the one that the service's unit names, else None."""
+        """Group of the socket: as configured, else that of the service's unit, else None."""
         return self.group or os.environ.get("COMPANION_CONTROL_GROUP") or None
 
     @property
     def path(self) -> Path:
-        """The socket's path: as configured, else in systemd's runtime directory, else /run/companion."""
+        """Path of the socket: as configured, else in systemd's runtime directory, else /run/companion."""
         if self.socket is not None:
             return Path(self.socket)
         return Path(os.environ.get("RUNTIME_DIRECTORY", "/run/companion")) / "control.sock"
@@ -274,11 +274,11 @@ class Control(Section, frozen=True):
 class Storage(Section, frozen=True):
     directory: NonEmpty | None = None
     recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
-    """Size of the ring of recordings; 0: no ring; None: a modest ring, if mcap is installed."""
+    """Size of the ring of recordings; 0: no ring; None: a small ring, if mcap is installed."""
 
     @property
     def path(self) -> Path:
-        """The folder: as configured, else systemd's state directory, else /var/lib/companion."""
+        """Storage folder: as configured, else systemd's state directory, else /var/lib/companion."""
         if self.directory is not None:
             return Path(self.directory)
         return Path(os.environ.get("STATE_DIRECTORY", "/var/lib/companion"))

@@ -1,4 +1,4 @@
-"""Errors of a configuration file, in the file's own words; removed keys, commands and options with their remedies."""
+"""Error texts for a configuration file, in its terms; removed keys, commands and options with their remedies."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def refusal_of_words(command: str, word: str) -> str | None:
 
 
 def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path: str, name: str) -> None:
-    """Refuse the first key that no section knows, and values that no key could have.
+    """Refuse the first unknown key, and values that no key can have.
 
     Raises:
-        ConfigError: names the key and the nearest known one, or what is allowed.
+        ConfigError: names the key and the nearest known one, or the allowed ones.
     """
     known = typing.get_type_hints(section)
     for key, value in raw.items():
@@ -85,9 +85,9 @@ def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path
 
 
 def _refuse_unusable(value: object, here: str, name: str) -> None:
-    """Refuse values that TOML allows and no key can have: nan, inf, huge integers, invisible characters."""
+    """Refuse values that are valid TOML but invalid for any key: nan, inf, huge integers, invisible characters."""
     within = [value]
-    while within:  # no recursion: dots in a key nest as deep as they like
+    while within:  # no recursion: dots in a key may nest to any depth
         item = within.pop()
         if isinstance(item, dict):
             within += [*item, *item.values()]
@@ -110,7 +110,7 @@ def brief(words: str) -> str:
 
 
 def _section_in(annotation: object) -> type[msgspec.Struct] | None:
-    """The section type inside an annotation such as `Section | None` or `list[Section]`."""
+    """Return the section type inside an annotation such as `Section | None` or `list[Section]`."""
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         return annotation
     for inner in typing.get_args(annotation):
@@ -125,7 +125,7 @@ _MISSING = re.compile(r"missing required field `(?P<field>\w+)`")
 
 
 def explain(message: str, raw: dict[str, Any]) -> str:
-    """Turn msgspec's message into `key: found ..., allowed ...` in the file's own words."""
+    """Convert msgspec's message to `key: found ..., allowed ...` in the file's terms."""
     match = _AT_PATH.match(message)
     what, path = (match["what"], (match["path"] or "").lstrip(".")) if match else (message, "")
     missing = _MISSING.search(what)

@@ -41,21 +41,21 @@ from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltS
 from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
-"""Rate asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
+"""Rate requested for each autopilot IMU unless the connection limits it; the autopilot's filters pass 20 Hz."""
 LEAST_IMU_RATE_HZ: Final = 10.0
 LINE_SHARE: Final = 0.5
 BITS_PER_BYTE: Final = 10.0  # Bits on the wire for one byte (8N1): a start bit, eight bits of data, a stop bit
-# Lengths in MAVLink 2 of HIGHRES_IMU, VISION_POSITION_ESTIMATE and SCALED_IMU2: 63, 117 and 24 bytes, and 12 around.
-HIGHRES_BYTES: Final = 75.0  # Length of HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them
+# Lengths in MAVLink 2: the payload and 12 bytes of header and checksum.
+HIGHRES_BYTES: Final = 75.0  # Length of HIGHRES_IMU: 63 bytes and 12
 VISION_BYTES: Final = 129.0  # Length of VISION_POSITION_ESTIMATE: 117 bytes and 12
 SCALED_BYTES: Final = 36.0  # Length of SCALED_IMU2 and SCALED_IMU3: 24 bytes and 12
 
 TILT_SIGMA_DEG: Final = 0.05
-"""Sigma of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
+"""Default sigma of a gradienter, from cell and mounting; protocols of worse devices have their own."""
 TILT_BY_THE_WAY_SIGMA_DEG: Final = 0.65
-"""Sigma of the tilt that a compass or an IMU gives as well, where no document has a figure: the HMR3300's."""
+"""Sigma of the tilt from a compass or an IMU without a documented figure; the value is the HMR3300's."""
 HEADING_SIGMA_DEG: Final = 3.0
-"""Sigma of a compass where no document has a figure: the aircraft's own iron and currents."""
+"""Sigma of a compass without a documented figure, from the aircraft's own iron and currents."""
 
 
 def settings(config: Config) -> Settings:
@@ -73,7 +73,7 @@ def baud_of(url: str) -> int | None:
 
 
 def imu_rate_hz(config: Config) -> float:
-    """Return the rate of each autopilot IMU that leaves half of a serial line free (57600 baud: 38 Hz for one IMU).
+    """Return the rate for each autopilot IMU that leaves half of a serial line free (57600 baud: 38 Hz for one IMU).
 
     An autopilot whose line is full drops messages and answers late.
     """
@@ -86,13 +86,13 @@ def imu_rate_hz(config: Config) -> float:
 
 
 def attitude_rate_hz(config: Config) -> float:
-    """Return the rate of the attitude that does not fill a serial line (57600 baud: 22 Hz)."""
+    """Return an attitude rate that does not fill a serial line (57600 baud: 22 Hz)."""
     wanted, baud = config.push.attitude_rate_hz, baud_of(config.mavlink.url)
     return wanted if baud is None else min(wanted, LINE_SHARE * baud / BITS_PER_BYTE / VISION_BYTES)
 
 
 def cannot_work(config: Config) -> list[str]:
-    """List the wishes of the configuration that cannot be met: reported at start, never silently ignored."""
+    """List the settings that cannot take effect, to report them at start instead of ignoring them."""
     if config.push.attitude == "off" or config.compass is not None:
         return []
     return [f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known']
@@ -168,9 +168,9 @@ def longest_window_s(config: Config) -> float:
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
-    """Return place and date: as configured, else the autopilot's.
+    """Return place and date: the configured ones, otherwise the autopilot's.
 
-    The date is the autopilot's (from its GNSS), else the host's; it only picks the year of the magnetic model.
+    The date is the autopilot's (from its GNSS), otherwise the host's; it only selects the year of the magnetic model.
     """
     unix_s = time.time() if vehicle.place.unix_time_s is None else vehicle.place.unix_time_s
     date = datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).date()
@@ -188,7 +188,7 @@ def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
 
 
 def place_doubt(config: Config, vehicle: Vehicle) -> str | None:
-    """Return why a calibration waits: the autopilot contradicts itself on a place that is not configured; else None."""
+    """Return the reason to wait if no place is configured and the autopilot's reports contradict each other."""
     place = config.vehicle
     return None if place.latitude_deg is not None and place.height_m is not None else vehicle.place.doubt
 
@@ -209,16 +209,16 @@ class Role:
 
     name: str
     kind: Kind
-    north: Literal["magnetic", "true"] | None = None  # The north that a compass' headings are configured to mean
+    north: Literal["magnetic", "true"] | None = None  # Configured north of a compass' headings
 
     def refuses(self, sample: Sample) -> bool:
-        """Return whether the device itself calls this a heading to another north than the configured one."""
+        """Return whether the device reports a heading from another north than the configured one."""
         return self.north is not None and isinstance(sample, CompassSample) and sample.north not in (None, self.north)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SerialDevice:
-    """One device with its line: as configured, else as it comes from the factory."""
+    """One device and its serial settings: the configured ones, otherwise the factory's."""
 
     port: str
     info: ProtocolInfo
@@ -237,7 +237,7 @@ class SerialDevice:
 
     @property
     def name(self) -> str:
-        """Name of its first role, and of its bytes in a recording."""
+        """Name of the device's first role, also the name of its bytes in a recording."""
         return self.roles[0].name
 
     @property
@@ -263,7 +263,7 @@ def _sections(config: Config) -> Iterator[tuple[Role, Imu | Gradienter | Compass
 
 
 def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) -> SerialDevice:
-    # The configuration has been checked: what several sections say of one port agrees.
+    # The configuration has been checked: sections that share a port have the same settings for it.
     (first, section), sections = used[0], [section for _, section in used]
     info = PROTOCOLS[first.kind][section.protocol or ""]
     return SerialDevice(
@@ -283,7 +283,7 @@ def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Samp
 
 
 def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
-    """Give the collector the part of a role; return the reading of the pose that counts or results, if any."""
+    """Pass the sample of one role to the collector; return the tilt or compass sample that it accepts or derives."""
     match part:
         case ImuSample():
             into.add_imu(role.name, part)
@@ -298,16 +298,16 @@ def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | Co
 
 
 def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
-    """Predict how well the gyros of each part of the catalogue can be known; one sigma, "unknown" last.
+    """Predict one sigma of the gyro bias, deg/h, for each part in the catalogue, "unknown" last.
 
-    The estimator's own V(T, H) of the longest window. A warm-up and integer telemetry add to it.
+    The figure is the estimator's own V(T, H) for the longest window. A warm-up and integer telemetry add to it.
     """
     mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
     return {name: predicted_sigma(one.gyro, mean_s, horizon_s) / DEG_H for name, one in PROFILES.items()}
 
 
 class Profiles:
-    """The profile of each IMU: as configured; else that of the part which its autopilot names."""
+    """The profile of each IMU: the configured one, otherwise that of the part that its autopilot reports."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -315,13 +315,13 @@ class Profiles:
         self._parts: dict[str, Profile | None] = {}
 
     def found(self, name: str, part: Profile | None) -> bool:
-        """Set the part that the autopilot names for an IMU, None where it knows none; return whether that matters."""
+        """Set the part that the autopilot reports for an IMU (None: unknown); return whether the profile changes."""
         before = self.of(name)
         self._parts[name] = part
         return self.of(name) != before
 
     def of(self, name: str) -> str | NoiseProfile | None:
-        """Return the profile of an IMU; None: nobody has named its part."""
+        """Return the profile of an IMU; None: its part is unknown."""
         return self._imus[name].profile or self._parts.get(name)
 
     def imu(self, name: str) -> Imu:

@@ -1,1 +1,1 @@
-"""The service: wiring, and the conduct of a calibration."""
+"""The daemon: its subsystems, and the process that runs them."""

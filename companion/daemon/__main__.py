@@ -1,4 +1,4 @@
-"""The daemon's process: `python -m companion.daemon FILE [-v]`. `companion run` turns into it."""
+"""The daemon's process: `python -m companion.daemon FILE [-v]`. `companion run` replaces itself by this process."""
 
 import gc
 import os
@@ -6,13 +6,13 @@ import sys
 
 
 def prepare() -> None:
-    """Make start and memory small (docs/speed.md); call it before asyncio, numpy and the dialect are imported."""
-    # The daemon speaks no TLS, and asyncio and hashlib do without OpenSSL where it is not installed: 5 MiB less.
-    # None in the place of a module makes its import an ImportError.
+    """Reduce start time and memory (docs/speed.md); call before asyncio, numpy and the dialect are imported."""
+    # The daemon uses no TLS, and asyncio and hashlib work without OpenSSL: leaving it out saves 5 MiB.
+    # None in place of a module makes its import raise ImportError.
     sys.modules.update({"ssl": None, "_hashlib": None})  # type: ignore[dict-item]
-    # Garbage collection among classes and modules that stay costs a tenth of the start.
+    # Imports create objects that stay; searching these for garbage takes a tenth of the start time.
     gc.disable()
-    # A thread for every processor, with its own buffers, for matrices of 6 by 6.
+    # OpenBLAS would start a thread with buffers for every processor; 6-by-6 matrices need one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 

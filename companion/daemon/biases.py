@@ -1,6 +1,6 @@
-"""Biases of each IMU from earlier calibrations and still windows, and their prediction for today.
+"""Biases of each IMU from earlier calibrations and still windows, and the prediction of its present biases.
 
-A change of sensor, profile or mounting voids them. The last calibration since the power-up predicts best.
+A change of sensor, profile or mounting voids them. The best prediction is the last calibration since the power-up.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from companion.storage.records import BiasStore, KnownImu, this_boot
 
 logger = logging.getLogger(__name__)
 
-LOOK_K: Final = 1.0  # temperatures nearer than this count as equal
+LOOK_K: Final = 1.0  # Temperatures closer than this count as equal
 WRITE_EVERY_S: Final = 60.0  # least time between writes of still windows to the disk
 _MUCH_BETTER: Final = 0.7
-"""Share of its sigma below which a still window replaces another one of the same temperature."""
-_IN_WORDS: Final = {  # of the keys of an identity
+"""Sigma, as a fraction of the kept window's, below which a new still window of equal temperature replaces it."""
+_IN_WORDS: Final = {  # Keys of an identity, as text for people
     "system": "vehicle",
     "gyro": "gyro (device id)",
     "accel": "accelerometer (device id)",
@@ -61,11 +61,11 @@ class BiasMemory:
         self._sources = {imu.name: imu for imu in core.config.imu}
         self._host = this_boot() or os.urandom(8).hex()
         self._curves: dict[tuple[str, Triad], Curve | None] = {}
-        self._settling: dict[str, tuple[float, float] | None] = {}  # warm-up of each board, and one sigma, s
+        self._settling: dict[str, tuple[float, float] | None] = {}  # Warm-up time of each board and its sigma, s
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
-        """Session, point and count of contradictions of the last good calibration in this power-up, by triad."""
+        """Reference of this power-up by IMU and triad: its session and point, and the contradictions since."""
         self._now_degc: dict[str, float | None] = {}
         self._written_s = -math.inf
 
@@ -93,7 +93,7 @@ class BiasMemory:
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
     ) -> tuple[Vector, Vector] | None:
-        """Predict the change of the output since a temperature, and its variance; None: not known."""
+        """Predict the change of the output between two temperatures, and its variance; None: unknown."""
         curve = self.curve(name, triad)
         if curve is None or degc is None or now_degc is None:
             return None
@@ -114,14 +114,14 @@ class BiasMemory:
         return msgspec.structs.replace(found, warm=None, **left)
 
     def _taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
-        """Return the change that the autopilot compensates by temperature itself, (3,)."""
+        """Return the bias change that the autopilot's own temperature calibration compensates, (3,)."""
         calibration = self._imus[name].calibration if name in self._imus else None
         return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
     # --- before a result is used
 
     def with_offsets(self, solution: Solution) -> Solution:
-        """Add the offsets that the autopilot subtracts; AutopilotError while they are not known."""
+        """Add the offsets that the autopilot subtracts; raise AutopilotError while they are unknown."""
         imus = tuple(
             dataclasses.replace(imu, subtracted=self._imus[imu.name].in_force.subtracted(imu.temperature_degc))
             if imu.name in self._imus
@@ -146,12 +146,12 @@ class BiasMemory:
         return found
 
     def why_not_now(self, name: str, started_at: str) -> str | None:
-        """Return why the bias of a calibration may have changed since; None without a reason."""
+        """Return why the bias may have changed since a calibration; None: no reason known."""
         if (point := self._point(name, started_at)) is None:
             return message("imu_changed_since_calibration", event="has lost its history")
         if what := self._changed(name):
             return message("imu_changed_since_calibration", event=f"was changed ({what})")
-        # An autopilot may have run on while our board was off.
+        # IMUs of the autopilot are not checked: it may have stayed powered while our board was off.
         same = name in self._imus or point.power_up.is_same(self.power_up(name, time.time()))
         return None if same else message("imu_changed_since_calibration", event="was without power")
 
@@ -201,10 +201,10 @@ class BiasMemory:
             effect=effect,
         )
 
-    # --- and afterwards
+    # --- after a calibration
 
     def measured(self, solution: Solution, doubts: Sequence[Doubt], started_at: str, unix_s: float) -> dict[str, Point]:
-        """Make the points of the history from a solution by the readings alone."""
+        """Make the points of the history from a solution that uses the readings alone, no earlier biases."""
         return points(
             dataclasses.replace(solution, imus=tuple(map(self._at_mean, solution.imus))),
             doubts,
@@ -215,7 +215,7 @@ class BiasMemory:
         )
 
     def _at_mean(self, imu: ImuSolution) -> ImuSolution:
-        """Subtract the offsets of the window's mean temperature, not those of its end."""
+        """Refer the autopilot's temperature compensation to the window's mean temperature instead of its end's."""
         degc, end_degc = imu.mean_degc, imu.temperature_degc
         if degc is None or end_degc is None or degc == end_degc:
             return imu
@@ -232,7 +232,7 @@ class BiasMemory:
         await self._write()
 
     async def look(self, solution: Solution) -> None:
-        """Remember the best still window of each kelvin of a power-up."""
+        """Remember the best still window at each temperature (1 K steps) of this power-up."""
         unix_s = time.time()
         self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
@@ -263,7 +263,7 @@ class BiasMemory:
             await self._write()
 
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
-        """Return whether a window is the first at its temperature in this power-up, or much better."""
+        """Return whether a window is the first at its temperature in this power-up, or much better than those."""
         degc, power_up = imu.mean_degc, self.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or degc is None or self._changed(imu.name):
             return False
@@ -272,7 +272,7 @@ class BiasMemory:
         return bool(imu.sigma_stat[:3].max() < _MUCH_BETTER * best)
 
     async def forget(self, started: Collection[str]) -> None:
-        """Forget calibrations that were undone, by their start."""
+        """Forget undone calibrations, given by their start times."""
         if not any(point.started_at in started for known in self._known.values() for point in known.points):
             return
         for name, known in self._known.items():
@@ -290,7 +290,7 @@ class BiasMemory:
             logger.warning("%s", message("history_not_kept", what="biases of this calibration", reason=error))
 
     def _refer(self, name: str, triad: Triad, point: Point) -> None:
-        """Set the reference of this power-up; a contradiction becomes the reference the third time."""
+        """Update the reference of this power-up; only the third contradicting point in a row replaces it."""
         found = point.of(triad)
         if found is None:
             return
@@ -301,11 +301,11 @@ class BiasMemory:
         else:
             self._today[name, triad] = session, point, 0
 
-    # --- what is known
+    # --- stored biases
 
     def temperature(self) -> list[Object]:
         """Summarise the biases over temperature; blocking."""
-        # Imported here: the start is shorter without.
+        # Imported here to keep the start short.
         from companion.estimation.solution.by_temperature import by_temperature
 
         self.follow()
@@ -331,14 +331,14 @@ class BiasMemory:
         return next((each for each in self._points(name) if each.started_at == started_at), None)
 
     def _remember(self, name: str, known: Sequence[Point]) -> None:
-        """Keep as many points of an IMU as the disk does: predictions must not change with a restart."""
+        """Keep as many points of an IMU as are stored on disk, so that predictions do not change at a restart."""
         imu = self._known.get(name) or KnownImu(identity=self._identity(name, {}))
         self._known[name] = msgspec.structs.replace(imu, points=kept(known))
 
     # --- identity of the sensor behind each IMU
 
     def _changed(self, name: str) -> str:
-        """Name the differences to the known sensor; empty: none."""
+        """List the differences between the present and the remembered sensor, as text; empty: none."""
         if name not in self._known:
             return ""
         before = self._known[name].identity
@@ -351,7 +351,7 @@ class BiasMemory:
         return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
 
     def _session(self, name: str) -> str:
-        """Return a word that changes as soon as the sensor may have been without power."""
+        """Return a text that changes whenever the sensor may have lost power."""
         if name in self._imus:
             return f"boot {self._vehicle.boots}"
         sensor = self._sensors.get(name)
@@ -368,7 +368,7 @@ class BiasMemory:
         return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
 
     def _identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
-        """Return the properties that define a sensor and its biases; `before` fills gaps."""
+        """Return the properties that identify a sensor and its biases; `before` supplies those unknown now."""
         source = self._sources[name]
         profile = source.profile.name if isinstance(source.profile, NoiseProfile) else source.profile
         found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
@@ -381,7 +381,7 @@ class BiasMemory:
             "firmware": str(self._vehicle.firmware),
         }
         if calibration is None:
-            # A property that is not known now has not changed.
+            # A property that is unknown now counts as unchanged.
             return {**before, **found}
         return found | {
             "gyro": str(calibration.gyro_id),

@@ -1,4 +1,4 @@
-"""Parts that all subsystems of the daemon share, and the interface of a subsystem to the service that runs it."""
+"""Parts shared by all subsystems of the daemon, and the base class of a subsystem."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from companion.links.system.events import Listeners
 logger = logging.getLogger(__name__)
 
 CATCH_UPS: Final = 3
-"""Most estimates in a row: while one is computed the next may become due."""
+"""Most evaluations of the window in a row: while one is computed the next may become due."""
 TICK_S: Final = 0.2
 REREAD_EVERY_S: Final = 0.5
-"""Least time between two reads, as anybody on the network can announce a change."""
+"""Least time between two reads: anybody on the network can announce a change and so cause one."""
 Handler = Callable[[Any, str], AsyncIterator[Object]]
-"""Answers a `Command` that came through an interface (second), with any number of replies."""
+"""Handler of a command: its arguments are the `Command` and the name of the interface; it yields replies."""
 Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
-"""Name, and a coroutine that runs until it is cancelled."""
+"""Name of a task, and the function that makes its coroutine, which runs until cancelled."""
 Offload = Callable[..., Awaitable[Any]]
-"""Runs a blocking call elsewhere: `asyncio.to_thread` in the daemon."""
+"""Function that runs a blocking call outside the event loop: `asyncio.to_thread` in the daemon."""
 
 
 class RuntimeSettings:
@@ -59,7 +59,7 @@ class RuntimeSettings:
 
 
 class RepeatedRead:
-    """Reads from the autopilot after each of its starts and each `again`, and `retry_s` after an AutopilotError."""
+    """Reads from the autopilot after each of its starts and each `again`; retries `retry_s` after an AutopilotError."""
 
     def __init__(self, vehicle: Vehicle, read: Callable[[], Awaitable[None]], retry_s: float) -> None:
         self._vehicle, self._read, self._retry_s = vehicle, read, retry_s
@@ -69,12 +69,11 @@ class RepeatedRead:
         vehicle.on_event.add(self._on_event)
 
     def again(self, pause_s: float = 0.0) -> None:
-        """Read once more, as something has changed; `pause_s`: least time until the read after it."""
+        """Request another read, as something has changed; `pause_s`: least time from it to the next read."""
         self._pause_s = max(self._pause_s, pause_s)
         self._due.set()
 
     async def run(self) -> None:
-        """Read until cancelled."""
         while True:
             await self._due.wait()
             await self._vehicle.found.wait()
@@ -95,18 +94,18 @@ class RepeatedRead:
 
 
 class Core:
-    """The configuration, the autopilot's link and the collector, which all subsystems share; `link` is for tests."""
+    """Parts shared by all subsystems: configuration, autopilot link, collector and others; `link` is for tests."""
 
     def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
         self.config, self.offload = config, offload
         self.only_listening = only_listening
-        """Reason given for refusing every job in check mode, which must change nothing; None in normal operation."""
+        """Check mode: the reason for refusing every job, as nothing may change; None in normal operation."""
         system_id = config.vehicle.system_id
         self.link = link or MavlinkLink(system_id=system_id or 1, component_id=config.mavlink.component_id)
         self.vehicle = Vehicle(self.link, system_id=system_id, is_carried=self._is_carried)
         self.parameters = ParameterClient(self.link, self.vehicle)
         self.profiles, self.collector, self.machine = Profiles(config), models.collector(config), Machine()
-        self.on_tick: Listeners[[float]] = Listeners()  # Notified of the time of every tick, before the collector
+        self.on_tick: Listeners[[float]] = Listeners()  # Notified of every tick with its time, before the collector
         self.wanted, self.texts = RuntimeSettings(config, self._retarget), StatusText(self.link)
         self.tunes = Tunes(self.link, self.vehicle, lambda: self.wanted.tunes, self.texts.woken)
 
@@ -116,7 +115,7 @@ class Core:
         return self.collector.glance(asyncio.get_running_loop().time()).moving
 
     def _retarget(self, settings: Settings) -> None:
-        if not self.machine.state.busy:  # a calibration under way keeps its targets
+        if not self.machine.state.busy:  # a running calibration keeps its targets
             self.collector.retarget(settings)
 
     async def local_earth(self) -> LocalEarth:
@@ -131,7 +130,7 @@ class Core:
             await asyncio.sleep(TICK_S)
 
     async def catch_up(self, *, since_s: float | None = None) -> None:
-        """Evaluate the collector's window if due, in a thread: arming requests must not wait (autopilots 5.2)."""
+        """Evaluate the collector's window if due, in a thread, as arming requests must not wait (autopilots 5.2)."""
         for _ in range(CATCH_UPS):
             work = self.collector.pending(asyncio.get_running_loop().time(), since_s=since_s)
             if work is None:
@@ -151,7 +150,7 @@ class Core:
 
 
 class Subsystem:
-    """Base class of a part of the daemon: its state, status, commands and tasks for the service."""
+    """Base class of the daemon's parts: stored state, status, commands and tasks, as the service calls them."""
 
     def load(self) -> None:
         """Load stored data before anything runs; blocking."""

@@ -1,4 +1,4 @@
-"""One request under way: a calibration, an alignment, the writing of temperature curves, or an undo."""
+"""Running job: a calibration, an alignment, the writing of temperature curves, or an undo."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ TEMPERATURE: Final = "temperature curve"
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 
 GoOn = Callable[[str], None]
-"""Called now and then with words for progress; raises `JobCancelledError`."""
+"""Callback during a long wait: sets the text of the progress, and raises `JobCancelledError` after a cancel."""
 
 
 class JobCancelledError(Exception):
-    """Raised inside a job at the next safe point after somebody cancelled it."""
+    """The job was cancelled; raised inside it at the next safe point."""
 
 
 class Job:
-    """One request, as its requesters see it; `finished` is done exactly once."""
+    """One job as its requesters see it; the future `finished` is set exactly once."""
 
     def __init__(
         self,
@@ -48,16 +48,16 @@ class Job:
         self.automatic = automatic  # Started by the daemon itself
         self.was_armed = False
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
-        """Loop time by which measuring must end; None: no limit."""
+        """Time of the event loop by which measuring must end; None: no limit."""
         self.finished: asyncio.Future[JobResult] = loop.create_future()
         self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Object | None = None
         self.undid_calibration = kind == "undo"
-        """False also where an alignment or a temperature curve was undone: the last calibration stays."""
+        """True if an undo has undone a calibration; False for the undo of an alignment or a temperature curve."""
         self.words = ""  # Present activity, for people
         self.hold_still_s: int | None = None
-        """Time to hold still before anything else goes on."""
+        """Time for which the aircraft must be held still before the job goes on."""
         self.progress_percent = 0
-        """0 to 100, never falling."""
+        """0 to 100; never falls."""
         self._until_s = 0.0
         self.cancelled_by: str | None = None
         self._nudge = asyncio.Event()
@@ -97,7 +97,7 @@ class Job:
         self._nudge.set()
 
     def check_cancelled(self) -> None:
-        """Raise JobCancelledError, with the canceller, if it was cancelled: a safe point."""
+        """Mark a safe point: raise JobCancelledError, which names the canceller, if the job was cancelled."""
         if self.cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self.cancelled_by}")
 
@@ -108,7 +108,7 @@ class Job:
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
 
     async def pause(self, seconds: float) -> None:
-        """Wait, but not past a cancel (JobCancelledError) or a `look_again`."""
+        """Wait, at most until `look_again` or a cancel, which raises JobCancelledError."""
         self.check_cancelled()
         self._nudge.clear()
         if await comes(self._nudge, seconds):

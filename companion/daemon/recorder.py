@@ -1,4 +1,4 @@
-"""Records the inputs of the last hour and a half to a ring of files, and to a file on request.
+"""Recorder of all inputs: the last hour and a half in a ring of files, and a single file on request.
 
 Sensing and MAVLink never wait for the disk: a thread empties a bounded queue once a second.
 """
@@ -47,15 +47,15 @@ RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Default size of the ring: some 100 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
 MOST_BYTES: Final = 4 << 30, 1 << 30
-"""Largest size of a recording without and with a stated length: the file limit of many USB sticks, and 27 hours of a
-200 Hz IMU beside 100 Hz telemetry."""
+"""Largest size of a recording with and without a requested length: the file limit of many USB sticks, and 27 hours of
+a 200 Hz IMU beside 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 INTERNAL: Final = "internal error; the log has the details"
 
 
 def _coarse(where: Whereabouts) -> tuple[object, ...]:
-    """Round a place, so that the noise of a GNSS receiver is no change."""
+    """Round a place, so that the noise of a GNSS receiver does not count as a change."""
     degrees = [None if value is None else round(value, 3) for value in (where.latitude_deg, where.longitude_deg)]
     return *degrees, None if where.height_m is None else round(where.height_m, -1), where.source, where.date
 
@@ -71,7 +71,7 @@ class _OnRequest:
 
 
 class Recorder(Subsystem):
-    """Records the inputs of calibrations."""
+    """Records the inputs of calibrations, for replay."""
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating) -> None:
         config = core.config
@@ -178,7 +178,7 @@ class Recorder(Subsystem):
                         self._note_place()
                     await self._flush()
                 except Exception:
-                    # No fault in here may end the daemon.
+                    # A fault of the recorder must not end the daemon.
                     logger.exception("recordings: internal error; none are kept until the next start")
                     self.fault = INTERNAL
                     if self._on_request is not None:
@@ -207,7 +207,7 @@ class Recorder(Subsystem):
             if self._offset_ns is None:
                 self._offset_ns = time.time_ns() - round(now_s * 1e9)
             if tape.lost:
-                level = logging.WARNING if tape.lost == tape.lost_in_all else logging.DEBUG  # once is enough
+                level = logging.WARNING if tape.lost == tape.lost_in_all else logging.DEBUG  # warn only once
                 logger.log(level, "recordings: %s", message("disk_too_slow", lost=tape.lost))
                 self._begin()
             since_s, states, batch = tape.drain(now_s)
@@ -226,7 +226,7 @@ class Recorder(Subsystem):
                 await self._in_thread(ring.close)
         except StorageError as error:
             self._ring_again_s = _now_s() + RETRY_S
-            # Logged once: it may stay so for the whole day.
+            # Warn only once: the fault may last the whole day.
             logger.log(logging.WARNING if self.fault is None else logging.DEBUG, "recordings: %s", error)
             self.fault = str(error)
         else:
@@ -235,7 +235,7 @@ class Recorder(Subsystem):
                 self.fault = None
 
     async def _in_thread(self, function: Callable[..., T], *arguments: object) -> T:
-        """Run a call that touches a file; a cancel waits for its end, as two of them must not overlap."""
+        """Run a file operation in a thread; a cancel waits for its end, as two operations must not overlap."""
         task: asyncio.Future[T] = asyncio.ensure_future(self._offload(function, *arguments))
         try:
             return await asyncio.shield(task)
@@ -243,7 +243,7 @@ class Recorder(Subsystem):
             done, _ = await asyncio.wait([task], timeout=HANGS_S)
             if not done:
                 raise StorageError("the disk hangs") from None
-            task.exception()  # retrieved: it is too late for a report
+            task.exception()  # mark it as retrieved: after a cancel nobody handles it
             raise
 
     async def _flush_file(self, recording: _OnRequest, batch: list[Message], beginning: Beginning) -> None:

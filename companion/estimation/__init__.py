@@ -1,1 +1,1 @@
-"""The science: stillness, averages, biases and their sigmas. No I/O, no clock, no event loop."""
+"""Estimation: stillness, averages, biases and their sigmas. No I/O, no clock, no event loop."""

@@ -1,4 +1,4 @@
-"""Kinds of calibration, and the states of one as a table: the diagram in docs/calibration.md is this table."""
+"""Kinds of calibration, and its state machine as a table, which docs/calibration.md shows as a diagram."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import enum
 from typing import Final
 
 LONGEST_S: Final = 1e6
-"""Time limits of requests are shorter."""
+"""Upper bound of the time limit in a request, s."""
 
 
 class What(enum.Enum):
@@ -47,12 +47,12 @@ class State(enum.Enum):
 
     @property
     def is_writing(self) -> bool:
-        """True while offsets are being changed and not yet known to be right."""
+        """True while offsets are being written and not yet verified."""
         return self in _WRITING
 
     @property
     def shown(self) -> str:
-        """Coarser words, which other programs rely on."""
+        """Coarser state names; other programs rely on them."""
         return _SHOWN.get(self, self).value
 
     @property
@@ -99,12 +99,12 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     (State.WAITING, Event.STILL): State.COLLECTING,
     (State.COLLECTING, Event.MOVED): State.WAITING,
     (State.COLLECTING, Event.ENOUGH): State.SOLVING,
-    # What was measured can turn out stale (an offset changed under it): measure again.
+    # An offset changed during the measurement: the readings are stale, measure again.
     (State.SOLVING, Event.MOVED): State.WAITING,
     (State.SOLVING, Event.WRITE): State.WRITING,
     (State.SOLVING, Event.NOTHING_TO_WRITE): State.DONE,
     (State.WRITING, Event.WRITTEN): State.VERIFYING,
-    # What was written acts on another IMU than believed; it is put back, and now it is known.
+    # The offsets act on another IMU than assumed: they were restored, and the right IMU is known now.
     (State.WRITING, Event.MOVED): State.WAITING,
     (State.VERIFYING, Event.VERIFIED): State.SETTLING,
     (State.VERIFYING, Event.REBOOT): State.RESTARTING,
@@ -117,17 +117,17 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
 
 
 class IllegalEventError(Exception):
-    """An event that cannot happen in this state: a fault of the program, never of a device."""
+    """Event that cannot happen in this state: a fault of the program, never of a device."""
 
 
 class Machine:
-    """One calibration's state."""
+    """State machine of one calibration."""
 
     def __init__(self) -> None:
         self.state = State.IDLE
 
     def on(self, event: Event) -> State:
-        """Take an event; returns the new state.
+        """Handle an event; return the new state.
 
         Raises:
             IllegalEventError: the table has no such transition.

@@ -1,1 +1,1 @@
-"""The fleet's end: collectors that put what aircraft tell into a database. No part of the daemon."""
+"""Fleet server: collectors that write the items of aircraft into a database. Not part of the daemon."""

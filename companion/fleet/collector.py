@@ -1,7 +1,7 @@
 """Collector of a fleet: receives the items of aircraft from a broker, writes them into the database, confirms them.
 
-A collector has no state of its own. Any failure of the broker or the database ends both connections. Aircraft send
-again what was not confirmed; at each new connection the collector asks them for what the database lacks.
+A collector has no state of its own. Any failure of the broker or the database ends both connections. Aircraft resend
+unconfirmed items; at each new connection the collector requests the items that the database lacks.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ logger = logging.getLogger(__name__)
 BATCH: Final = 500
 GATHER_S: Final = 0.1
 ASK_AFTER: Final = 50
-"""Factor on `GATHER_S` for hellos: items sent with a hello have arrived by then, perhaps at another collector."""
+"""Wait for items sent with a hello (any collector may get them) before missing ones are requested, in `GATHER_S`."""
 WAITING: Final = 20 * BATCH
-"""Most messages that wait to be written; more are dropped, and sent again by their aircraft."""
+"""Most messages that wait to be written; further ones are dropped, and their aircraft resend them."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
 BATCH_BYTES: Final = 4 * 1024 * 1024  # Most bytes of a batch; a database makes several copies of it
 AT_ONCE: Final = 50  # Answers sent concurrently; the time that aiomqtt takes for each grows with their number
-SWEEP_S: Final = 5.0  # Time to receive the retained hellos, which shared subscriptions do not deliver
+SWEEP_S: Final = 5.0  # Time to receive the retained hellos, which need a subscription that is not shared
 JUDGE_S: Final = 2.0
-REST: Final = 4.0  # Pause after a judgement, as a multiple of its duration: collecting goes first
+REST: Final = 4.0  # Pause after a judgement, as a multiple of its duration: collecting has priority
 ANSWER_S: Final = 10.0
 STOP_AGAIN_S: Final = 0.5
 _HELLO: Final = "fleet/+/hello"
@@ -72,7 +72,7 @@ def load_broker(path: Path) -> Mqtt:
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
     """Cancel tasks until they have ended; return their exceptions.
 
-    One cancellation is not enough: before Python 3.12 `asyncio.wait_for`, which aiomqtt uses, loses one that comes at
+    One cancellation is not enough: before Python 3.12 `asyncio.wait_for`, which aiomqtt uses, loses a cancellation at
     the moment of its result.
     """
     pending = found = set(tasks)
@@ -84,7 +84,7 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
 
 
 class BoundedMessages(asyncio.Queue[Any]):
-    """Queue of messages that is bounded in bytes, too: one message may have 256 KiB."""
+    """Queue of messages, bounded in number and in bytes: one message may have 256 KiB."""
 
     def __init__(self, maxsize: int = WAITING, most_bytes: int = WAITING_BYTES) -> None:
         super().__init__(maxsize)
@@ -203,7 +203,7 @@ class Collector:
         if outcome.rejected:
             message, reason = outcome.rejected[0]
             logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
-        # One timer for several: one each would cost as much as sending.
+        # One timer for all answers: a timer for each would cost as much as sending.
         publish = functools.partial(client.publish, timeout=math.inf)
         for some in (said[k : k + AT_ONCE] for k in range(0, len(said), AT_ONCE)):
             async with asyncio.timeout(ANSWER_S):

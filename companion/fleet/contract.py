@@ -1,6 +1,6 @@
 """Parser of the aircraft's payloads (docs/fleet/asyncapi.yaml): from bytes to rows of the tables.
 
-The tables of schema.py say what fits. Bytes of any content raise nothing but `NotTakenError`.
+The tables of schema.py define the allowed values. Any invalid bytes raise `NotTakenError` and nothing else.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
 _EARLIEST: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _LATEST: Final = datetime.datetime(2200, 1, 1, tzinfo=datetime.UTC)
-"""Latest time that is accepted; the earliest is that of a clock without a battery."""
+"""Latest accepted time; the earliest is that of a clock without a battery."""
 _STATES: Final = ("done", "failed", "cancelled")
 _KEY: Final = ("aircraft", "epoch", "sequence")
 _TRIADS: Final = [name for name, _ in schema.biases.c.items() if name.endswith(("_rad_s", "_m_s2"))]
@@ -60,7 +60,7 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class ReceivedItem(msgspec.Struct, frozen=True):
-    """Item of an aircraft; a newer format may change everything but its key."""
+    """Item of an aircraft; a newer format may change everything except its key."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
     aircraft: _Aircraft
@@ -81,7 +81,7 @@ def _row(table: sa.Table, told: _Object) -> Row:
 
 
 def _fitting(column: sa.Column[Any], value: object) -> Any:
-    """Return a value as a column keeps it; raise NotTakenError where it does not fit."""
+    """Convert a value to the type of a column; raise NotTakenError if it does not fit."""
     kind = column.type
     if value is None and column.nullable:
         return None
@@ -115,7 +115,7 @@ def _calibration(told: _Object) -> Rows:
     for name, imu in {_fitting(schema.biases.c.imu, imu.get("name")): imu for imu in imus}.items():
         held += [f"{name} {triad}" for triad in msgspec.convert(imu.get("held_back", []), _Words)]
         written |= msgspec.convert(imu.get("written", {}), _Object).keys()
-        # Biases before earlier power-ups were weighed in; None: none were.
+        # Biases before they were combined with earlier power-ups; None: not combined.
         prior = msgspec.convert(imu.get("prior"), dict[str, _Object | None] | None) or {}
         gyro, accel = (prior.get(triad) or {} for triad in TRIADS)
         read = {"gyro_read_rad_s": gyro.get("measured_rad_s"), "accel_read_m_s2": accel.get("measured_m_s2")}
@@ -192,14 +192,14 @@ KINDS: Final[dict[str, Callable[[_Object], Rows]]] = {
     "curve": lambda _: {},
     "flight": _flight,
 }
-"""Parsers of the bodies by kind; items of other kinds are kept until a newer companion knows them."""
+"""Parsers of the bodies by kind; items of other kinds are stored until a newer companion can parse them."""
 
 
 def moment(words: str) -> datetime.datetime:
     """Parse a time of ISO 8601, in UTC unless it names another zone.
 
     Raises:
-        NotTakenError: it is no time, or out of range.
+        NotTakenError: not a time, or out of range.
     """
     try:
         found = datetime.datetime.fromisoformat(words)
@@ -212,18 +212,18 @@ def moment(words: str) -> datetime.datetime:
 
 
 def addressed(topic: str) -> tuple[str, str] | None:
-    """Give the aircraft of a topic and "hello" or "item"; None: it is another topic."""
+    """Return the aircraft of a topic and "hello" or "item"; None for another topic."""
     match = _AIRCRAFT.fullmatch(topic)
     return None if match is None else (match[1], match[2])
 
 
 def read_hello(aircraft: str, payload: bytes) -> Hello:
-    """Parse a hello; raise NotTakenError where it is none, names another aircraft, or has a newer format."""
+    """Parse a hello; raise NotTakenError if it is invalid, names another aircraft, or has a newer format."""
     return _decode(aircraft, payload, Hello)
 
 
 def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
-    """Parse the key of an item of any format; raise NotTakenError where it has none, or names another aircraft."""
+    """Parse the key of an item of any format; raise NotTakenError if it has none or names another aircraft."""
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
     return _decode(aircraft, payload, ReceivedItem)
@@ -282,7 +282,7 @@ def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
 
 
 def _same(item: ReceivedItem, rows: Rows, body: _Object) -> str:
-    """Hash everything that stays the same when an item is sent again under another epoch, so not `undone_at`."""
+    """Hash the content that is equal when an item is resent under another epoch: all but `undone_at`."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
     told_again = msgspec.json.encode((item.kind, item.at, content if rows else body), order="deterministic")
     return hashlib.sha256(told_again).hexdigest()[:32]

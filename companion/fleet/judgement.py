@@ -1,8 +1,8 @@
 """Judgement of an aircraft's sensors: from the rows of its calibrations to rows of `parts` and `findings`.
 
-Each IMU becomes a `PartHistory` over its power-ups, that becomes columns for the tests of sequential.py, and their
-alarms become findings. All calibrations are the input, never an earlier judgement: every collector gets the same
-result.
+Each IMU becomes a `PartHistory` over its power-ups. The history becomes columns for the tests of sequential.py, and
+their alarms become findings. The input is always all calibrations, never an earlier judgement, so that every collector
+gets the same result.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
 LEARNS: Final = 16
-"""Power-ups at the beginning that define what is usual, where no model does."""
+"""Power-ups at the beginning that define the usual level and scatter, if there is no model."""
 _WITH_MODEL: Final = 10
-"""Power-ups at the beginning that define the level, where a model defines the scatter."""
+"""Power-ups at the beginning that define the level, if a model defines the scatter."""
 _OF_MODEL, _OF_OWN = 1.5, 3.0
-"""Largest accepted scatter of a part, as a multiple of its model's or of that of its first power-ups."""
+"""Largest accepted scatter of a part, as a multiple of its model's scatter or of that of its first power-ups."""
 WANDER: Final = (0.03, 0.3)
 """Least and largest wander of a bias from one power-up to the next, in scatters."""
 LEAST_SIZE: Final = 1.8
 LEAST_TIMES: Final = 1.4
 _FEW_TELL: Final = 1.2
-"""Factor on the scatter of a part's first power-ups, which may be too small."""
+"""Factor on the scatter of a part's first power-ups: estimated from few values, it may be too small."""
 _LEAST_NOISE: Final = 0.08
 """Least scatter of the logarithm of a noise that is measured over some ten seconds."""
 _BOUND_DEG: Final = 5.0
@@ -45,10 +45,10 @@ LEAST_ZERO_SIGMAS: Final = 8.0
 ZERO_USUAL_DEG: Final = 0.05
 """One sigma between two alignments of a good gradienter, from the air's temperature."""
 MOST_CALIBRATIONS: Final = 2000
-"""Most calibrations of an aircraft, the latest ones: five years of one a day."""
+"""Most calibrations of an aircraft that are used, the latest ones: five years at one a day."""
 SAME_POWER_UP_WITHIN: Final = datetime.timedelta(minutes=30)
 MOST_DEGC: Final = 150.0
-"""Limit of a believable temperature, to catch kelvins that were not turned into degrees."""
+"""Limit of a plausible temperature, to detect kelvins that were not converted to degrees Celsius."""
 _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
 _TOGETHER_WITHIN_POWER_UPS: Final = 10
@@ -57,10 +57,10 @@ REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
 
 
 class PartHistory(NamedTuple):
-    """One IMU over its n power-ups, in their order; NaN: not known.
+    """One IMU over its n power-ups, in order of time; NaN: unknown.
 
-    Arrays are (n,), or (n, 6) for gyro x y z in rad/s and accelerometer x y z in m/s^2. `biases` are by the readings
-    alone, `white` is in their units times sqrt(s), and `new_zero` tells whether the gradienter's zero differs from the
+    Arrays are (n,), or (n, 6) for gyro x y z in rad/s and accelerometer x y z in m/s^2. `biases` are from the readings
+    alone, `white` is in their units times sqrt(s), and `new_zero` is True where the gradienter's zero differs from the
     power-up before.
     """
 
@@ -75,8 +75,8 @@ class PartHistory(NamedTuple):
 class PartFinding(NamedTuple):
     """Complaint about a sensor: bias, drift, scatter, noise, zero or compass.
 
-    `axis` is 0 to 5, or -1 for none; `since` is the index of a power-up; `size` is a multiple of what is usual; `moved`
-    is the move of a level, rad/s or m/s^2.
+    `axis` is 0 to 5, or -1 for none; `since` is the index of a power-up; `size` is a multiple of the usual value;
+    `moved` is the change of a level, rad/s or m/s^2.
     """
 
     kind: str  # bias, drift, scatter, noise, zero, compass
@@ -103,7 +103,7 @@ def columns_of(history: PartHistory, model: Floats | None) -> Columns:
     # The usual sigma is part of the scatter already.
     variance = np.nan_to_num(np.maximum(use - usual, 0.0) / unit**2)
     noise = np.log(np.where(history.white > 0.0, history.white, np.nan))
-    # At the end of a warm-up the sigma is that of a fitted line, which does not tell the noise.
+    # At the end of a warm-up the sigma is that of a fitted line, which does not show the noise.
     share = np.sqrt(use) / history.white
     noise = np.where(share > 3.0 * np.array([middle_of(column) for column in share.T]), np.nan, noise)
     of_noise = scatter_of_part(noise[:LEARNS], history.temperature_degc[:LEARNS])[0]
@@ -126,7 +126,7 @@ def columns_of(history: PartHistory, model: Floats | None) -> Columns:
 
 
 def counts(alarm: Alarm) -> bool:
-    """Tell whether an alarm of these columns is a complaint: a noise that falls or scatters is none."""
+    """Return whether an alarm of these columns is a complaint: noise that falls or scatters is not."""
     return alarm.column < 6 or (alarm.kind == "level" and alarm.size > 0.0)
 
 
@@ -160,13 +160,13 @@ def judge(history: PartHistory, model: Floats | None) -> list[PartFinding]:
                 f" {'deg/h' if axis < 3 else 'mg'}, {abs(size):.1f} times {its}"
             )
             found[axis, "level"] = PartFinding(kind, axis, since, size, words, size * unit)
-    # A grown scatter also raises alarms of the level.
+    # A larger scatter also raises alarms of the level: drop those.
     left = [each for (axis, what), each in found.items() if what != "level" or (axis, "scatter") not in found]
     return sorted((each._replace(size=abs(each.size)) for each in left), key=lambda each: -each.size)
 
 
 def judge_compass(heading_bound_deg: Floats) -> list[PartFinding]:
-    """Judge the compass by the bound of the heading's error at each power-up, (n,); NaN: not known."""
+    """Judge the compass by the bound of the heading's error at each power-up, (n,); NaN: unknown."""
     if len(heading_bound_deg) <= LEARNS:
         return []
     columns = compass_column(heading_bound_deg)
@@ -225,7 +225,7 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
         for imu, rows in biases.get(key, {}).items():
             if len(rows) == 3:
                 imus.setdefault(imu, []).append((about, rows))
-    # The import is heavy, and most of the collector does without.
+    # Imported here: it is slow, and most of the collector does not need it.
     from companion.autopilot.firmware.firmwares import model_of
 
     firmware = next((row.firmware for row in reversed(done.values()) if row.firmware), None)

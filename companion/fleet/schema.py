@@ -1,8 +1,8 @@
 """Database of the collector, PostgreSQL or SQLite: its schema, connections and errors.
 
-The table `items` has the payloads as they came. All else is made from them and can be made again. Axes are the
+The table `items` has the received payloads. All other tables are derived from them and can be rebuilt. Axes are the
 vehicle's FRD. Times are UTC by the aircraft's clock, which may be wrong; `heard_at`, `received_at` and `last_at` are by
-the collector's.
+the collector's clock.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from companion.errors import StorageError
 
 VERSION: Final = 4
 _LOCK: Final = 0x636F6D70616E696F
-"""Key of PostgreSQL's advisory lock that the collector holds while it reads and changes the version."""
+"""Key of PostgreSQL's advisory lock that a collector holds while it reads and changes the schema's version."""
 _STATEMENT_MS: Final = 30_000
 _BUSY_S: Final = 10.0
 OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
-"""Errors of a database that cannot be reached, is full or broken."""
+"""Errors of a database that is unreachable, full or broken."""
 OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
 
 
 class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
-    """Time with its zone, UTC; SQLite keeps it as a text without."""
+    """Time in UTC, with its zone; SQLite stores text without a zone."""
 
     impl = sa.DateTime(timezone=True)
     cache_ok = True
@@ -247,14 +247,14 @@ _VIEWS: Final = Path(__file__).with_name("views.sql")
 
 
 def bring_up_to_date(connection: sa.Connection) -> None:
-    """Make tables and views that are missing, within the connection's transaction, by one collector at a time.
+    """Create missing tables and views in the connection's transaction, under a lock against other collectors.
 
     Raises:
-        StorageError: another version has made the tables.
+        StorageError: the tables are of another version.
     """
     if connection.dialect.name == "postgresql":
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
-        connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # tables of years take their time
+        connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # large tables take long
     inspector = sa.inspect(connection)
     found = connection.execute(sa.select(_version)).scalar_one() if inspector.has_table(_version.name) else None
     if found not in (None, VERSION):
@@ -271,12 +271,12 @@ def bring_up_to_date(connection: sa.Connection) -> None:
         connection.execute(sa.insert(_version).values(version=VERSION))
     for view, purpose, query in views():
         connection.exec_driver_sql(f"CREATE VIEW {view} AS /* {purpose} */ {query}")
-        if connection.dialect.name == "postgresql":  # which forgets what stands in a query's text
+        if connection.dialect.name == "postgresql":  # it drops comments in a view's query
             connection.exec_driver_sql(f"COMMENT ON VIEW {view} IS '{purpose}'")
 
 
 def views() -> list[tuple[str, str, str]]:
-    """List name, purpose and query of each view; a view comes after the views it rests on."""
+    """List name, purpose and query of each view, in order of dependency."""
     return _VIEW.findall(_VIEWS.read_text(encoding="utf-8"))
 
 
@@ -284,7 +284,7 @@ def url_of(database: str) -> sa.URL:
     """Parse postgresql://..., sqlite:///... or the path of a file.
 
     Raises:
-        StorageError: it is none of these.
+        StorageError: the text is none of these.
     """
     try:
         url = sa.make_url(database if "://" in database else f"sqlite:///{database}")
@@ -310,7 +310,7 @@ def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
     if url.drivername == "sqlite":
         engine = sa.create_engine(url, connect_args={"timeout": _BUSY_S})
         sa.event.listen(engine, "connect", _prepare_sqlite)
-        # SQLite refuses the first write of a transaction that began with a read when another has written meanwhile.
+        # In SQLite a transaction that began with a read cannot write after another one has written.
         begin = "BEGIN" if reads_only else "BEGIN IMMEDIATE"
         sa.event.listen(engine, "begin", lambda connection: connection.exec_driver_sql(begin))
         return engine

@@ -1,9 +1,9 @@
 """Statistics of a figure that is measured at each power-up: its scatter, and tests for a change of level or scatter.
 
-A Kalman filter predicts each value from those before: a level that wanders like those of its model, and a cubic over
-temperature. Its normalised residuals go into two-sided CUSUMs (Page, Biometrika 41 (1954) 100-115) for a moved level.
-The scatter of each value about the three before it goes into a likelihood-ratio CUSUM for twice the scatter. Single
-values count at most `CLIP` sigmas: no knock alone raises an alarm.
+A Kalman filter predicts each value from the earlier ones, by a wandering level and a cubic over temperature. Its
+normalised residuals are the input of two-sided CUSUMs (Page, Biometrika 41 (1954) 100-115) for a changed level. The
+scatter of each value about the three before it is the input of a likelihood-ratio CUSUM for twice the scatter. A single
+value counts at most `CLIP` sigmas, so that one knock raises no alarm.
 
 With these limits tests/judgement_study.py finds less than one false alarm per hundred aircraft and month. Columns of a
 part are gyro x y z, then accelerometer x y z, vehicle FRD, SI units.
@@ -28,21 +28,21 @@ WANDER_LAG: Final = 30
 _POWER_UPS_PER_TEMPERATURE_TERM: Final = 24
 _OUTLIER_SIGMAS: Final = 3.0
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
-"""Columns with one scatter: parts are mounted in any direction, but the gradienter adds to the level accelerometers."""
+"""Columns that share one scatter, in any mounting; the gradienter's errors add to the level accelerometers."""
 CLIP: Final = 3.0
 LEAST_SHIFT: Final = 0.5
-"""Reference value of the CUSUMs in sigmas: half of the shift that is found soonest."""
+"""Reference value of the CUSUMs in sigmas: half of the shift that they detect fastest."""
 LEVEL_LIMIT: Final = 17.0
 SCATTER_LIMIT: Final = 20.0
 _FURTHER: Final = 6.0
-"""Largest excess of the sum over its limit, so that it falls again when the scatter does."""
+"""Largest excess of the sum over its limit: the sum must fall soon after the scatter falls."""
 _TWICE: Final = (0.375, np.log(2.0))
-"""Factor of z^2 and constant of the log-likelihood ratio for twice the scatter."""
+"""Factor of z^2, and the constant, in the log-likelihood ratio for twice the scatter."""
 OWN_WEIGHT: Final = 8.0
-"""Weight of the model's scatter, in power-ups: the scatter of parts differs by a quarter."""
+"""Weight of the model's scatter, in power-ups: parts of a model differ by a quarter in their scatter."""
 _HELD_SIGMAS: Final = 2.5
-_MEAN_SQUARE_OF_HELD: Final = 0.9775  # of a normal number that is clipped to `_HELD_SIGMAS`
-_VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # of normal numbers
+_MEAN_SQUARE_OF_HELD: Final = 0.9775  # for a standard normal number, clipped to `_HELD_SIGMAS`
+_VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # for standard normal numbers
 _STEP_K: Final = 15.0
 _AT_DEGC: Final = 20.0
 _INITIAL_VARIANCES: Final = np.square(
@@ -55,15 +55,15 @@ _BASE_POWER_UPS: Final = 20
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Floats:
     """Estimate the scatter of a part from its power-ups in order, (n, c) and (n,); NaN: not measured.
 
-    Rows of the result, (2, c): one sigma from one power-up to another at one temperature, errors of the calibrations
-    included; one sigma of the step that stays. Steps between successive power-ups, less the part that follows the
-    temperature, are the input: neither ageing nor a single move makes them larger.
+    Rows of the result, (2, c): sigma between two power-ups at one temperature, errors of the calibrations included;
+    sigma of the lasting step. The input is the steps between successive power-ups, less the part explained by
+    temperature: neither ageing nor a single change of level makes them larger.
     """
     return np.array([_column(column, temperature_degc) for column in biases.T]).T
 
 
 def scatter_of_model(parts: Sequence[Floats]) -> Floats | None:
-    """Give the median scatter of the parts, (2, 6); None: fewer than `LEAST_PARTS` have one."""
+    """Return the median scatter of the parts, (2, 6); None: fewer than `LEAST_PARTS` have one."""
     telling = [part for part in parts if np.isfinite(part[0]).any()]
     if len(telling) < LEAST_PARTS:
         return None
@@ -85,7 +85,7 @@ def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float]:
         return np.nan, np.nan
     known = np.isfinite(degc)
     warmer = np.where(known, degc - (degc[known].mean() if known.any() else 0.0), 0.0) / _STEP_K
-    # A line for few, up to a cubic for many.
+    # A line for few power-ups, up to a cubic for many.
     laws = warmer[:, None] ** np.arange(1, 2 + min(len(value) // _POWER_UPS_PER_TEMPERATURE_TERM, 2))
     step, by = np.diff(value), np.diff(laws, axis=0)
     weight = np.ones(len(step))
@@ -106,10 +106,10 @@ def _sigma(steps: Floats) -> float:
 
 
 class Alarm(NamedTuple):
-    """Change of one column's figure, found at power-up `at`; `since` is the first power-up that counts towards it.
+    """Change of one column's figure, detected at power-up `at`; `since` is the first power-up of the change.
 
-    `until` is the power-up at which the scatter was as before; the number of power-ups: not yet, or a moved level.
-    `size` is the move of the level, or the scatter since then, in usual scatters.
+    `until` is the power-up at which the scatter was usual again; n: not yet, or a change of level. `size` is the change
+    of the level, or the scatter since the change, in usual scatters.
     """
 
     column: int
@@ -121,7 +121,7 @@ class Alarm(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Figures of n power-ups in order, in c columns that are tested side by side; NaN: not known.
+    """Figures of n power-ups in order, in c columns that are tested independently; NaN: unknown.
 
     The first three arrays and `relevel` are (n, c), the others (c,). All but `temperature_degc`, `first` and `unit` are
     in usual scatters.
@@ -129,16 +129,16 @@ class Columns(NamedTuple):
 
     values: Floats  # (n, c) in usual scatters; NaN: not measured
     variance: Floats
-    """Variance of a value beyond the usual one."""
+    """Variance of a value in excess of the usual one."""
     temperature_degc: Floats
     wander: Floats
     """One sigma of the step of the level from one power-up to the next."""
     relevel: NDArray[np.bool_]
     """True where the reference of the measurement has changed, so that the level may differ."""
     first: NDArray[np.int_]
-    """Number of power-ups at the beginning that define what is usual, at least 3."""
+    """Number of power-ups at the beginning that define the usual level and scatter, at least 3."""
     most_own: Floats  # (c,) largest accepted scatter of the column itself, in usual scatters
-    least: Floats  # (c,) least move or scatter that raises an alarm
+    least: Floats  # (c,) least change of level, or scatter, that raises an alarm
     unit: Floats
 
 
@@ -178,7 +178,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
         usual = np.clip(own / count, 1.0, most_own**2)
         ph = (p * h[:, None, :]).sum(axis=2)
         of_filter = (ph * h).sum(axis=1)
-        # A value without a temperature may belong to any.
+        # A value without a temperature may have any temperature.
         law = np.square(x[:, 1:]) + p[:, range(1, 4), range(1, 4)]
         more = variance[k] + unknown[k] * law.sum(axis=1)
         total = of_filter + usual + more
@@ -190,7 +190,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
         x += gain * (np.clip(z, -most, most) * np.sqrt(total))[:, None]
         p -= gain[:, :, None] * ph[:, None, :]
 
-        # Scatter about the median of the three values before: a moved level makes two large residuals only.
+        # Scatter about the median of the three values before: a change of level makes only two large residuals.
         before = y[latest, every] - (laws[latest, every, 1:] * x[:, 1:]).sum(axis=2)
         middle = before.sum(axis=0) - before.max(axis=0) - before.min(axis=0)
         apart = h[:, 1:] - laws[latest, every, 1:].mean(axis=0)

@@ -1,4 +1,4 @@
-"""The pages over HTTP: read only, for this computer alone or for clients with the password."""
+"""HTTP server of the fleet pages: read only, for this computer alone or for clients with the password."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_password(path: Path) -> str:
     """Read the password from a file.
 
     Raises:
-        ConfigError: it cannot be read, or is too short.
+        ConfigError: the file cannot be read, or the password is too short.
     """
     try:
         found = read_regular(path, 4096).decode().strip()
@@ -60,7 +60,7 @@ class Server:
     """Server of the pages at HOST:PORT, read only; `run` it as a task.
 
     Raises:
-        ConfigError: the address is none, or others could look without a password.
+        ConfigError: the address is invalid, or other computers could read the pages without a password.
     """
 
     def __init__(self, bind: str, database: str, password: str | None) -> None:
@@ -76,7 +76,7 @@ class Server:
                 "page: whoever listens on the network can read its password: put a proxy with https before it"
             )
         self._engine = engine_of(database, reads_only=True)
-        # Rendering is work for the processor: at once, 20 of them would take 20 times as long each, and as much memory.
+        # One thread: rendering is bound by the processor, so 20 pages at once would each take 20 times as long.
         self._thread = ThreadPoolExecutor(1, "fleet-pages")
         self._app = Starlette(
             routes=[Route("/{path:path}", self._page)], middleware=[Middleware(_Door, password=password)]
@@ -122,7 +122,7 @@ class Server:
 
 
 class _Door:
-    """Admits requests with the password; without one, those for this computer's own name."""
+    """Filter that admits requests with the password; if none is set, requests for this computer's own name."""
 
     def __init__(self, app: ASGIApp, password: str | None) -> None:
         self._app, self._password = app, password

@@ -1,4 +1,4 @@
-"""Writer of the database: each batch is one transaction, so that no item is written by halves or twice."""
+"""Writer of the database: each batch is one transaction, so that no item is written in part or twice."""
 
 from __future__ import annotations
 
@@ -73,10 +73,10 @@ class Store:
             raise LinkError(f"{self.where}: {why(error)}") from None
 
     def prepare(self) -> None:
-        """Bring the tables up to date, and parse the items that an older version did not know.
+        """Update the tables, and parse the items that an older version did not know.
 
         Raises:
-            StorageError: a newer companion has made them.
+            StorageError: the tables are of a newer companion.
             LinkError: the database cannot be reached, or fails.
         """
         with self._link_errors():
@@ -100,7 +100,7 @@ class Store:
                 found = self._judged(connection, due.aircraft)
             is_it = table.c.aircraft == due.aircraft
             with self._engine.begin() as connection:
-                # Write nothing if new items have come meanwhile.
+                # Write nothing if new items have arrived meanwhile.
                 update = sa.update(table).where(is_it, table.c.news == due.news).values(judged=due.news)
                 if connection.execute(update).rowcount and found is not None:
                     for of, rows in zip((schema.parts, schema.findings), found, strict=True):
@@ -129,7 +129,7 @@ class Store:
             raise LinkError(f"{self.where}: {why(error)}") from None
         except sa.exc.SQLAlchemyError as error:
             reason = _refusal(error)
-        # Find the refused message: write each by itself.
+        # To find the refused message, write each in its own transaction.
         if len(messages) == 1:
             return self._reject(messages[0], reason, now)
         found = BatchResult({}, {}, [])
@@ -199,7 +199,7 @@ class Store:
         connection.execute(insert.on_conflict_do_nothing(), values)
 
     def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
-        """Make a statement for all rows, and its values; PostgreSQL reads JSON in a third of the time."""
+        """Make one statement for all rows, and its values; with JSON PostgreSQL needs a third of the time."""
         insert, names = self._insert(table), list(rows[0])
         if self._insert is sqlite.insert:
             return insert, rows
@@ -256,7 +256,7 @@ class Store:
             connection.execute(sa.delete(table).where(table.c.digest.in_(beyond)))
 
     def _reject(self, message: Incoming, reason: str, now: datetime.datetime) -> BatchResult:
-        """Note a message that the database refuses; confirm an item, or its aircraft would send it for ever."""
+        """Record a message that the database refuses; confirm an item, or its aircraft would resend it for ever."""
         outcome = BatchResult({}, {}, [(message, reason)])
         to = addressed(message.topic)
         item = None
@@ -272,7 +272,7 @@ class Store:
         return outcome
 
     def _take_in_again(self) -> bool:
-        """Parse items of a newer aircraft whose kind is known by now; return whether there may be more."""
+        """Parse items of newer aircraft whose kind is now known; return whether there may be more."""
         items, each, refused = schema.items, schema.items.c, []
         of_a_kind = each.kind.is_(None) | each.kind.in_(KINDS)
         known = sa.select(items).where(each.state == "unknown", each.format_version == FORMAT_VERSION, of_a_kind)
@@ -303,7 +303,7 @@ def _raw(item: ReceivedItem, message: Incoming) -> Row:
 
 
 def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str, str], list[list[int]]]:
-    """Find the sequences that these aircraft keep, by their last hellos, and the database lacks."""
+    """List the sequences that these aircraft keep (by their last hellos) and the database lacks."""
     one, items = schema.aircraft.c, schema.items.c
     of = one.aircraft.in_(sorted(which))
     before = sa.select(one.aircraft, one.epoch, one.last, (one.first - 1).label("number")).where(of)

@@ -1,5 +1,5 @@
-"""The companion from the ground: a pilot's laptop on the telemetry link, without a ground station program.
+"""Client of the companion on a pilot's laptop, over the telemetry link and without a ground station program.
 
-A face: it knows MAVLink and people, and nothing of the daemon, which runs on the aircraft. MAVSDK is imported here
-only, and only when one of the commands runs.
+The package is an interface to people over MAVLink and uses no part of the daemon, which runs on the aircraft. Only this
+package imports MAVSDK, when one of its commands runs.
 """

@@ -1,4 +1,4 @@
-"""Heartbeats and texts heard on the link: who is there, whether the vehicle is armed, the companion's words."""
+"""Heartbeats and texts received on the link: components, the vehicle's armed state, and the companion's texts."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from companion.links.system.events import Listeners
 from companion.protocols.guess import AUTOPILOT_NAMES
 
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
-FRESH_S: Final = 3.0  # heartbeats come once a second, and two may be lost in a row
-MAX_PEERS: Final = 64  # the most senders that are remembered; newcomers beyond are not
+FRESH_S: Final = 3.0  # longest age of a valid heartbeat: they come once a second, and two may be lost in a row
+MAX_PEERS: Final = 64  # most senders that are remembered; later ones are ignored
 MAX_TEXTS: Final = 200
 
 Fields = Mapping[str, object]
 
 
 class Address(NamedTuple):
-    """A component of a vehicle."""
+    """MAVLink address of a component of a vehicle."""
 
     system_id: int
     component_id: int
@@ -50,7 +50,7 @@ class Text(NamedTuple):
 
 
 class AutopilotSeen(NamedTuple):
-    """The autopilot as its heartbeat shows it."""
+    """State of the autopilot from its heartbeat."""
 
     system_id: int
     firmware: str | None
@@ -58,11 +58,11 @@ class AutopilotSeen(NamedTuple):
 
 
 class GroundListener:
-    """Keeps heartbeats of all components, and texts of the companions; never raises, whatever the messages hold."""
+    """Heartbeats of all components, and texts of the companions. Never raises, whatever the messages contain."""
 
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
-        self.first_s: float | None = None  # of the first heartbeat
+        self.first_s: float | None = None  # time of the first heartbeat
         self.heartbeats: dict[Address, PeerState] = {}
         self.texts: list[Text] = []  # of all vehicles' companions, oldest first
         self.on_text: Listeners[[Text]] = Listeners()  # Listeners for every text, with its system id
@@ -86,14 +86,14 @@ class GroundListener:
         return AutopilotSeen(system_id, beat.firmware, armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
-        """Return whether the companion is at work by a heartbeat later than `since_s`; None: there was none."""
+        """Return whether a heartbeat after `since_s` shows the companion at work; None: no such heartbeat."""
         beat = self.heartbeats.get(Address(system_id, self.component_id))
         if beat is None or beat.at_s <= since_s:
             return None
         return beat.system_status == mavlink.MAV_STATE_CALIBRATING
 
     def texts_of(self, system_id: int, since_s: float) -> list[Text]:
-        """List the texts of a vehicle's companion since then; continuation lines are joined."""
+        """List the texts of a vehicle's companion since `since_s`; continuation lines are joined."""
         found: list[Text] = []
         for text in self.texts:
             if text.system_id != system_id or text.at_s < since_s:
@@ -125,7 +125,7 @@ class GroundListener:
             )  # fmt: skip
 
     def _text(self, system_id: int, fields: Fields, now_s: float) -> None:
-        # A terminal must not obey it.
+        # The terminal must not execute control characters in it.
         words = to_ascii(str(fields.get("text", "")).rstrip("\0"))
         text = Text(system_id, whole(fields, "severity"), words, now_s)
         self.texts.append(text)
@@ -146,7 +146,7 @@ def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
 
 
 def nobody_heard(heard: GroundListener, url: str, system_id: int | None, within_s: float) -> str:
-    """Say in one line why no companion was found: what was heard, and what to try."""
+    """Describe in one line why no companion was found: heard senders, and the remedy."""
     others, component = heard.summary(), heard.component_id
     if not others:
         return (

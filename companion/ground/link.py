@@ -1,15 +1,15 @@
-"""The link from the ground, on MAVSDK 4.1, and one command with all its answers (`Exchange`).
+"""Ground end of the link, on MAVSDK 4.1, and one command with all its answers (`Exchange`).
 
-MavlinkDirectServer sends and hears any message, also before MAVSDK has found a system; Param is a parameter client with
-retries. MAVSDK's own `send_command` keeps the progress to itself, repeats with confirmation 0 (which is a new request)
-and does not ask again when the final answer was lost. MAVSDK 4.1 has no signing: where there is a key, the companion's
-own link checks and signs, and MAVSDK talks to it over `raw://`. MAVSDK calls back in threads of its own; everything
-here goes on in the event loop.
+MavlinkDirectServer sends and receives any message, even before MAVSDK has found a system; Param is a parameter client
+with retries. MAVSDK's own `send_command` does not report progress, repeats with confirmation 0 (a new request) and does
+not ask again after a lost final answer. MAVSDK 4.1 has no signing: with a key, the companion's own link verifies and
+signs, and MAVSDK connects to it over `raw://`. MAVSDK calls back in threads of its own; all code here runs in the event
+loop.
 
-`Exchange` is MAVLink's command protocol from the asking side, over a radio that loses packets: repeat with a counted-up
-`confirmation` until the first answer, then follow IN_PROGRESS to the one final answer. When progress falls silent, the
-same request again brings a lost final answer back for as long as the companion remembers it (`component.commands`);
-later it would count as a new one, and must not be sent.
+`Exchange` is the client of MAVLink's command protocol, over a radio that loses packets. It repeats a request with an
+increasing `confirmation` until the first answer, then follows IN_PROGRESS to the final answer. When progress stops, a
+repeated request returns a lost final answer while the companion remembers it (`component.commands`). Later the request
+would count as a new one, so it must not be sent.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[Signing]:
-    """Carry what MAVSDK sends as `own` and hears over a url, signed, until the context ends."""
+    """Connect MAVSDK to a url through a signing link until the context ends; `own`: system and component id."""
     await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
     loop, parser = asyncio.get_running_loop(), mavlink.MAVLink(None)
     parser.robust_parsing = True
@@ -53,7 +53,7 @@ async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> A
                 link.send(message)
 
     def send_from_thread(data: bytes) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+        with contextlib.suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(send, data)
 
     for kind in mavlink.mavlink_map.values():
@@ -73,7 +73,7 @@ _HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
 
 
 class GroundLink:
-    """A ground station on an open link; made by `open_link`."""
+    """Ground station on an open link; `open_link` makes it."""
 
     def __init__(
         self, sdk: Any, direct: Any, own: Address, heard: GroundListener, signing: Signing | None = None
@@ -86,17 +86,17 @@ class GroundLink:
             direct.subscribe_message(name, self._in_a_thread)
 
     def unbelieved(self) -> str:
-        """Name the messages that were dropped because of their signature; empty: none."""
+        """Describe the messages that were dropped because of their signature; empty: none."""
         if self._signing is None or not self._signing.doubted:
             return ""
         counts = ", ".join(f"{count} {reason}" for reason, count in self._signing.doubted.most_common())
         return f"messages dropped because of their signature: {counts}"
 
     def send_command(self, target: Address, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
+        """Send COMMAND_LONG; a failed send counts as a lost packet."""
         from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServerError, MavlinkMessage
 
-        # Every field is given, as a number: MAVSDK takes a wrong name or a string and puts 0 on the wire.
+        # Give every field, as a number: for a wrong name or a string MAVSDK sends 0, without an error.
         fields = {
             "target_system": target.system_id,
             "target_component": target.component_id,
@@ -115,7 +115,7 @@ class GroundLink:
         return {one.name: one.value for one in (*found.float_params, *found.int_params)}
 
     async def get_parameter(self, target: Address, name: str) -> float | None:
-        """One parameter; None when there is no answer, or no such parameter."""
+        """Read one parameter; None: no answer, or no such parameter."""
         from mavsdk.plugins.param import ParamError
 
         try:
@@ -133,7 +133,7 @@ class GroundLink:
                 try:
                     client.select_component(target.component_id, ProtocolVersion.V1)
                 except ParamError as error:
-                    # 4.1.0 selects, and then reports UNKNOWN.
+                    # MAVSDK 4.1.0 selects the component, but reports UNKNOWN.
                     if error.result != ParamResult.UNKNOWN:
                         raise AutopilotError(f"component {target.component_id}: {error.result.name}") from None
                 return client
@@ -164,8 +164,8 @@ class GroundLink:
 class _Log:
     """Sink for MAVSDK's log, which would go to the terminal otherwise.
 
-    `mavsdk.log_subscribe` is no help: it fails on texts that are not UTF-8. Any component's STATUSTEXT may be one, and
-    MAVSDK logs them all. The text would then reach the terminal, with a complaint about itself.
+    `mavsdk.log_subscribe` fails on texts that are not UTF-8, such as a STATUSTEXT of any component: MAVSDK logs them
+    all. The text would then reach the terminal, with an error.
     """
 
     def __init__(self) -> None:
@@ -174,14 +174,14 @@ class _Log:
 
         self.last_error = ""
         self._error = LogLevel.ERROR
-        # Kept as long as the library may call it: for as long as it is loaded.
+        # Keep a reference for as long as the library is loaded, since it may call back at any time.
         _Log.callback = LogCallback(self._take)
         _cmavsdk_lib.mavsdk_log_subscribe(_Log.callback, None)
 
     callback: ClassVar[Any] = None
 
     def _take(self, level: int, message: bytes | None, *_: object) -> bool:
-        """Run in one of MAVSDK's threads; True: it is not to print this itself."""
+        """Record a log message, in one of MAVSDK's threads; return True: MAVSDK must not print it."""
         words = (message or b"").decode(errors="replace")
         logger.debug("MAVSDK: %s", words)
         if level == self._error:
@@ -191,10 +191,10 @@ class _Log:
 
 @asynccontextmanager
 async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -> AsyncIterator[GroundLink]:
-    """Be a ground station on a link; `heard` learns what comes; with a key, only what is signed with it.
+    """Open a link as a ground station; `heard` gets all messages, or with a key only those signed with it.
 
     Raises:
-        ConfigError: MAVSDK is not installed, or the url is none.
+        ConfigError: MAVSDK is not installed, or the url is invalid.
         LinkError: the port cannot be opened.
     """
     try:
@@ -221,13 +221,13 @@ async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -
 
 
 ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
-"""Timeout of each attempt: 0.3 s for the companion, the rest for the radio. All attempts end while the companion
-remembers the end of the first; else the last could start another calibration."""
+"""Timeout of each attempt: 0.3 s for the companion, the rest for the radio. All attempts must end while the companion
+remembers the result of the first; otherwise the last could start another calibration."""
 REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
-"""Seconds without an answer after which progress is asked for again: two ACKs may be lost in a row before. The last
-leaves the radio the rest of the time for which the companion remembers its final answer."""
+"""Seconds without an answer after which the request is repeated: two ACKs may be lost in a row before that. The last
+repeat leaves the radio the rest of the time for which the companion remembers its final answer."""
 assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
-ENDED_AFTER_S: Final = 5.0  # silence, while heartbeats show no work: the end was missed
+ENDED_AFTER_S: Final = 5.0  # silence, with idle heartbeats, after which the final answer counts as lost
 LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 
@@ -235,7 +235,7 @@ _TICK_S: Final = 0.25
 class Exchange:
     """A request; `run` it once, then read `result` (MAV_RESULT; None: no final answer) and `detail` (`result_param2`).
 
-    `on_progress` is told how far it is and for how long nothing has come, several times a second.
+    `on_progress` gets the percentage and the seconds since the last answer, several times a second.
     """
 
     def __init__(
@@ -251,14 +251,14 @@ class Exchange:
         self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
         self.result: int | None = None
         self.detail = 0
-        self.unanswered = False  # No answer came to any attempt
+        self.unanswered = False  # True: no attempt was answered
         self._answered = asyncio.Event()
         self._heard_s = 0.0
         self._confirmation = 0
         self.percent = 0
 
     async def run(self) -> None:
-        """Ask and wait for the end; without an answer or a heartbeat at most 20 s."""
+        """Send the request and wait for its end; without an answer or a heartbeat, for at most 20 s."""
         stop_watching = self._link.on_ack.add(self._on_ack)
         try:
             self.unanswered = not await self._begin()
@@ -275,7 +275,7 @@ class Exchange:
         return False
 
     async def _follow(self) -> bool:
-        """Wait for one more answer; False when there is no use in waiting on."""
+        """Wait for one more answer; return False if none can be expected any more."""
         loop = asyncio.get_running_loop()
         repeats = list(REPEAT_AFTER_S)
         while not await self._hears(_TICK_S):

@@ -22,10 +22,10 @@ from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListen
 from companion.ground.link import Exchange, GroundLink
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
-EVERYBODY_WITHIN_S: Final = 1.3  # after the first heartbeat: they come once a second
-WORDS_WITHIN_S: Final = 3.0  # the texts of an end may follow it by that
-QUIET_S: Final = 1.0  # silence after which a sender has said everything: two lines a second pass
-CANCELLED_WITHIN_S: Final = 30.0  # a cancel waits for a safe point, and old values may have to be put back
+EVERYBODY_WITHIN_S: Final = 1.3  # wait for all senders after the first heartbeat; heartbeats come once a second
+WORDS_WITHIN_S: Final = 3.0  # longest delay of the texts after the end that they describe
+QUIET_S: Final = 1.0  # silence after which a sender's texts are complete: it sends two lines a second
+CANCELLED_WITHIN_S: Final = 30.0  # a cancel waits for a safe point, and may have to restore old values
 SILENCE_WORTH_A_WORD_S: Final = 3.0
 _POLL_S: Final = 0.05
 
@@ -79,7 +79,7 @@ class Display:
 
 
 class Station:
-    """Speaks to the one companion that `find` found."""
+    """Client of the companion that `find` has found."""
 
     def __init__(self, link: GroundLink, url: str, display: Display) -> None:
         self._link, self._url, self._display = link, url, display
@@ -94,7 +94,7 @@ class Station:
         return self._heard.vehicle(self._target.system_id, asyncio.get_running_loop().time())
 
     def interrupt(self) -> None:
-        """Ctrl-C: cancel what was asked for; a second time: do not wait for its end."""
+        """Handle Ctrl-C: cancel the request; the second time, do not wait for its end."""
         self._why_cancelled = self._why_cancelled or "Ctrl-C"
         self._interrupted.set()
 
@@ -102,8 +102,8 @@ class Station:
         """Wait for the companion's heartbeat, and its autopilot's if there is one.
 
         Raises:
-            NobodyHeardError: none came in time; says what was heard and what to try.
-            ConfigError: several vehicles have a companion, and nobody has said which is meant.
+            NobodyHeardError: no heartbeat in time; the text names the heard senders and the remedy.
+            ConfigError: several vehicles have a companion, and none was selected.
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
@@ -124,10 +124,10 @@ class Station:
         self._target = Address(wanted[0], self._heard.component_id)
 
     async def calibrate(self, what: What, timeout_s: float | None, *, reboot: bool) -> RequestOutcome:
-        """Calibrate, and follow it to its end.
+        """Start a calibration and follow it to its end.
 
         Raises:
-            NobodyHeardError: the companion beats, but does not answer.
+            NobodyHeardError: the companion sends heartbeats but does not answer.
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
@@ -149,13 +149,13 @@ class Station:
         return dataclasses.replace(outcome, reason=reason, lines=lines, more={**outcome.more, **more})
 
     async def undo(self) -> RequestOutcome:
-        """Put the old values back; raises as `calibrate`."""
+        """Undo the last write; raises NobodyHeardError."""
         begun_s, exchange = asyncio.get_running_loop().time(), Exchange(self._link, self._target, UNDO)
         await self._cancellable(exchange, None)
         return await self._judge(exchange, begun_s)
 
     async def cancel(self) -> RequestOutcome:
-        """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
+        """Cancel the running job, whoever started it, and wait for its end; raises NobodyHeardError."""
         loop = asyncio.get_running_loop()
         begun_s, exchange = loop.time(), Exchange(self._link, self._target, CANCEL)
         await exchange.run()
@@ -195,10 +195,10 @@ class Station:
         more = {**self._more(0.0), "last": last, **sigma, "parameters": found}
         return RequestOutcome(state, reason, good=True, lines=lines, more=more)
 
-    # --- asking
+    # --- requests
 
     async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> None:
-        """Run an exchange; Ctrl-C or the timeout cancel it, and its end is waited for all the same."""
+        """Run an exchange. Ctrl-C or the timeout cancels it at the companion; then wait for its end too."""
         running = asyncio.create_task(exchange.run())
         try:
             if not await self._ends(running, timeout_s):
@@ -217,7 +217,7 @@ class Station:
             await asyncio.gather(running, return_exceptions=True)
 
     async def _ends(self, running: asyncio.Task[None], within_s: float | None) -> bool:
-        """Wait for the end, the timeout or the next Ctrl-C; return whether it ended."""
+        """Wait for the end, the timeout or the next Ctrl-C; return whether the exchange ended."""
         interrupted = asyncio.create_task(self._interrupted.wait())
         try:
             await asyncio.wait({running, interrupted}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
@@ -281,13 +281,13 @@ class Station:
         return _result(await self._link.get_parameter(self._target, "CMP_STATE"))
 
     async def _own_parameters(self) -> dict[str, float]:
-        # MAVSDK's list waits over 10 s for its first answer, and tells nobody; one parameter is given up after 3 s.
+        # MAVSDK waits over 10 s for the first answer to a list, without an error; a single parameter fails after 3 s.
         if await self._link.get_parameter(self._target, "CMP_STATE") is None:
             return {}
         found = await self._link.parameters(self._target)
         return {name: value for name, value in sorted(found.items()) if name.startswith("CMP_")}
 
-    # --- words
+    # --- texts
 
     def _on_text(self, text: Text) -> None:
         if text.system_id == self._target.system_id:
@@ -310,7 +310,7 @@ class Station:
     def _ended(
         self, state: State, reason: str, begun_s: float, said: Text | None = None, *, good: bool = False
     ) -> RequestOutcome:
-        """Make an outcome, with the warnings of the companion meanwhile."""
+        """Make an outcome, with the companion's warnings since `begun_s`."""
         warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text != said]
         lines = [f"{state.upper()}: {reason}", *(f"warning: {text.words}" for text in warned)]
         return RequestOutcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
@@ -324,5 +324,5 @@ class Station:
 
 
 def _result(state: float | None) -> str | None:
-    """Name the end of the last calibration by CMP_STATE; None: there was none, or it is not known."""
+    """Name the result of the last calibration from CMP_STATE; None: no calibration, or unknown."""
     return RESULTS[int(state)] if state in (1.0, 2.0, 3.0) else None

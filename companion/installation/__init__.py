@@ -1,1 +1,1 @@
-"""Putting the companion in place as a service: its unit, udev rules, modules and configuration."""
+"""Installation of the companion as a service: its unit, udev rules, kernel modules and configuration."""

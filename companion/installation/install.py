@@ -1,4 +1,4 @@
-"""Installs and removes the files of the service, idempotently; what its owner has changed is never overwritten."""
+"""Installation and removal of the service's files: idempotent; files that the owner has changed are not overwritten."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ SHIPPED: Final = {
     MODULES: f"lib/{MODULES}",
     SAMPLE: "companion.toml.sample",
 }
-"""Target of each file of `systemd/`: lib/ is below a prefix, the installation's own folder (an owner changes units
-with `systemctl edit`, in /etc); all else is below /etc/companion, the owner's."""
+"""Target of each file of `systemd/`. Targets in lib/ are below the installation's prefix (owners change units with
+`systemctl edit`, in /etc); all others are below /etc/companion, which belongs to the owner."""
 
 
 def folder() -> Path:
-    """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError where there is none."""
+    """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError if there is none."""
     here = Path(__file__).resolve().parent
     for candidate in (here / "systemd", here.parents[1] / "systemd"):
         if (candidate / SERVICE).is_file():
@@ -47,7 +47,7 @@ def folder() -> Path:
 
 
 def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
-    """Return a shipped file for this executable, without stamp; raise CompanionError where that cannot be."""
+    """Return a shipped file adapted to `executable`, without stamp; raise CompanionError for an unsuitable path."""
     text = (folder() / shipped).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
@@ -61,7 +61,7 @@ def stamped(data: bytes) -> bytes:
 
 
 def is_untouched(data: bytes) -> bool:
-    """Return whether some version of us wrote this content."""
+    """Return whether any version of the companion wrote this content, and nobody has changed it."""
     match = _STAMPED.match(data)
     return match is not None and hashlib.sha256(data[match.end() :]).hexdigest().encode() == match[1]
 
@@ -72,7 +72,7 @@ HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S10
 """Folders that the unit hides from the service: ProtectHome and PrivateTmp."""
 
 PACKAGED: Final = "packaged-by"
-"""A file at the top of the environment that a Debian package brings: the service is then the package's."""
+"""File at the top of an environment from a Debian package; the service then belongs to the package."""
 _START_PACKAGED: Final = "sudo systemctl enable --now companion"
 UDEV_RUNS: Final = Path("/run/udev/control")
 
@@ -114,7 +114,7 @@ def own_executable() -> str:
 
 
 def install(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
-    """Install step by step; raise CompanionError for another user, or where a package has brought the service."""
+    """Install step by step; raise CompanionError unless root runs it, or if a package has installed the service."""
     if target.is_this_machine:
         _check_not_packaged(_START_PACKAGED)
         _check_user("install-service")
@@ -127,7 +127,7 @@ def install(target: Installation, run: Run | None = None) -> Iterator[InstallSte
 
 
 def start_service(run: Run | None = None) -> Iterator[InstallStep]:
-    """Have the service run now and at every boot; raise CompanionError as `install`."""
+    """Start the service now and at every boot; raise CompanionError (see `install`)."""
     if _is_packaged():
         for command in ("enable", "restart"):
             yield _command(run or _run, "systemctl", command, "companion.service")
@@ -140,7 +140,7 @@ def how_to_start() -> str:
 
 
 def uninstall(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
-    """Remove what `install` wrote; configuration and records stay. Raise CompanionError as `install`."""
+    """Remove the files that `install` wrote; keep configuration and records. Raise CompanionError (see `install`)."""
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
         _check_user("uninstall-service")
@@ -209,7 +209,7 @@ def _check_user(command: str) -> None:
 
 
 def _check_reach(executable: str) -> None:
-    """Raise CompanionError where the service, nobody's account, could not run this installation."""
+    """Raise CompanionError if the service, which has its own account, could not run this installation."""
     package = Path(companion.__file__).parent
     for path in (Path(executable), package, Path(sys.base_prefix)):
         why = unreachable(path)
@@ -223,7 +223,7 @@ def _check_reach(executable: str) -> None:
 
 
 def unreachable(path: Path) -> str | None:
-    """Return why the service could not reach a path, in one line; None when it can."""
+    """Return the reason why the service cannot reach a path, in one line; None: it can."""
     resolved = path.resolve()
     for hidden in HIDDEN:
         if resolved.is_relative_to(hidden):
@@ -265,7 +265,7 @@ def systemd_runs() -> bool:
 
 
 def is_service() -> bool:
-    """Return whether systemd here knows the companion's unit, wherever it was put."""
+    """Return whether this system runs systemd and has the companion's unit, in any of its folders."""
     folders = ("/etc", "/usr/local/lib", "/usr/lib", "/lib")
     return systemd_runs() and any(Path(folder, "systemd/system", SERVICE).exists() for folder in folders)
 

@@ -33,12 +33,12 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "EV": ("", ("Id",)),
     "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
 }
-"""Field with the instance, and fields to read, by message."""
+"""Name of the instance field, and names of the fields to read, by message."""
 _IMUS: Final = 5
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
 _STEPS: Final = np.array([*[0.01 * DEG] * 3, 0.01])
-"""XKF1 and XKF2 hold biases in whole hundredths of deg/s and m/s^2, cut toward zero: zero is anything within one."""
+"""Resolution of the biases in XKF1 and XKF2, in rad/s and m/s^2: hundredths of deg/s and m/s^2, truncated to zero."""
 _EVENTS: Final = {"armed": {10: True, 11: False}, "airborne": {28: True, 18: False}}
 _MOTOR_FUNCTIONS: Final = (*range(33, 41), *range(82, 86), 70)
 _TURNING_US: Final = 30.0
@@ -51,7 +51,7 @@ def read(path: Path) -> Iterator[Boot]:
 def _boot(start: BootMessages) -> Boot:
     parameters = {name: value for _, name, value in start.parameters}
     mask = round(parameters.get("EK3_IMU_MASK", 3.0))
-    cores = [k for k in range(_IMUS) if mask >> k & 1]  # by EKF core, its IMU from 0
+    cores = [k for k in range(_IMUS) if mask >> k & 1]  # IMU (from 0) of each EKF core
     lanes = _lanes(start)
     simulated = bool(start.instances("SIM"))
     return Boot(
@@ -65,7 +65,7 @@ def _boot(start: BootMessages) -> Boot:
         parameters=tuple(start.parameters),
         unix_offset_s=_unix_offset(start.rows("GPS")),
         place=_place(start.rows("GPS")),
-        # Its own physics know neither.
+        # A simulator has neither the Earth's rate nor local gravity.
         earth_turns=not simulated,
         standard_gravity=simulated,
         notes=(
@@ -93,7 +93,7 @@ def _of_core_in_use(start: BootMessages, name: str, lanes: Floats) -> Floats:
 
 def _imu(start: BootMessages, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
     rows = start.rows("IMU", instance)
-    failed: NDArray[np.bool_] = np.any(rows[:, 8:10] < 1.0, axis=1)  # not so in a log that does not say
+    failed: NDArray[np.bool_] = np.any(rows[:, 8:10] < 1.0, axis=1)  # False in a log without the health fields
     used = rows[np.isfinite(rows[:, :7]).all(axis=1) & ~failed]
     vibration = start.rows("VIBE", instance)
     number = instance + 1
@@ -118,16 +118,16 @@ def _estimated(start: BootMessages, core: int) -> Floats | None:
     steps = start.rows("XKT", core)
     step_s = float(steps[:, 1:3].mean()) if len(steps) else 0.01
     biases = np.column_stack([gyro[:, 7:10] * DEG, np.interp(t_s, accel[:, 0], accel[:, 1])])
-    # It logs those of the core that it flies by; the others are tuned alike.
+    # Only the primary core's variances are logged; the other cores have the same tuning.
     of = next((one for one in (core, *start.instances("XKV2")) if len(start.rows("XKV2", one))), core)
     first, second = start.rows("XKV1", of), start.rows("XKV2", of)
     sigmas = np.full(biases.shape, np.nan)
     if len(first) and len(second) and step_s > 0.0:
-        # Of increments of one step of the filter.
+        # The variances are those of increments in one step of the filter.
         variances = [(first, 1), (first, 2), (second, 1), (second, 2)]
         columns = [np.interp(t_s, rows[:, 0], rows[:, k]) for rows, k in variances]
         sigmas = np.sqrt(np.maximum(np.column_stack(columns), 0.0)) / step_s
-    # A logged value is the end toward zero of the range that was cut off to it.
+    # A logged value is truncated toward zero: the middle of its range is half a step further out.
     middle = biases + 0.5 * _STEPS * np.sign(biases)
     cut = np.where(np.abs(biases) < 0.5 * _STEPS, 2.0 * _STEPS, _STEPS) / math.sqrt(12.0)
     return np.column_stack([t_s, middle, np.hypot(sigmas, cut)])

@@ -1,7 +1,7 @@
 """Logs of autopilots as rows of numbers: ArduPilot's dataflash (.bin) and PX4's ULog (.ulg).
 
-Dataflash: AP_Logger/LogStructure.h; the letters of its formats are pymavlink's, whose own reader takes sixteen times
-as long. A ULog is read by pyulog.
+Dataflash: AP_Logger/LogStructure.h, with pymavlink's table of format letters; pymavlink's own reader takes sixteen
+times as long. A ULog is read by pyulog.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from companion.physics.frames import Floats
 
 US: Final = 1e-6
 DATAFLASH_MAGIC: Final = b"\xa3\x95\x80"
-"""Beginning of a dataflash log: the head of a format message that describes format messages."""
+"""First bytes of a dataflash log: the head of the format message that describes format messages."""
 ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
 _HEAD: Final = DATAFLASH_MAGIC[:2]
 _FMT: Final = np.dtype([("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")])
 _CLOCK: Final = "TimeUS"
 _PARAMETER: Final = "PARM"
 _MOST_PARAMETERS: Final = 1 << 16
-_INSTANCES: Final = 16  # Most instances: a larger number is damage
+_INSTANCES: Final = 16  # Most instances; a larger number is a damaged byte
 
 Fields = Mapping[str, tuple[str, tuple[str, ...]]]
-"""Field with the instance (or ""), and fields to read, by message."""
+"""Name of the instance field (or ""), and names of the fields to read, by message."""
 _MOST_TIMES: Final = 4
-"""Damage can lead pyulog back to an earlier message, again and again."""
+"""Most bytes to read, as a multiple of the file's size: in a damaged file pyulog may jump back again and again."""
 _NEEDS_MORE: Final = (
     "a log of PX4 needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
 
 Topics = Mapping[str, tuple[str, ...]]
-"""Fields to read by topic; arrays element by element: `gyro_rad[0]`."""
+"""Fields to read by topic; elements of arrays are listed one by one: `gyro_rad[0]`."""
 
 _LARGEST: Final = 1e6
 _CORRECTED: Final = (
@@ -61,13 +61,13 @@ _TOPICS: Final = {
 
 
 class BootMessages:
-    """Messages of one start of the autopilot; parameters as time in s, name and value."""
+    """Messages of one start of the autopilot; parameters are rows of time in s, name and value."""
 
     def __init__(self, fields: Mapping[str, int]) -> None:
         self._fields = fields
         self._chunks: dict[tuple[str, int], list[Floats]] = defaultdict(list)
         self.parameters: list[tuple[float, str, float]] = []
-        self.gaps = 0  # Gaps in which the autopilot could not write
+        self.gaps = 0  # Gaps where the autopilot could not write to the log
 
     def add(self, name: str, instance: int, rows: Floats) -> None:
         """Add rows in the order of the file: the autopilot's clock in s, then the fields; NaN: no such field."""
@@ -89,7 +89,7 @@ class BootMessages:
 
 
 def ascending(rows: Floats) -> Floats:
-    """Select rows in order of their time, the first column; a single one ahead of all others is damage."""
+    """Select rows with ascending time (the first column); drop a single row that is ahead, because it is damaged."""
     rows = rows[np.isfinite(rows[:, 0])]
     if not len(rows):
         return rows
@@ -130,7 +130,7 @@ class _Kind:
 
 
 def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
-    """Read these messages and the parameters, start by start: memory is that of one."""
+    """Read the messages of `fields` and the parameters; yield them start by start, to save memory."""
     kinds: dict[bytes, _Kind] = {DATAFLASH_MAGIC: _Kind(_FMT.itemsize + 3)}
     fields = {**fields, _PARAMETER: ("Name", ("Value",))}
     widths = {name: len(columns) for name, (_, columns) in fields.items()}
@@ -142,7 +142,7 @@ def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
                 kind = kinds.get(data[at : at + 3])
                 after = end if kind is None else at + kind.length
                 if kind is None or (after != end and data[after : after + 2] != _HEAD):
-                    # Damage: bytes that no other message follows are no message.
+                    # Damaged: a message must be followed by the head of another one.
                     at = data.find(_HEAD, at + 1)
                     continue
                 if kind.layout is not None:
@@ -166,7 +166,7 @@ def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
 
 
 def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
-    """Give the head and the kind of the messages that a format message describes; None: it cannot be one."""
+    """Return the head and the kind of the messages that a format message describes; None: it is damaged."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT
 
     number, length, *said = np.frombuffer(data, _FMT)[0].tolist()
@@ -214,12 +214,12 @@ def ulog(path: Path, topics: Topics) -> BootMessages:
     except ImportError:
         raise StorageError(_NEEDS_MORE) from None
     try:
-        # It prints what is damaged to stdout, where an answer may stand.
+        # pyulog prints damage to stdout, which may be reserved for JSON.
         with _Counted(path) as file, contextlib.redirect_stdout(None):
             log = ULog(file, [*topics])
     except OSError as error:
         raise unreadable(path, error) from None
-    except Exception as error:  # noqa: BLE001 - pyulog raises anything of a damaged file
+    except Exception as error:  # noqa: BLE001 - pyulog may raise anything for a damaged file
         raise StorageError(f"{path}: not a readable log of PX4: {' '.join(str(error).split())[:200]}") from None
     start = BootMessages({name: len(fields) for name, fields in topics.items()})
     told = [(log.start_timestamp, name, value) for name, value in log.initial_parameters.items()]
@@ -234,16 +234,16 @@ def ulog(path: Path, topics: Topics) -> BootMessages:
     return start
 
 
-# --- flights, whichever firmware wrote the log
+# --- flights, of either firmware
 
 
 class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU in one log, numbered from 1 as in the configuration.
 
     Readings (n, 6) are in rad/s and m/s^2, corrected by the firmware, vehicle FRD; `means`: each is the mean since the
-    one before, not an instant. Temperatures and vibration levels (m/s^2) have rows of time and value. `estimated` are
-    biases of an EKF, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), sigma of each; NaN where unknown.
-    Readings at `failed_s`, when the autopilot took the IMU for failed, are left out.
+    previous reading, not an instant. Temperatures and vibration levels (m/s^2) have rows of time and value. `estimated`
+    has biases of an EKF, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), sigma of each; NaN: unknown.
+    Readings at `failed_s`, when the autopilot marked the IMU as failed, are left out.
     """
 
     number: int  # Number from 1, as in the configuration
@@ -263,9 +263,9 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Boot(msgspec.Struct, frozen=True, kw_only=True):
-    """Log of one start of the autopilot; times in s on its clock, which `unix_offset_s` takes to UTC.
+    """Log of one start of the autopilot. Times are in s on its clock; `unix_offset_s` converts them to UTC.
 
-    A simulator may have no Earth's rate, and standard gravity everywhere.
+    A simulator may lack the Earth's rate and have standard gravity everywhere.
     """
 
     firmware: FirmwareName
@@ -284,7 +284,7 @@ class Boot(msgspec.Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...] = ()
 
     def parameters_at(self, t_s: float) -> dict[str, float]:
-        """Return the parameters at a time; one that was logged only later has its first value."""
+        """Return the parameters at a time; a parameter that was first logged later has its first value."""
         found: dict[str, float] = {}
         for told_s, name, value in self.parameters:
             if told_s <= t_s or name not in found:
@@ -301,7 +301,7 @@ def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]
 
 
 def in_use(choices: Floats, t_s: Floats) -> Floats:
-    """Look up which of (n, 2) times and choices is in use at each time; before the first, the first."""
+    """Look up the choice in use at each time from rows (n, 2) of time and choice; the first is also used before it."""
     return np.asarray(choices[np.maximum(np.searchsorted(choices[:, 0], t_s, side="right") - 1, 0), 1])
 
 
@@ -309,7 +309,7 @@ def in_use(choices: Floats, t_s: Floats) -> Floats:
 
 
 def read_ulog(path: Path) -> list[StillLog]:
-    """Read the IMUs of a PX4 log: sensor_combined, which PX4 flies by, and pairs of sensor_gyro and sensor_accel."""
+    """Read the IMUs of a PX4 log: sensor_combined, which PX4's EKF uses, and pairs of sensor_gyro and sensor_accel."""
     start = ulog(path, _TOPICS)
     notes = (f"gaps in it, in which PX4 could not write: {start.gaps}",) if start.gaps else ()
     logs: list[StillLog] = []
@@ -320,7 +320,7 @@ def read_ulog(path: Path) -> list[StillLog]:
     for instance in start.instances("sensor_gyro"):
         rows, beside = (start.unsorted(topic, instance) for topic in ("sensor_gyro", "sensor_accel"))
         if len(beside):
-            # Each has messages of its own: join the force that is nearest in time to every rate.
+            # Gyro and accelerometer have separate messages: join the nearest force in time to every rate.
             at = np.searchsorted(0.5 * (beside[1:, 0] + beside[:-1, 0]), rows[:, 0])
             table = np.column_stack([rows[:, :4], beside[at, 1:4], rows[:, 4]])
             logs += _log(path, f"sensor{instance}", table, (_RAW, *notes))
@@ -337,7 +337,7 @@ def read_dataflash(path: Path) -> list[StillLog]:
 
 
 def _log(path: Path, imu: str, table: Floats, notes: tuple[str, ...]) -> Iterator[StillLog]:
-    """Make the log of an IMU from the samples that are whole and in order; rows of time, six readings, temperature."""
+    """Make the log of an IMU from the complete samples in order; rows of time, six readings, temperature."""
     t_s, readings = table[:, 0], table[:, 1:7]
     whole = (np.abs(t_s) < LAST_S) & (np.abs(readings) < _LARGEST).all(axis=1)
     ahead = whole.copy()

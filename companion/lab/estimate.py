@@ -1,4 +1,4 @@
-"""Biases in a log: estimated from its longest still stretch, or from windows side by side to check sigma."""
+"""Biases in a log: estimated from its longest still stretch, or from adjacent windows to check sigma."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from companion.samples import ImuSample, Vector
 
 MIN_STILL_S: Final = 5.0
 MAX_STILL_S: Final = 3600.0
-# The collector drops the second in which a stream begins: here that is its first millisecond.
+# The collector drops the second in which a stream begins: times are shifted so that it has only one millisecond.
 _FIRST_S: Final = 999.999
 _REMEDIES: Final = Remedies(
     "say --latitude-deg",
@@ -44,20 +44,20 @@ _REMEDIES: Final = Remedies(
     mounting="--mounting {}",
     any_bias="--any-bias takes it",
 )
-_LONGER: Final = 1.02  # A window is chosen again when the stretch has grown by so much
+_LONGER: Final = 1.02  # Growth of the stretch after which a new window is chosen
 _AT_ONCE: Final = 4096
 
 MOST_WINDOWS: Final = 100_000
-"""Eleven days of the shortest windows; a clock that jumps makes more."""
+"""Most windows: eleven days of the shortest ones; more mean that the log's clock jumped."""
 PAUSE_S: Final = 3.0
-"""A sensor that was silent for longer may have been switched off."""
+"""Longest silence without a possible power-off of the sensor."""
 HORIZON_S: Final = 180.0
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
 _SAME_RAD: Final = 1.0 * DEG
-"""More than any bias drifts by: a larger turn of gravity is another pose."""
+"""Largest rotation of the measured gravity in one pose; it exceeds any drift of the bias."""
 _EXACT_DEG: Final = 1e-4
 _LATITUDE_DEG: Final = 45.0
-"""Any will do: the Earth's rate cancels."""
+"""Substitute for an unknown latitude; its value does not matter, because the Earth's rate cancels."""
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,7 +81,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Object]:
-    """Estimate the biases from the longest still stretch of a log; return also which part of it was used, for JSON."""
+    """Estimate the biases from the longest still stretch of a log; return the record, and the part used, for JSON."""
     return _Pass(log, given, max_still_s).run()
 
 
@@ -116,7 +116,7 @@ class _Pass:
         end_s = float(log.t_s[-1]) + offset_s
         looked_s = _FIRST_S
         for now_s, gyro, accel, degc in _rows(log, offset_s):
-            # Before the sample is added, as in the daemon: a second ends with the first sample of the next.
+            # Check before the sample is added, as in the daemon: the first sample of a second ends the previous one.
             if now_s - looked_s >= 1.0:
                 looked_s = math.floor(now_s)
                 collector.tick(now_s)
@@ -149,7 +149,7 @@ class _Pass:
             self._still_s = glance.still_s
 
     def _latest(self, seconds: float) -> tuple[Measurement, Window]:
-        """Find the latest measurement that gives a window; if none does, raise the reason of the last."""
+        """Return the latest measurement that gives a window, and the window; if none does, raise the latest refusal."""
         refusals = []
         for each in reversed(self._found):
             try:
@@ -168,7 +168,7 @@ class _Pass:
         return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
 
     def _aged(self, measurement: Measurement) -> Measurement:
-        """Add the time for which the IMU had been on before the log, unless it was silent since."""
+        """Add the power-on time before the log to a measurement that has no pause since the log's beginning."""
         begun_s = measurement.begun_s.get(self._log.imu, math.inf)
         powered = self._given.powered
         if self._log.clock_from_start:
@@ -222,18 +222,18 @@ def _posed(window: Window, given: Given) -> Window:
 
 
 def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
-    """Check sigma on a sensor: calibrate every window of a length in seconds by itself, as after a start.
+    """Check sigma on a sensor: calibrate every window of `length_s` seconds independently, as after a start.
 
     The result of a window is compared with those of the windows after it: in 95 of 100 cases they should agree within
-    2 sigma. The pose is the same in both and cancels: it counts as known, and sigma is the sensor's alone. Windows are
+    2 sigma. The pose is equal in both and cancels: it counts as known, so that sigma is that of the sensor. Windows are
     not compared across a move of the sensor.
 
     Returns:
-        Number of windows; number of failed ones by reason, whatever its figures, the commonest first; comparisons by
-        axis, none where no two windows in a row gave a result.
+        Number of windows; number of failed ones by reason (figures in the reason are ignored), the commonest first;
+        comparisons by axis, empty if no two consecutive windows gave a result.
     """
     posed, force = given, np.zeros(3)
-    found: list[Floats | None] = []  # Bias, sigma_stat and sigma_use of each window, (3, 6); None: it gave none
+    found: list[Floats | None] = []  # Bias, sigma_stat and sigma_use of each window, (3, 6); None: no result
     whys: list[str] = []
     begin_s = float(log.t_s[0])
     starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
@@ -254,7 +254,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str
         if not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0:
             posed, force = _posed_by(here, given), here
             found.append(None)
-        # What was switched on before the window says how far a warm-up may still go.
+        # The time since power-on bounds the warm-up that is still to come.
         at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
         powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered if at == 0 else 0.0)
         record, _ = estimate(part, msgspec.structs.replace(posed, powered=powered_s), max_still_s=length_s)
@@ -268,7 +268,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str
 
 
 def _posed_by(force: Floats, given: Given) -> Given:
-    """Fill in what was not given: the pose by that specific force (3,), and a place, both exact."""
+    """Fill in missing values: the pose from the specific force (3,), and a place; both count as exact."""
     mean = rotation_matrix(given.mounting) @ force
     roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
     return msgspec.structs.replace(
@@ -298,8 +298,8 @@ def _counted(whys: Sequence[str]) -> dict[str, int]:
 def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[Object]:
     """Compare every window with the mean of the `span` windows after it; by axis, in rad/s or m/s^2.
 
-    `rms`: of the differences; `sigma_use`: median; `ratio`: root mean square of a difference over its sigma (1 where
-    sigma is right); `share`: part within 2 sigma. Both allow for the white noise of the windows after.
+    `rms` is that of the differences, `sigma_use` the median, `ratio` the rms of a difference over its sigma (1: sigma
+    is right), `share` the part within 2 sigma. The last two include the white noise of the later windows.
     """
     misses, uses, seen = [], [], []
     for at, one in enumerate(found):

@@ -1,4 +1,4 @@
-"""One flight of a log: offsets in force, biases in the air, and the drift of free inertial navigation."""
+"""Analysis of a flight in a log: active offsets, biases in the air, and the drift of free inertial navigation."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from companion.storage.records import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
 _SETTLED_S: Final = 3.0
-"""Left out after the take-off, and before the landing."""
+"""Time left out after the take-off and before the landing."""
 _STOOD_S: Final = 30.0
 """Longest time before the motors' start that is analysed."""
 _STILL_RAD_S: Final = 0.005
 _OUTLIER: Final = 6.0
 _USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
-"""Least scatter of windows that counts as usual."""
+"""Floor of the usual scatter of windows: gyro x y z in rad/s, vertical accelerometer in m/s^2."""
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
 _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-"""ArduPilot up to 4.6, ArduPilot from 4.7, PX4."""
+"""Parameters of the system id: ArduPilot up to 4.6, ArduPilot from 4.7, PX4."""
 _UNKNOWN: Final[Sequence[Term | None]] = (None,) * 4
 
 Knowledge = tuple[Sequence[Record], Mapping[str, KnownImu]]
@@ -67,7 +67,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
     if reference is None:
         return []
     reference = _on_earth(boot, reference)
-    # Filters delay the readings, and the solution must be compared with those of the same moment.
+    # Filters delay the readings; shift them to compare them with the solution of the same instant.
     late: dict[int, Increments] = {}
     for imu in boot.imus:
         rows = inertial.whole(np.column_stack([imu.t_s, imu.readings]))
@@ -98,7 +98,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
 
 
 def _key(boot: Boot, stages: Stages) -> str:
-    """Identify a flight: both firmwares count in parameters how often and how long they ran."""
+    """Make the key of a flight, from the parameters in which both firmwares count their starts and run time."""
     sensors = [(imu.number, imu.gyro_id, imu.accel_id) for imu in boot.imus]
     told = [boot.firmware, stages.armed_s, sensors, sorted(boot.parameters_at(stages.armed_s).items())]
     return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
@@ -123,7 +123,7 @@ def _on_earth(boot: Boot, reference: Navigation) -> Navigation:
 
 
 def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
-    """List the stages of each arming; where none is logged, the whole log is one."""
+    """List the stages of each arming; without a logged arming, the whole log is one flight."""
     armed = [at_s for at_s, state in boot.armed if state] or [float(reference.t_s[0])]
     found = []
     for k, armed_s in enumerate(armed):
@@ -207,7 +207,7 @@ async def _imu(
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
-    """List windows before the motors, compared with standing still, which is surer than any solution."""
+    """List windows before the motors' start, compared with a standstill, which is more exact than any solution."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:
@@ -221,7 +221,7 @@ def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
 
 
 def _kept(rows: Floats) -> Floats:
-    """Leave out windows in which the solution has jumped, such as at a reset of its heading."""
+    """Remove windows in which the solution has jumped, such as at a reset of its heading."""
     if len(rows) < 4:
         return rows
     off = np.abs(rows[:, 1:5] - np.median(rows[:, 1:5], axis=0))
@@ -237,7 +237,7 @@ def _means(table: Floats, times_s: Floats) -> Floats | None:
 
 
 def _ekf(imu: FlownImu, in_air: tuple[float, float]) -> Sequence[Term | None]:
-    """Average the EKF's biases over the latter half; sigma is its own, and the rounding in the log."""
+    """Average the EKF's biases over the flight's second half; sigma: the EKF's, the log's rounding, and the scatter."""
     found = imu.estimated
     if found is None:
         return _UNKNOWN
@@ -258,7 +258,7 @@ def _offset_sets(
     found: Increments,
     in_air: tuple[float, float],
 ) -> dict[str, tuple[Floats, Floats]]:
-    """Return the change of the output (SI) by the offsets from before the calibration, and by those flown: none."""
+    """Return changes of the output (SI): "before", by the offsets before the calibration, and "flown", all zero."""
     sets: dict[str, tuple[Floats, Floats]] = {}
     if calibration is not None and before:
         inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
@@ -299,7 +299,7 @@ def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibra
     return identity.get("gyro", "") in ("", str(calibration.gyro_id))
 
 
-# --- offsets in force
+# --- active offsets
 
 
 class _LoggedParameters(Parameters):
@@ -334,9 +334,9 @@ async def _calibration_in(firmware: FirmwareName, values: Mapping[str, float], i
 
 
 def _written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple[Record, dict[str, float]] | None:
-    """Find the latest calibration that wrote the offsets in force, and the values before; records newest first.
+    """Find the latest calibration that wrote the active offsets, and the values before it; records newest first.
 
-    The offsets decide and not the time: clocks of a companion and of an autopilot may be years apart.
+    Records are matched by offsets and not by time: the clocks of companion and autopilot may be years apart.
     """
     in_force = calibration.offsets
     for record in records:
@@ -349,7 +349,7 @@ def _written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple
 
 
 def _iso(unix_s: float | None) -> str | None:
-    """Format a time in UTC, ISO 8601; None: it is not believable."""
+    """Format a time in UTC, ISO 8601; None for an unknown or impossible time."""
     if unix_s is None or not 0.0 < unix_s < 1e11:
         return None
     return datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).isoformat(timespec="seconds")

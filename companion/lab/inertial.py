@@ -1,8 +1,8 @@
 """Free inertial navigation over a flight, and the biases that the flight shows.
 
-Navigation uses the readings as the firmware corrected them and no aid. They are integrated once, from the log's
-beginning; a start somewhere in the flight is then one turn and one shift of that, so that many starts cost no more than
-one (method 3.7).
+Navigation uses the readings as corrected by the firmware, and no aid. They are integrated once, from the log's
+beginning; a start later in the flight is one rotation and one shift of that result, so that many starts cost no more
+than one (method 3.7).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG
 
 STEP_S: Final = 0.02
-"""Length of an increment; coning and sculling within it are kept."""
+"""Length of an increment; coning and sculling within it are integrated."""
 GAP_S: Final = 0.25
-"""A longer hole in the readings ends a stretch of free navigation."""
+"""Longest gap in the readings within a stretch of free navigation."""
 _LARGEST: Final = 1e6
 _LAG_SPAN_S: Final = 0.3
 _MOST_LAG_S: Final = 0.1
@@ -30,10 +30,10 @@ _OUTLIER: Final = 50.0
 
 
 class Navigation(NamedTuple):
-    """An estimator's solution, or the truth of a simulator, and the Earth that it is on.
+    """Solution of an estimator, or truth of a simulator, with the Earth's rate and gravity.
 
-    Quaternions (n, 4) turn body FRD to NED; velocity (n, 3) and position (n, 3) are NED in m/s and m. A rate of the
-    Earth of zero: a simulator without, or an unknown place.
+    Quaternions (n, 4) rotate body FRD to NED; velocity (n, 3) and position (n, 3) are NED in m/s and m. The Earth's
+    rate is zero for an unknown place, and in a simulator without it.
     """
 
     t_s: Floats
@@ -41,7 +41,7 @@ class Navigation(NamedTuple):
     velocity: Floats
     position: Floats
     gravity_m_s2: float = 9.80665
-    earth_rate_ned_rad_s: Floats = np.zeros(3)  # (3,); zero: a simulator without, or a place that is not known
+    earth_rate_ned_rad_s: Floats = np.zeros(3)  # (3,)
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
         """Interpolate rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3)."""
@@ -76,18 +76,18 @@ class Increments(NamedTuple):
     t_s: Floats  # (n,) the ends
     dt_s: Floats
     angle: Floats  # (n, 3) rad, body axes at the beginning of each
-    velocity: Floats  # (n, 3) m/s, likewise
+    velocity: Floats  # (n, 3) m/s, body axes at the beginning of each
 
     def shifted(self, rate_rad_s: Floats, force_m_s2: Floats) -> Increments:
         """Add a rate and a force, (3,) or (n, 3), to the output."""
         dt = self.dt_s[:, None]
         turned = rate_rad_s * dt
-        # What turns more has its force summed up in other axes.
+        # The added rotation changes the axes in which the force was summed up.
         velocity = self.velocity + force_m_s2 * dt + 0.5 * np.cross(turned, self.velocity)
         return self._replace(angle=self.angle + turned, velocity=velocity)
 
     def nodes(self) -> Floats:
-        """Return the times at which the increments begin, and the end of the last one, (n + 1,)."""
+        """Return the start times of the increments, and the end of the last one, (n + 1,)."""
         return np.concatenate([self.t_s - self.dt_s, self.t_s[-1:]])
 
     def holes_before(self) -> Floats:
@@ -95,7 +95,7 @@ class Increments(NamedTuple):
 
 
 def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
-    """Integrate readings (n, 6) in rad/s and m/s^2; `means`: since the one before, else instants joined by lines."""
+    """Integrate readings (n, 6) in rad/s and m/s^2; `means`: each is a mean since the previous one, not an instant."""
     dt = np.diff(t_s)
     rates = readings[1:] if means else 0.5 * (readings[1:] + readings[:-1])
     grown = rates * dt[:, None]
@@ -130,9 +130,9 @@ def without_earth(found: Increments, solution: Navigation) -> Increments:
 
 
 def lag_s(found: Increments, solution: Navigation) -> float:
-    """Estimate the delay of the readings by filters, against the solution's attitude.
+    """Estimate the delay of the readings in filters, by comparison with the solution's attitude.
 
-    Over a short while late readings have turned less than the solution, by the change of rate times the delay.
+    Over a short time the rotation of late readings differs from the solution's by the change of rate times the delay.
     """
     span = max(round(_LAG_SPAN_S / float(np.median(found.dt_s))), 1)
     rate = found.angle / found.dt_s[:, None]
@@ -150,7 +150,7 @@ def lag_s(found: Increments, solution: Navigation) -> float:
         by_off, by_change = off[usual] - off[usual].mean(axis=0), change[usual] - change[usual].mean(axis=0)
         power = float(np.square(by_change).sum())
         found_s = -float((by_off * by_change).sum()) / power if power > 0.0 else 0.0
-        # Where the solution found its heading anew, no filter is to blame.
+        # Ignore resets of the solution's heading: filters do not explain them.
         size = np.linalg.norm(off + found_s * change, axis=1)
         usual = size <= _OUTLIER * max(float(np.median(size)), 1e-9)
     return found_s if abs(found_s) < _MOST_LAG_S else 0.0
@@ -171,17 +171,17 @@ def drift(
     spans_s: Sequence[float],
     offsets: Mapping[str, tuple[Floats, Floats]],
 ) -> dict[str, list[Drift]]:
-    """Navigate freely from each second within a time, by each set of offsets, and compare the end with the solution.
+    """Navigate freely from each second of an interval, with each set of offsets; compare the ends with the solution.
 
     Args:
-        found: readings, corrected by the firmware, on the solution's clock.
+        found: integrated readings, corrected by the firmware, on the solution's clock.
         solution: attitude, velocity and position at each start and end.
         within_s: first start and last end.
         spans_s: lengths of free navigation.
         offsets: change of the output (rad/s, m/s^2) by each set of offsets.
 
     Returns:
-        The drift of each span that fits in without a gap in the readings, by set of offsets.
+        The drift of each span without a gap in the readings, by set of offsets.
     """
     clean = without_earth(found, solution)
     nodes = found.nodes()
@@ -216,18 +216,18 @@ NO_WINDOWS: Final = np.zeros((0, 7))
 
 
 def windows(found: Increments, solution: Navigation, within_s: tuple[float, float], length_s: float) -> Floats:
-    """Compare the readings with the solution in windows side by side; leave out those with holes in either.
+    """Compare the readings with the solution in adjacent windows; leave out windows with gaps in either.
 
     Returns:
         (n, 7): middle of the window in s; excess of the readings over the solution, by gyro (3, rad/s, axes of the
-        body) and by accelerometer along the vertical, as if it were all of body z (m/s^2); share of x and of y that
-        lies along the vertical, relative to z.
+        body) and by accelerometer along the vertical, as if it were all in body z (m/s^2); vertical components of the
+        body's x and y axes, relative to that of z.
     """
     clean = without_earth(found, solution)
     nodes = found.nodes()
     turn, velocity, _ = solution.at(nodes)
     carried, _, _ = _carry(clean)
-    # Specific force is turned by the solution's attitude, so that errors of the gyros do not tilt it.
+    # Rotate specific force by the solution's attitude, so that gyro errors do not tilt it.
     added = np.einsum("nj,nj->n", (0.5 * (turn[:-1] + turn[1:]))[:, 2], clean.velocity)
     down = _cumulative(added)
     along = _cumulative(carried[:-1] * found.dt_s[:, None, None])
@@ -253,25 +253,25 @@ def windows(found: Increments, solution: Navigation, within_s: tuple[float, floa
 
 # --- biases of a flight
 #
-# Least squares over windows side by side. The error of a window comes from the solution's errors at its two ends, which
-# the next window has with the other sign: treated as independent they make sigma rather too large than too small. The
-# solution's errors that last a whole flight, and that no window shows, are these constants; every sigma has them.
+# Least squares over adjacent windows. The error of a window comes from the solution's errors at its two ends, which the
+# next window has with the opposite sign: treated as independent they make sigma too large rather than too small. The
+# constants below are errors of the solution that last a whole flight, so no window shows them; every sigma has them.
 
 LENGTH_S: Final = 10.0
 SHORT_S: Final = 2.0
-"""Windows before the motors, where there is little time and little noise."""
+"""Length of windows before the motors' start, where time is short and noise is low."""
 _LEAST: Final = 3
 _ATTITUDE_RAD: Final = (0.3 * DEG, 0.3 * DEG, 2.0 * DEG)
 """Error of tilt and heading at one end of a stretch, for a solution with GNSS and a compass."""
 _VELOCITY_M_S: Final = 0.1
 _GRAVITY_M_S2: Final = 0.003
-"""Gravity where it flies against the normal one, and the accelerometer's scale at one g."""
+"""Error of vertical force: local gravity against normal gravity, and the accelerometer's scale at one g."""
 _AT_REST: Final = 0.02
-"""Share of both errors while it stands."""
+"""Share of the attitude and velocity errors that applies at rest."""
 _LEVEL_M_S2: Final = 5.0 * MG
-"""Error of the other two accelerometers, which a tilt turns into the vertical."""
+"""Error of the other two accelerometers; a tilt rotates it into the vertical."""
 _LEAST_SPREAD: Final = 0.15
-"""Share of its mean by which vibration has to vary for a slope."""
+"""Least scatter of vibration, as a share of its median, from which a slope is estimated."""
 _LEAST_TREND_S: Final = 60.0
 
 
@@ -282,10 +282,10 @@ def split(
     warmth: Sequence[Term | None],
     ekf: Sequence[Term | None],
 ) -> list[Split]:
-    """Split the biases of the gyro's three axes and the accelerometer's vertical one.
+    """Split the biases of the gyro's three axes and of the accelerometer's vertical axis into their causes.
 
-    `before` are windows before the motors, `flight` those in the air, `levels` the vibration in
-    each of these, (n,) in m/s^2. `warmth` is the part of the step at the motors' start that temperature explains.
+    `before` are windows before the motors' start, `flight` windows in the air, `levels` the vibration in the latter,
+    (n,) in m/s^2. `warmth` is the part of the step at the motors' start that temperature explains.
     """
     found = []
     for k, axis in enumerate(AXES):
@@ -298,7 +298,7 @@ def split(
         motors = None
         if turn_on is not None and in_flight is not None:
             by_degc = warmth[k] or Term(0.0, 0.0)
-            # Gravity and scale are the same before and after.
+            # Errors of gravity and scale are equal before and after the motors' start.
             sigma = np.sqrt(max(turn_on.sigma**2 + in_flight.sigma**2 - 2.0 * constant**2, 0.0) + by_degc.sigma**2)
             motors = Term(in_flight.value - turn_on.value - by_degc.value, float(sigma))
         slope, trend = _slopes(air, flight, levels, end, aside)
@@ -316,7 +316,7 @@ def _tilt(windows: Floats) -> float:
 
 
 def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
-    """Average windows; the solution is off by `end` at either end of them all, and by `constant` throughout."""
+    """Average windows; the solution's error is `end` at the first and the last end, and `constant` throughout."""
     if len(values) < _LEAST:
         return None
     freedom = len(values) - 1
@@ -343,7 +343,7 @@ def _slopes(
         return None, None
     left = values - design @ fit
     variance = float(left @ left) / freedom * (student_quantile(2.0, freedom) / 2.0) ** 2
-    # The solution's own wandering over minutes, by the same columns.
+    # Wander of the solution itself over minutes, fitted with the same columns.
     wander = math.hypot(end / LENGTH_S / math.sqrt(len(values)), aside * _tilt(windows))
     sigmas = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * (variance + wander**2))
     terms = {name: Term(float(fit[1 + k]), float(sigmas[1 + k])) for k, name in enumerate(columns)}
@@ -365,7 +365,7 @@ def matrices(q: Floats) -> Floats:
 
 
 def vectors(turns: Floats) -> Floats:
-    """Return the rotation vectors (n, 3) of matrices (n, 3, 3) that turn by less than half a circle."""
+    """Return the rotation vectors (n, 3) of matrices (n, 3, 3) that rotate by less than 180 degrees."""
     skew = 0.5 * (turns - _transposed(turns))
     sine = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
     size = np.linalg.norm(sine, axis=1)
@@ -378,7 +378,7 @@ def _transposed(turns: Floats) -> Floats:
 
 
 def _one_sign(q: Floats) -> Floats:
-    """Choose of q and -q, which are one rotation, the one nearer to the row before."""
+    """Choose the sign of each quaternion (q and -q are one rotation) that is nearer to the previous row."""
     if not len(q):
         return q
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
@@ -386,7 +386,7 @@ def _one_sign(q: Floats) -> Floats:
 
 
 def _cumulative(values: Floats) -> Floats:
-    """Return the sum of the values before each, and of all: one row more than they have."""
+    """Return the sum of the values before each row, and the sum of all: one row more than `values`."""
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
 
 

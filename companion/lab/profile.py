@@ -1,6 +1,6 @@
-"""A noise profile from recordings of an IMU at rest: still stretches, a fit of each axis, one model for each triad.
+"""Noise profile from recordings of an IMU at rest: still stretches, a fit of each axis, one model for each triad.
 
-A figure that the recordings are too short for is borrowed from another profile, within the bounds that they show.
+If the recordings are too short for a figure, it is borrowed from another profile, within the bounds that they show.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from companion.estimation.stillness.own_noise import OwnNoise
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, rows_of
 
-MIN_SECONDS: Final = 16  # Least seconds of a stretch: a shorter one shows nothing of what averaging leaves
+MIN_SECONDS: Final = 16  # Least seconds of a stretch: a shorter one shows no flicker or walk
 LEAST_STILL_S: Final = 60
-"""Least time at rest in all; a calibration measures as long itself."""
+"""Least total time at rest; a calibration itself measures as long."""
 _MIN_GOOD: Final = 10
 _NAMES: Final = ("N", "B", "K")
 
@@ -35,7 +35,7 @@ Rest = tuple[NDArray[np.int64], Floats]
 
 
 def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
-    """Average every whole second of a recording, without the first and the last; arguments as for `rests`."""
+    """Average every whole second of a recording, without the first and the last; for the arguments see `rests`."""
     finite = np.isfinite(t_s) & np.isfinite(readings).all(axis=1)
     t_s, readings = t_s[finite], readings[finite]
     slot_of = np.floor(t_s).astype(np.int64)
@@ -47,10 +47,10 @@ def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
 
 
 def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> tuple[list[Rest], int, str]:
-    """Find the stretches of a recording in which the IMU lay still, by the daemon's gate.
+    """Find the stretches of a recording in which the IMU was still, with the daemon's stillness gate.
 
     Times (n,) ascend; readings are (n, 6) in rad/s and m/s^2; rows that are not finite are left out. `profile` is the
-    noise that the gate allows before it has learned.
+    noise that the gate allows until it has learned the actual noise.
 
     Returns:
         The stretches, the number of whole seconds, and the commonest reason of a rejection; empty: none was rejected.
@@ -108,7 +108,7 @@ def fit_profile(
         `fallback`, such as "gyro K".
 
     Raises:
-        CalibrationRefusedError: too little at rest, or an axis that never changes.
+        CalibrationRefusedError: too little time at rest, or an axis that never changes.
     """
     still_s = seconds_at_rest(stretches)
     if still_s < LEAST_STILL_S:
@@ -127,12 +127,12 @@ def fit_profile(
 
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:
-    """Choose the model that promises too much for none of three axes, and list the figures that no axis shows."""
+    """Choose a model that is not too optimistic for any of three axes; list the figures that no axis shows."""
     other = fallback.white, fallback.flicker, fallback.walk
     chosen, unknown = [0.0, 0.0, 0.0], []
     for which in range(3):
         shown = [axis.figures[which] for axis in axes if axis.known[which]]
-        # The axes of one part are alike: the figure of one is a better guess for the others than another profile.
+        # Axes of one part are similar: a figure of one axis is a better guess for the others than another profile's.
         guess = max(shown) if shown else other[which]
         for axis in axes:
             figure = axis.figures[which]

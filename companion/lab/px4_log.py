@@ -1,4 +1,4 @@
-"""PX4's ULog of flights (its message definitions; autopilots 4), which has one start of the autopilot."""
+"""PX4's ULog of flights (PX4's message definitions; autopilots 4); one file has one start of the autopilot."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _whole(rows: Floats) -> Floats:
 
 
 def _sampled(rows: Floats) -> Floats:
-    """Order rows by the sample's time, the field after the message's; older versions have only the latter."""
+    """Order rows by the sample's time, the field after the message's time; older versions have only the message's."""
     at_s = rows[:, 1] * US
     return ascending(_whole(np.column_stack([np.where(np.isfinite(at_s), at_s, rows[:, 0]), rows[:, 2:]])))
 
@@ -88,7 +88,7 @@ def _imus(start: BootMessages) -> tuple[FlownImu, ...]:
 
 
 def _selection(start: BootMessages) -> Floats:
-    """Give the device id of the gyro in use over time, (n, 2)."""
+    """Return the device id of the gyro in use over time, (n, 2)."""
     told = _whole(start.rows("sensor_selection"))
     return told if len(told) else np.zeros((1, 2))
 
@@ -129,6 +129,6 @@ def _place(start: BootMessages) -> tuple[float, float] | None:
     rows = rows[rows[:, 0] != 0.0]
     if not len(rows):
         return None
-    # The simulator's gravity is that of the ellipsoid.
+    # A simulator's gravity is that of the ellipsoid.
     simulated = start.instances("vehicle_attitude_groundtruth")
     return float(rows[-1, 0]), 0.0 if simulated else float(rows[-1, 1])

@@ -1,7 +1,7 @@
-"""Reads a recording, and gives its bytes to the daemon's decoders.
+"""Reader of recordings, and playback of their bytes through the daemon's decoders.
 
-A power cut or a broken copy may end a file anywhere. The `mcap` library does the parsing; lengths are checked before it
-unpacks anything, since it believes what a file says.
+A power cut or a broken copy may end a file anywhere. The `mcap` library does the parsing. It trusts all lengths in a
+file, so they are checked before it unpacks anything.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from companion.samples import ImuSample, Sample
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MOST_BYTES: Final = 4 * 1024 * 1024
-"""The most bytes of a record, and of a chunk unpacked; ours have less than one MiB, and 2.3 in a flood of bytes."""
+"""Most bytes of a record and of an unpacked chunk; ours have less than 1 MiB, and 2.3 MiB in a flood of bytes."""
 _NEEDS_MORE: Final = (
     "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
@@ -42,11 +42,11 @@ _KINDS: Final = {
 
 
 class Recording:
-    """An MCAP file of ours, opened up to its first message; `offset_ns` is UTC minus the daemon's clock."""
+    """MCAP file of the companion, opened up to its first message; `offset_ns` is UTC minus the daemon's clock."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.cut_short: str | None = None  # After reading: why it ended before its end; None when it is whole
+        self.cut_short: str | None = None  # After reading: reason of an early end; None: complete
         self.companion = ""
         self.offset_ns = 0
         self._config: bytes | None = None
@@ -69,7 +69,7 @@ class Recording:
             raise StorageError(f"{self.path}: its configuration is of another version: {error}") from None
 
     def read(self) -> Iterator[messages.Message]:
-        """Yield the messages in the order of writing, once, until the end or a cut."""
+        """Yield the messages in the order of writing, until the end or a cut; call it only once."""
         return itertools.chain(self._first, self._rest)
 
     def is_same_run(self, later: Recording) -> bool:
@@ -121,7 +121,7 @@ class Recording:
 
 
 class _Bounded:
-    """A file of which no read is larger than a record may be: the library believes the lengths of texts."""
+    """File that limits each read to the largest record: the library trusts the lengths of texts."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -133,7 +133,7 @@ class _Bounded:
 
 
 def _records(file: IO[bytes]) -> Iterator[Any]:
-    """Yield all records; a chunk is replaced by its records."""
+    """Yield all records, with those inside chunks instead of the chunks."""
     from mcap.records import Chunk, DataEnd
     from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -149,7 +149,7 @@ def _records(file: IO[bytes]) -> Iterator[Any]:
 
 
 def _check_size(chunk: Any) -> None:
-    """Check the unpacked size; the zstd frame reserves what it states itself, whatever the chunk says."""
+    """Check the unpacked size, also that in the zstd frame: unpacking allocates it, whatever the chunk states."""
     import zstandard
 
     size: int = chunk.uncompressed_size
@@ -165,7 +165,7 @@ def _check_size(chunk: Any) -> None:
 
 @contextlib.contextmanager
 def reporting_damage(path: Path, topic: str) -> Iterator[None]:
-    """Raise StorageError for the errors of a message that no companion wrote."""
+    """Convert errors of a message that no companion wrote to StorageError."""
     try:
         yield
     except _UNUSABLE as error:
@@ -173,7 +173,7 @@ def reporting_damage(path: Path, topic: str) -> Iterator[None]:
 
 
 class Playback:
-    """The devices of a configuration, fed with what was recorded of them."""
+    """Devices of a configuration, fed with the recorded bytes."""
 
     def __init__(self, config: Config) -> None:
         self._devices = {device.name: device for device in serial_devices(config)}
@@ -193,7 +193,7 @@ class Playback:
             self._link.subscribe(kind, self._on_message)
 
     def state(self, name: str) -> ImuState | None:
-        """Return the state of an IMU; None: it is none of the autopilot's, or nothing is known yet."""
+        """Return the state of an IMU of the autopilot; None: another IMU, or unknown so far."""
         return self._states.get(name)
 
     def take(self, topic: str, data: bytes, t_s: float) -> list[Part]:
@@ -215,7 +215,7 @@ class Playback:
         elif topic.startswith(IMU):
             name, state = topic.removeprefix(IMU), decode(topic, data)
             samples = self._samples[name]
-            # Without messages the autopilot may have restarted.
+            # While its messages were missing, the autopilot may have restarted.
             self._samples[name] = ImuSamples() if state.message is None else samples
             self._states[name] = state
         return self._found
@@ -227,7 +227,7 @@ class Playback:
                 self._found.append((Role(name, "imu"), sample))
 
     def _sample(self, message: Any, t_s: float, state: ImuState, samples: ImuSamples) -> ImuSample | None:
-        """Return the sample of an IMU in a message; None: it carries none that counts."""
+        """Return the sample of an IMU in a message; None: the message has no usable one."""
         sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
         source = next((each for each in sources if each.message is type(message)), None)
         header = message.get_header()

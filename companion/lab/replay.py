@@ -1,7 +1,7 @@
-"""A recording through the daemon's decoders, collector and estimator, in the recorded order and at the recorded times.
+"""Replay of a recording through decoders, collector and estimator, in the recorded order and at the recorded times.
 
-Recomputed: every sample from its raw bytes, every batch, verdict of stillness and mean, pose, biases and sigmas. Taken
-from the recording: times of ticks and windows, parameters of the autopilot, the place, the expectation from earlier
+Recomputed: every sample from its raw bytes, every batch, verdict of stillness and mean, pose, biases and sigmas. Copied
+from the recording: times of ticks and windows, parameters of the autopilot, the place, the prediction from earlier
 power-ups, and everything that only the autopilot knows, such as the outcome of a write.
 """
 
@@ -45,14 +45,14 @@ _SIGMAS: Final = {
     "residual_accel_m_s2": "accel_sigma_use_m_s2",
 }
 _BEFORE: Final = "it was measured before the recording began"
-"""Initial variances in scatters: of the level, and of the three coefficients over temperature."""
+"""Reason in `Replayed.not_recomputed` for a window that began before the recording."""
 
 
 class Replayed(msgspec.Struct, frozen=True):
-    """One calibration again.
+    """Result of one replayed calibration.
 
-    `differences` are biases that differ by more than the tolerance; `worst_sigmas` is the largest difference, in
-    sigma_use; both are empty where the estimates were taken from the recording, for the reason `not_recomputed`.
+    `differences` lists biases that differ by more than the tolerance; `worst_sigmas` is the largest difference, in
+    sigma_use. Both are empty if the estimates were copied from the recording; `not_recomputed` is then the reason.
     """
 
     record: Record
@@ -62,27 +62,27 @@ class Replayed(msgspec.Struct, frozen=True):
 
 
 class Replay:
-    """One pass over a recording: one file, or several of a ring, the oldest first."""
+    """One pass over a recording: a single file, or several of a ring, the oldest first."""
 
     def __init__(self, recording: Recording) -> None:
         self._config = recording.config()
         self._playback = Playback(self._config)
         self._collector: RollingCollector | None = None
         self.calibrations: list[Replayed] = []
-        self.notes: list[str] = []  # Other versions, gaps
+        self.notes: list[str] = []  # Notes on other versions and gaps
         if recording.companion != __version__:
             self.notes.append(f"recorded with companion {recording.companion}, here {__version__}")
-        self.cut_short: str | None = None  # Why the first file that ends early does so
+        self.cut_short: str | None = None  # Reason of the early end of the first incomplete file
         self._is_cut = False
         self._first_s = self._now_s = self._begun_s = math.nan
         self._where = Whereabouts()
         self._measured: Measurement | CalibrationRefusedError | None = None
-        self._offsets: dict[str, ImuCalibration | None] = {}  # Offsets in force at the latest window, by IMU
+        self._offsets: dict[str, ImuCalibration | None] = {}  # Active offsets at the latest window, by IMU
         self._solution: Solution | None = None
         self._not_recomputed = _BEFORE
 
     def take(self, recording: Recording) -> None:
-        """Replay one file; if its end is missing, the next one begins anew."""
+        """Replay one file; if its end is missing, the next file starts without its state."""
         for topic, t_s, data in recording.read():
             with reporting_damage(recording.path, topic):
                 self._take(topic, data, t_s)
@@ -141,7 +141,7 @@ class Replay:
         try:
             found = collector.measurement(now_s)
             if self._config.vehicle.platform == "ground" and found.slots[0] != measured.start_s:
-                # The cause of a new stretch, such as arming, is not in the bytes.
+                # The cause of a new stretch, such as arming, is not in the recorded bytes.
                 found = collector.measurement(now_s, since_s=measured.start_s)
         except CalibrationRefusedError as error:
             return error
@@ -177,7 +177,7 @@ class Replay:
         return dataclasses.replace(imu, subtracted=calibration.subtracted(imu.temperature_degc))
 
     def _compare(self, recorded: Record) -> Replayed:
-        """Compare a recorded calibration with its replay, which copies what only the autopilot knows."""
+        """Compare a recorded calibration with its replay; values that only the autopilot knows are copied."""
         solution, self._solution = self._solution, None
         if recorded.pose is None:
             return Replayed(recorded, [], None, "it ended before anything was worked out")

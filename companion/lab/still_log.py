@@ -1,7 +1,7 @@
 """Readings of one IMU at rest, and a reader of CSV logs.
 
-One vocabulary of column names (`COLUMNS`) serves the header of the file and --columns. Nothing is guessed: a column of
-another name is left out, and noted.
+The names in `COLUMNS` are valid in the header of the file and in --columns. Nothing is guessed: a column with another
+name is left out, with a note.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ COLUMNS: Final[dict[str, tuple[str, float]]] = {
 """Quantity by column name, and its factor to s, rad/s, m/s^2 or degrees Celsius."""
 HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
-"""Allowed median specific force of a log at rest: outside it, a unit or a column is named wrongly."""
+"""Allowed median specific force of a log at rest; outside, a unit or a column has a wrong name."""
 
 _SEPARATORS: Final = (";", "\t", ",", " ")
 _LONGEST: Final = 1 << 14
 _NUMBERS: Final = 1e20
 """Limit of a number in any unit: nanoseconds since 1970 are 2e18."""
 _WRAPS: Final = 2.0**32
-"""Range of a counter of 32 bits: an Arduino's micros() begins anew every 71.6 min."""
+"""Range of a 32-bit counter: an Arduino's micros() wraps every 71.6 min."""
 _MOST_NAMED: Final = 12
 
 
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one session: a file, or several that continue one another.
+    """One IMU in one run: a file, or several consecutive ones.
 
-    Times (n,) ascend; readings (n, 6) are in rad/s and m/s^2, axes as recorded; none: it came as integers only, which
-    are left out. Temperatures are NaN where unknown. `profile`: of the configuration in force then. `clock_offset_s`:
-    UTC minus the recording's clock. `breaks_s`: times of changes by other reasons than noise, such as a write of
+    Times (n,) ascend; readings (n, 6) are in rad/s and m/s^2, axes as recorded; they are empty if there were only
+    integers, which are left out. Temperatures are NaN if unknown. `profile` is that of the configuration at the time.
+    `clock_offset_s`: UTC minus the recording's clock. `breaks_s`: times of steps that are not noise, such as a write of
     offsets or a restart. `left_out`: ignored lines by reason. `clock_from_start`: times count from the switch-on of the
     autopilot.
     """
@@ -68,12 +68,12 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     files: tuple[str, ...]
     t_s: Floats  # (n,) ascending
     readings: Floats
-    temperature_degc: Floats  # (n,); NaN where unknown
+    temperature_degc: Floats  # (n,); NaN: unknown
     profile: str | NoiseProfile | None = None
     clock_offset_s: float | None = None
     breaks_s: tuple[float, ...] = ()
 
-    notes: tuple[str, ...] = ()  # Assumptions and oddities, in words
+    notes: tuple[str, ...] = ()  # Assumptions and oddities, as text
     left_out: dict[str, int] = {}
     clock_from_start: bool = False
 
@@ -88,7 +88,7 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
         return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
 
     def pieces(self, skip_s: float = 0.0) -> list[slice]:
-        """Return the samples between the breaks, in order, without the first `skip_s` of the session."""
+        """Return the samples between the breaks, in order, without the first `skip_s` of the run."""
         first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s))
         cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
         return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
@@ -99,9 +99,9 @@ def unreadable(path: Path, error: OSError) -> StorageError:
 
 
 def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
-    """Read a CSV file: semicolons, tabs, commas or blanks; "#" begins a comment.
+    """Read a CSV file, separated by semicolons, tabs, commas or blanks; "#" starts a comment.
 
-    `columns`, separated by commas, replace the file's header, and a rate its times.
+    `columns`, separated by commas, replace the file's header; `rate_hz` replaces its times.
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -167,7 +167,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _header(path: Path, file: TextIO, columns: str | None) -> tuple[list[str], str, Iterator[tuple[int, list[str]]]]:
-    """Return the column names, their place for messages, and the numbered lines as fields."""
+    """Return the column names, their source for messages, and the numbered lines as fields."""
     lines = _lines(file, path)
     number, first = next(lines, (0, ""))
     if not number:
@@ -177,7 +177,7 @@ def _header(path: Path, file: TextIO, columns: str | None) -> tuple[list[str], s
         separator = _separator(first)
     else:
         names, where = columns.split(","), "--columns"
-        # Text before the numbers is another header, or a logger's preamble.
+        # Text before the numbers is a second header, or a logger's preamble.
         lines = itertools.chain([(number, first)], lines)
         lines = itertools.dropwhile(lambda line: _is_text(line[1], len(names)), lines)
         found = next(lines, (0, ""))
@@ -188,12 +188,12 @@ def _header(path: Path, file: TextIO, columns: str | None) -> tuple[list[str], s
 
 
 def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the numbered lines of a file, without blank ones, comments, and a last one that is cut."""
+    """Yield the numbered lines of a file, without blank lines, comments, and a cut last line."""
     for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
         if len(line) == _LONGEST:
             raise StorageError(f"{path}, line {number}: found no line end within {_LONGEST} characters")
         if number > 1 and not line.endswith("\n"):
-            return  # in the middle of a number, perhaps, which then still looks like one
+            return  # cut, perhaps inside a number, which would still look like a number
         text = line.strip(" \n")
         if text.strip() and not text.startswith("#"):
             yield number, text
@@ -227,7 +227,7 @@ def _is_number(text: str) -> bool:
 def _numbers(
     path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, str]
 ) -> tuple[Floats, Floats]:
-    """Read time, readings and temperature (n, 8), NaN where one is missing, and the number of each line."""
+    """Read time, readings and temperature (n, 8), NaN if missing, and the number of each line."""
     places, width = [names.index(name) for name in used.values()], len(names)
     flat, numbers = array("d"), array("d")
     for number, fields in lines:
@@ -269,7 +269,7 @@ def _times(path: Path, stamps: Floats, factor: float, numbers: Floats) -> Floats
 
 
 def _check_gravity(path: Path, forces: Floats, names: Sequence[str]) -> None:
-    """Refuse wrong units of force: they would change the bias, too."""
+    """Refuse wrong units of force: they would also falsify the bias."""
     with np.errstate(over="ignore"):
         found_m_s2 = float(np.median(np.sqrt(np.square(forces).sum(axis=1))))
     low, high = GRAVITY_M_S2

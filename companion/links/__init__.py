@@ -1,1 +1,1 @@
-"""Bytes in and out: serial ports, sockets and the MAVLink codec; each comes back by itself after a loss."""
+"""Byte transport: serial ports, sockets and the MAVLink codec; every link reconnects by itself after a loss."""

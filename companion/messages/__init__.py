@@ -1,15 +1,15 @@
-"""The catalogue of messages to people: their words, what causes each, and what to do.
+"""Catalogue of messages to people: their texts, causes and remedies.
 
 The TOML files beside this module hold one table for each message, by identifier:
 
-- `text`: the words, with named fields (`"IMU {imu} moves {rate} deg/s"`), which `message` fills in. The caller formats
-  them: a field has no format of its own, so that no text of the catalogue can fail;
-- `also`: words of other texts that mean the same, of the arming script, the log or the autopilot; `…` is any value;
+- `text`: the text, with named fields (`"IMU {imu} moves {rate} deg/s"`), which `message` fills in. The caller formats
+  the values: a field has no format specification, so that no text of the catalogue can fail;
+- `also`: equivalent texts of the arming script, the log or the autopilot; `…` stands for any value;
 - `do`: the kind of remedy, a key of `KINDS`;
-- `cause`, `remedy`: one or two sentences, no remedy where there is nothing to do; `see`: a page of the documents, such
+- `cause`, `remedy`: one or two sentences; no remedy if there is nothing to do; `see`: a page of the documents, such
   as `"arming.md#the-gate"`.
 
-docs/messages.md is made from it (`make messages`).
+`make messages` generates docs/messages.md from the catalogue.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ KINDS: Final[Mapping[Kind, str]] = {
 ANY: Final = "…"
 _CERTAIN_LETTERS: Final = 8  # Fewest letters of a pattern that identify a message in a longer line
 _SIMILAR: Final = 0.8  # Least ratio of `difflib` at which a word counts as misspelt
-_LEAST_SCORE: Final = 0.4  # Least share of the searched words' weight that an entry must hold
+_LEAST_SCORE: Final = 0.4  # Least share of the searched words' weight that an entry must contain
 _WORD: Final = re.compile(r"[a-z][a-z_]+")
 
 
@@ -57,7 +57,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """Return the texts with `…` in the place of each value."""
+        """Return the texts, with `…` instead of each value."""
         return (*([re.sub(r"\{[^}]*\}", ANY, self.text)] if self.text else []), *self.also)
 
     def advice(self) -> str:
@@ -66,7 +66,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 @functools.cache
 def catalogue() -> dict[str, Entry]:
-    """Load all messages by identifier; raise ValueError where an identifier stands twice."""
+    """Load all messages by identifier; raise ValueError for a duplicate identifier."""
     found: dict[str, Entry] = {}
     for path in sorted(Path(__file__).parent.glob("*.toml")):
         part = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), dict[str, Entry])
@@ -82,18 +82,18 @@ def message(identifier: str, **fields: object) -> str:
 
 
 def explain(line: str) -> tuple[str, Entry] | None:
-    """Return the message that a line shows, the most specific one if it shows several."""
+    """Return the message that a line contains, the most specific one if it contains several."""
     shown = [(letters, identifier) for letters, identifier, pattern in _patterns() if pattern.search(line)]
     return (found := max(shown)[1], catalogue()[found]) if shown else None
 
 
 def remedy(line: str) -> str:
-    """Return what to do about a line, or nothing where the catalogue does not know it."""
+    """Return the remedy for a line; empty if the catalogue does not know the line."""
     return "" if (found := explain(line)) is None else found[1].advice()
 
 
 def search(words: str, most: int = 3) -> list[tuple[str, Entry]]:
-    """List the messages that words are about, the best first: an identifier, a line, or words in any order."""
+    """List the best matches for a search, the best first; `words`: an identifier, a line, or words in any order."""
     if words in catalogue():
         return [(words, catalogue()[words])]
     exact, index = explain(words), _index()
@@ -108,7 +108,7 @@ def search(words: str, most: int = 3) -> list[tuple[str, Entry]]:
 
 @functools.cache
 def _patterns() -> list[tuple[int, str, re.Pattern[str]]]:
-    """List the patterns that identify a message, with their number of letters."""
+    """List number of letters, identifier and pattern of each text that can identify a message in a longer line."""
     found = []
     for identifier, entry in catalogue().items():
         for pattern in entry.patterns:
@@ -138,7 +138,7 @@ def _weights() -> dict[str, float]:
 
 
 def _known(word: str, weights: Mapping[str, float]) -> str:
-    """Return the word of the catalogue that is meant by a misspelt or cut one."""
+    """Return the word of the catalogue that a misspelt or shortened word stands for, or the word itself."""
     if word in weights:
         return word
     whole = [known for known in weights if len(word) > 3 and known.startswith(word)]

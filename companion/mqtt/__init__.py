@@ -1,1 +1,1 @@
-"""The MQTT process: a client of the daemon on one side and of the broker on the other."""
+"""MQTT process: a client of the daemon and of the broker."""

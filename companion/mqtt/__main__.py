@@ -1,4 +1,4 @@
-"""`python -m companion.mqtt`: the MQTT process, started by the daemon."""
+"""Entry point of the MQTT process, `python -m companion.mqtt`; the daemon starts it."""
 
 from companion.links.system.process import run_child
 from companion.mqtt.process import MEMORY_MIB, MqttProcess

@@ -1,6 +1,6 @@
-"""Connection to a broker by aiomqtt 2: credentials, TLS, the version of MQTT, and refusals in words.
+"""Connection to a broker by aiomqtt 2: credentials, TLS, the version of MQTT, and texts of refusals.
 
-Only this module and `client` know aiomqtt, whose version 3 will be another library.
+Only this module and `client` use aiomqtt, because its version 3 will be a different library.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 _quiet = logging.getLogger(f"{__name__}.aiomqtt")
-# Errors of the library reach us as exceptions, and are logged once, in words for people.
+# The library raises its errors too; they are logged once, as text for people.
 _quiet.setLevel(logging.CRITICAL)
 
 MQTT_3_1_1: Final = 4
@@ -35,10 +35,10 @@ _LEAST_REFUSAL_CODE: Final = 128
 
 
 class Broker:
-    """Connects one client, in the newest version of MQTT that the broker speaks.
+    """Connects one client with the newest version of MQTT that the broker supports.
 
-    MQTT 5 is tried first: only there can a message say that it was published to be retained, and only there is the
-    broker told how long a message may be. Credentials are read for every connection: a correction needs no restart.
+    MQTT 5 is tried first: only MQTT 5 marks messages that were published as retained, and lets a client limit the
+    length of messages. Credentials are read for every connection, so that a correction needs no restart.
     """
 
     def __init__(self, settings: Mqtt, client_id: str) -> None:
@@ -51,10 +51,10 @@ class Broker:
 
     @contextlib.asynccontextmanager
     async def connected(self, most_bytes: int, **options: Any) -> AsyncIterator[aiomqtt.Client]:
-        """Hold a connection; `most_bytes`: longest packet that the broker may send (MQTT 5).
+        """Connect for the time of the context; `most_bytes`: longest packet that the broker may send (MQTT 5).
 
         Raises:
-            LinkError: why there is no connection, or why it ended.
+            LinkError: the connection failed or ended, with the cause.
         """
         import aiomqtt
 
@@ -89,7 +89,7 @@ class Broker:
                 return await client.__aenter__()
             except aiomqtt.MqttError as error:
                 before, self.protocol = self.protocol, MQTT_5
-                # A broker that is too old for MQTT 5 says so, or says nothing, or closes the connection.
+                # A broker without MQTT 5 refuses it, is silent, or closes the connection.
                 if before != MQTT_5 or not is_of_protocol(error):
                     raise
                 self.protocol = MQTT_3_1_1
@@ -118,7 +118,7 @@ class Broker:
 
 
 async def subscribe(client: aiomqtt.Client, topic: str, **options: Any) -> None:
-    """Subscribe to a topic; raise LinkError where the broker refuses it."""
+    """Subscribe to a topic; raise LinkError if the broker refuses it."""
     granted = await client.subscribe(topic, **options)
     if any(getattr(code, "value", code) >= _LEAST_REFUSAL_CODE for code in granted):
         raise LinkError(message("broker_refuses", what=f"topic {topic} (its access list?)"))
@@ -170,8 +170,8 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
         if settings.cert_file is not None and settings.key_file is not None:
             where = Path(settings.key_file)
             for file in (settings.cert_file, settings.key_file):
-                Path(file).open("rb").close()  # OpenSSL does not say which of them it cannot read
-            # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
+                Path(file).open("rb").close()  # OpenSSL does not name the file that it cannot read
+            # Without a password argument OpenSSL would ask for the password of an encrypted key at the terminal.
             context.load_cert_chain(settings.cert_file, settings.key_file, password=lambda: "")
     except ssl.SSLError as error:
         what = (error.reason or str(error)).lower().replace("_", " ")
@@ -183,12 +183,12 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
 
 
 UNSUPPORTED_PROTOCOL: Final = 132
-"""Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
+"""Reason code of MQTT 5 (its section 2.4) for a version that the broker does not support."""
 _BAD_PASSWORD: Final = (134, 135)
 _LOST: Final = "has ended the connection (stopped? network? another client called {id!r}?)"
-"""Codes of a lost connection: paho's own, and that of MQTT 5."""
+"""Text for a lost connection: paho's own code 7, and 128 of MQTT 5."""
 _SILENT: Final = "is silent"
-"""Codes of silence for twice the keepalive: paho's own, and that of MQTT 5."""
+"""Text for silence during twice the keepalive: paho's own code 16, and 141 of MQTT 5."""
 _STATES: Final = {
     7: _LOST,
     16: _SILENT,
@@ -201,11 +201,11 @@ _STATES: Final = {
     141: _SILENT,
     142: "has another client called {id!r}: a second companion for this vehicle? (change mqtt.base_topic)",
 }
-"""Reason codes of MQTT 5 (its section 2.4), and paho's own below 128; paho turns those of MQTT 3.1.1 into the same."""
+"""Texts by reason code: MQTT 5 (section 2.4), and paho's own below 128; paho converts those of MQTT 3.1.1."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
-    """List an error and its causes, outermost first; of a group, the first member's."""
+    """List an error and its causes, outermost first; follow only the first member of a group."""
     found: list[BaseException] = []
     inner: BaseException | None = error
     while inner is not None and inner not in found:
@@ -227,12 +227,12 @@ def is_of_protocol(error: BaseException) -> bool:
 
 
 def _is_unanswered(error: BaseException) -> bool:
-    """Return whether the connection was accepted and then silent (aiomqtt has no type for it)."""
+    """Return whether the broker accepted the connection and then was silent (aiomqtt has no error type for it)."""
     return any(str(cause) == "Operation timed out" for cause in causes(error))
 
 
 def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
-    """Say in one line why there is no connection, without the address; `reached`: there was one."""
+    """Describe the cause of a failed or lost connection in one line, without the address; `reached`: it was lost."""
     code = _reason_code(error)
     if code in _BAD_PASSWORD:
         user = f"user {settings.username!r}: unknown, or the password is wrong"

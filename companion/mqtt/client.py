@@ -1,6 +1,6 @@
-"""The MQTT process's connection: made again after every loss, and fed from an outbox that is bounded whatever it does.
+"""Connection of the MQTT process: it reconnects after every loss and sends from a bounded outbox.
 
-A broker that sends more than this process may hold ends the process, and nothing else.
+A broker that sends more than the memory limit of this process ends only this process.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 GREETING_DEADLINE_S: Final = 5.0
-"""Timeout of the broker's first answer; a broker that is silent to MQTT 5 is then tried with MQTT 3.1.1."""
+"""Timeout of the broker's first answer; after silence to MQTT 5 the client tries MQTT 3.1.1."""
 ANSWER_DEADLINE_S: Final = 5.0
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
-WORTH_S: Final = 10.0  # Least duration of a connection after which the next attempts begin with short waits again
+WORTH_S: Final = 10.0  # Least duration of a connection that resets the backoff
 MAX_PACKET_BYTES: Final = 64 * 1024
-"""The longest message that the broker may send us (MQTT 5)."""
+"""Longest message that the broker may send us (MQTT 5)."""
 MAX_WAITING: Final = 1000
-"""The most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
-than it empties it: a flood of some hundred requests has to fit. With 64 KiB each they fit the process's memory."""
+"""Most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
+than it empties it, so a flood of some hundred requests must fit. With 64 KiB each they fit the process's memory."""
 MAX_ANSWERS: Final = 64
-LONG_BYTES: Final = 1024  # A message that is longer may be too long for a broker
+LONG_BYTES: Final = 1024  # Messages above this length may be too long for a broker
 MOST_TRIES: Final = 3
-"""Connections that may end while one long message is being sent, before it is given up."""
+"""Connections that may end during the send of one long message before it is given up."""
 
 
 class Incoming(NamedTuple):
@@ -53,11 +53,11 @@ class Incoming(NamedTuple):
     topic: str
     payload: bytes
     retained: bool = False
-    """Kept by the broker from earlier, or (seen in MQTT 5 only) published now to be kept."""
+    """True if the broker had stored the message, or (only known in MQTT 5) if it was published as retained just now."""
 
 
 class Parcel(msgspec.Struct, eq=False):
-    """Message on its way; telemetry has QoS 0."""
+    """Message to send; telemetry has QoS 0."""
 
     topic: str
     payload: bytes
@@ -68,18 +68,18 @@ class Parcel(msgspec.Struct, eq=False):
 
     @property
     def is_given_up(self) -> bool:
-        """True where the broker ended the connection over it so often that it would end every connection."""
+        """True if the broker ended the connection during this long message more than `MOST_TRIES` times."""
         return self.tries > MOST_TRIES and len(self.payload) > LONG_BYTES
 
 
 class Outbox:
-    """Three kinds of messages, each with its own way of staying small.
+    """Bounded queues of three kinds of messages.
 
-    - kept: retained at the broker. Of each topic only the latest value counts; it is sent again at every connection,
-      as a broker that has restarted may have lost it. Their topics are few and our own.
-    - answers: each is sent, in order, also after the connection was lost in between. At most 64: then the oldest that
-      may be dropped (a refusal) goes, and where none may, the oldest of all.
-    - telemetry: of each topic only the latest value, and none without a connection.
+    - kept: retained at the broker. Only the latest value of each topic counts. It is sent again at every connection,
+      because a restarted broker may have lost it. The topics are few and our own.
+    - answers: each is sent, in order, even if the connection was lost in between. With 64 waiting, the oldest droppable
+      one (a refusal) is dropped; without a droppable one, the oldest of all.
+    - telemetry: only the latest value of each topic, and none without a connection.
     """
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class Outbox:
         return len(self._unsent) + len(self._answers) + len(self._telemetry)
 
     def keep(self, topic: str, payload: bytes, *, again: bool = False) -> None:
-        """Have the broker keep a payload; an empty one has it forget the topic. `again`: send it though it is kept."""
+        """Send a retained payload, if it is new; an empty one deletes the topic. `again`: send it even if unchanged."""
         if again or self.kept(topic) != payload:
             self._kept[topic] = self._unsent[topic] = Parcel(topic, payload, retain=True)
             self._notify()
@@ -132,7 +132,7 @@ class Outbox:
         self._notify()
 
     async def next(self) -> Parcel:
-        """Return the next parcel; it stays until `sent`."""
+        """Return the next parcel; it stays in the outbox until `sent`."""
         while not len(self):
             self._filled.clear()
             await self._filled.wait()
@@ -141,7 +141,7 @@ class Outbox:
         )
 
     def sent(self, parcel: Parcel) -> None:
-        """Remove a parcel that the broker has, or never takes, unless its topic has a newer value."""
+        """Remove a parcel that was sent or given up; keep a newer value of its topic."""
         for latest in (self._unsent, self._telemetry):
             if latest.get(parcel.topic) is parcel:
                 del latest[parcel.topic]
@@ -158,11 +158,11 @@ class Outbox:
 
 
 class MqttLink:
-    """Keeps a connection to the broker, sends what is in `outbox`, hands over what comes.
+    """Connection to the broker: sends the messages of `outbox` and passes received ones to `on_message`.
 
-    A second client of the same id takes over from the first. The will, topic and payload, is what the broker publishes,
-    retained, when we are gone without a word; its topic should be among the subscriptions, to know that what we say
-    there comes through. `on_message` must not block.
+    A second client with the same id replaces the first. `will` is the last will, topic and payload: the broker
+    publishes it, retained, when the connection is lost. Its topic should be among the subscriptions, to verify that our
+    messages come back. `on_message` must not block.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class MqttLink:
             connected_for_s = now_s - self._connected_s
             since = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=connected_for_s)
             if self._will is not None and not self._echoed and connected_for_s > ANSWER_DEADLINE_S:
-                # Few brokers tell a client that they let it neither speak nor hear.
+                # Few brokers report to a client that its access list forbids publishing or receiving.
                 faults.append(message("broker_refuses", what="our own messages: none comes back (its access list?)"))
             connected = message("mqtt_connected", broker=self._broker.where, detail=f"since {since:%H:%M:%S} UTC")
             words = "; ".join((connected, *faults))
@@ -212,7 +212,7 @@ class MqttLink:
         }
 
     async def run(self) -> None:
-        """Keep the connection until cancelled; a loss is an event to report, never an exception."""
+        """Stay connected until cancelled; report a loss in `status`, never as an exception."""
         try:
             await asyncio.to_thread(_load_library)
         except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
@@ -221,7 +221,7 @@ class MqttLink:
         await self._reconnection.keep(self._once)
 
     async def flush(self, within_s: float) -> None:
-        """Wait until everything was sent, at most so long; without a connection not at all."""
+        """Wait until everything was sent, for `within_s` at most; return at once without a connection."""
         if self.connected:
             await comes(self.outbox.emptied, within_s)
 
@@ -245,7 +245,7 @@ class MqttLink:
 
     async def _speak(self, client: aiomqtt.Client) -> None:
         self._refused = []
-        # A topic that is added meanwhile takes part.
+        # The loop includes topics that are added meanwhile.
         for topic in self._subscriptions:
             await self._subscribe_now(client, topic)
         self._client, self._echoed = client, False
@@ -267,14 +267,14 @@ class MqttLink:
             self.outbox.sent(parcel)
 
     async def subscribe(self, topic: str) -> None:
-        """Subscribe to one more topic, now and at every connection."""
+        """Subscribe to one more topic, now and at every later connection."""
         import aiomqtt
 
         if topic in self._subscriptions:
             return
         self._subscriptions.append(topic)
         if self._client is not None:
-            # A connection that is lost over it brings the next one.
+            # If this ends the connection, the next connection subscribes.
             with contextlib.suppress(aiomqtt.MqttError):
                 await self._subscribe_now(self._client, topic)
 
@@ -301,7 +301,7 @@ class MqttLink:
 
 
 def _load_library() -> None:
-    """Import aiomqtt, in a thread as it takes a while; raise ImportError where it is absent or another library."""
+    """Import aiomqtt, which is slow (run it in a thread); raise ImportError if it is absent or not version 2."""
     if not version("aiomqtt").startswith("2."):
         raise ImportError(f"found version {version('aiomqtt')}; allowed: 2")
     importlib.import_module("aiomqtt")

@@ -1,6 +1,6 @@
-"""The daemon as the MQTT process sees it: a stream of its status and attitude, and answers to requests.
+"""Client of the daemon in the MQTT process: a stream of its status and attitude, and answers to requests.
 
-Requests go to the control socket, as the command line's do, so refusals are the same too.
+Requests go to the control socket, as from the command line, and get the same refusals.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from companion.messages import message
 logger = logging.getLogger(__name__)
 
 SILENT_S: Final = 5.0
-"""The stream has five replies a second; a daemon without any for this long stands still."""
+"""Timeout of the stream, which has five replies a second; after it the daemon counts as hung."""
 AGAIN_S: Final = 1.0
 ANSWER_WITHIN_S: Final = 10.0
 CLOCKS_AGREE_S: Final = 2.0
@@ -35,8 +35,8 @@ Transaction = str | int | None
 MAX_PAYLOAD_BYTES: Final = 4096
 MAX_TRANSACTION: Final = 128
 MAX_NUMBER: Final = 2**53
-"""The largest integer that every reader of JSON keeps exactly."""
-MAX_PENDING: Final = 8  # The most requests that wait for their end, such as cancels in the middle of a write
+"""Largest integer that every JSON parser represents exactly."""
+MAX_PENDING: Final = 8  # Most pending requests, such as cancels during a write
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
 KNOWN: Final = asked_by(Interface.MQTT)
@@ -44,7 +44,7 @@ _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 class Daemon:
-    """Follows the daemon. `news` is set at every reply, and when the stream ends.
+    """Latest state of the daemon. `news` is set at every reply and at the end of the stream.
 
     `clock_agrees`: the autopilot's GNSS time confirms the clock of this computer.
     """
@@ -53,7 +53,7 @@ class Daemon:
         self.ask = ask
         self.status: Object | None = None
         self.pose: Object | None = None
-        self.record: Object | None = None  # The last calibration's record
+        self.record: Object | None = None  # Record of the last calibration
         self.alive = False
         self.news = asyncio.Event()
         self.clock_agrees = False
@@ -105,7 +105,7 @@ class Daemon:
 
 
 class Request(msgspec.Struct):
-    """A request, and its last response. `problem`: why it cannot be asked of the daemon; empty: it can."""
+    """A request, and its last response. `problem`: fault of the request; empty: it can be sent to the daemon."""
 
     command: str
     transaction: Transaction = None
@@ -116,7 +116,7 @@ class Request(msgspec.Struct):
 
 
 def parse(command: str, payload: bytes) -> Request:
-    """Parse a request's payload: a JSON object with known keys, or nothing. Never raises."""
+    """Parse the payload of a request: empty, or a JSON object with known keys. Never raises."""
     request = Request(command)
     try:
         _read(request, payload)
@@ -165,14 +165,14 @@ def _is_transaction(value: object) -> bool:
 
 
 class Requests:
-    """Accepts requests; each is answered by `respond`, none is obeyed twice, and a flood stays bounded.
+    """Handler of requests: answers each by `respond`, executes none twice, and bounds a flood.
 
-    An answer repeats the request's transaction. A calibration is answered twice: "accepted" at once, and how it ended;
-    everything else once. Three kinds of messages are no new request:
+    An answer repeats the request's transaction. A calibration gets two answers: "accepted" at once, then its result;
+    any other request gets one. Three kinds of messages are not executed:
 
-    - a retained one comes back at every connection, for ever: it is never obeyed, and the log says so once;
-    - the empty payload that deletes a retained one looks like a request (on MQTT 3.1.1): it is ignored;
-    - a repeat of a transaction (QoS 1 delivers at least once) gets the same answer again.
+    - a retained request, because it returns at every connection: it is refused, with one line in the log;
+    - the empty payload that deletes a retained request (on MQTT 3.1.1 it looks like a request): it is ignored;
+    - a repeated transaction (QoS 1 delivers at least once): it gets its latest answer again.
     """
 
     def __init__(self, ask: Ask, topic: str, respond: Callable[[str, Object], None]) -> None:
@@ -206,7 +206,7 @@ class Requests:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def _is_repeat(self, request: Request) -> bool:
-        """Return whether the transaction is known already; answer it as before."""
+        """Return whether the transaction is already known; if so, repeat its answer."""
         if request.transaction is None:
             return False
         known = self._known.get((request.command, request.transaction))
@@ -263,7 +263,7 @@ class Requests:
         self._respond(request.command, request.response)
 
     def _reject(self, request: Request, refusal: str, reason: str) -> None:
-        # A refused request is not remembered: the daemon may accept the same one a moment later.
+        # Do not remember a refused request: the daemon may accept the same request later.
         self._known.pop((request.command, request.transaction), None)
         self._refuse(request, refusal, reason)
 

@@ -1,7 +1,7 @@
-"""Keeps items for the fleet, and sends them by the broker's connection until a collector has confirmed them.
+"""Saves items for the fleet, and sends them over the broker's connection until a collector has confirmed them.
 
-The broker's receipt frees nothing: a broker may be wiped before a collector has read it. An item that is not confirmed
-in time is sent again; a collector that was restored from a backup asks for items that it lacks.
+The broker's acknowledgement is not enough: a broker may lose a message before a collector reads it. An item without
+confirmation in time is sent again; a collector that was restored from a backup requests the items that it lacks.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from companion.storage.state import UNREADABLE
 logger = logging.getLogger(__name__)
 
 COLLECT_EVERY_S: Final = 2.0
-BATCH: Final = 20  # Most entries read from the disk at once; a whole history may wait there
-WINDOW: Final = 8  # The most items under way without a confirmation
+BATCH: Final = 20  # Most entries read from the disk at once: a whole history may be unread
+WINDOW: Final = 8  # Most items sent and not confirmed
 CONFIRMED_WITHIN_S: Final = 30.0
 LONGEST_WAIT_S: Final = 600.0
 HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
 PAUSE_S: Final = 0.05
-CURVES_AFTER_S: Final = 60.0  # Delay of the first curves, which have to be worked out first
+CURVES_AFTER_S: Final = 60.0  # Delay of the first temperature curves, which take time to compute
 CURVES_EVERY_S: Final = 6 * 3600.0
 INBOX: Final = 64
 AIRCRAFT_MARK, CURVE_MARKS = "aircraft", "curve/"
@@ -63,16 +63,16 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_deg": 1,
     "inclination_expected_deg": 1,
 }
-"""Figures that give away a place (gravity and the field do, too), and the decimals that leave it a kilometre."""
+"""Decimals of figures that reveal the location, gravity and magnetic field included: they leave about a kilometre."""
 _WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "effective": None}
-"""Figures whose digits give away the gravity and the latitude behind them, and their substitutes."""
+"""Substitutes for figures whose digits reveal the gravity and the latitude from which they were computed."""
 _EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 
 
 class AircraftFleet:
-    """One aircraft's part of the fleet, and what is kept of others that carried this companion; `run` it.
+    """Fleet client of one aircraft, also for kept items of earlier aircraft with this companion; `run` it as a task.
 
-    `link` returns the broker's connection of now, or None; `offload` runs a blocking call elsewhere.
+    `link` returns the current connection to the broker, or None; `offload` runs a blocking call in a thread.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class AircraftFleet:
         self._curves_s = math.inf
         self._connection: tuple[MqttLink, int] | None = None
         self._greeted: dict[str, int] = {}
-        """Last sequence in the hello of this connection, by aircraft; -1: another hello is asked for."""
+        """Last sequence in the hello of this connection, by aircraft; -1: a new hello is requested."""
         self._hello_s = 0.0
         self._under_way: set[tuple[str, int]] = set()
         self._sent = 0
@@ -128,13 +128,13 @@ class AircraftFleet:
         return bool(vehicle.get("version_known")) and vehicle["uid"] is None
 
     def on_message(self, message: Incoming) -> None:
-        """Accept a message of the fleet; a retained one, which would come back at every connection, is ignored."""
+        """Accept a message of the fleet; ignore a retained one, which would return at every connection."""
         if message.topic.startswith("fleet/") and not message.retained:
             self._inbox.append(message)
             self._woken.set()
 
     async def run(self) -> None:
-        """Keep and send until cancelled; never raises anything else."""
+        """Save and send items until cancelled; faults are reported in `status`, never raised."""
         self._started_s = asyncio.get_running_loop().time()
         self._curves_s = self._started_s + CURVES_AFTER_S
         try:
@@ -150,7 +150,7 @@ class AircraftFleet:
             self._items.close()
 
     async def _try(self, step: Callable[[], Awaitable[None]]) -> str | None:
-        """Run a step; return its error in words. Keeping and sending do not hinder each other."""
+        """Run a step and return its error as text, so that a failed save does not block sending, nor the reverse."""
         try:
             await step()
         except Exception as error:
@@ -169,7 +169,7 @@ class AircraftFleet:
             self._aircraft = marks[AIRCRAFT_MARK].value if marks else None
             await self._count()
             if self._aircraft is not None:
-                # What an earlier run has left is of the aircraft that there was then.
+                # Results of an earlier run belong to the aircraft of that run.
                 await self._collect_all(CurrentAircraft(self._aircraft, None, self._clock()))
             self._caught_up = True
         uid, system_id = self._daemon.vehicle.get("uid"), self._daemon.vehicle.get("system_id")
@@ -196,7 +196,7 @@ class AircraftFleet:
         while len(batch) == BATCH:
             batch = await self._offload(lambda: list(islice(self._sources.entries(current), BATCH)))
             await self._add(current.aircraft, batch)
-            # A history is no hurry.
+            # An old history is not urgent.
             await asyncio.sleep(PAUSE_S)
 
     async def _add(self, aircraft: str, entries: list[SourceItems]) -> None:
@@ -216,7 +216,7 @@ class AircraftFleet:
         await self._add(current.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
-        """Return how good the clock was at a time: good within this run where the autopilot's GNSS confirms it now."""
+        """Return a function that rates the clock at a time: "good" in this run, if the autopilot's GNSS confirms it."""
         run_s = asyncio.get_running_loop().time() - self._started_s
         began = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=run_s)
         since, agrees = began.isoformat(timespec="milliseconds"), self._daemon.clock_agrees
@@ -247,7 +247,7 @@ class AircraftFleet:
                     if of == aircraft and any(first <= sequence <= last for first, last in sequences)
                 }
                 if self._wait_s > CONFIRMED_WITHIN_S:
-                    self._begin_again()  # somebody is there again: in order, from the first
+                    self._begin_again()  # a collector has returned: send in order, from the first item
         elif await self._offload(self._items.confirm, aircraft, epoch, sequences, None) and sequences:
             self._begin_again()
         else:
@@ -261,7 +261,7 @@ class AircraftFleet:
         return link if link is not None and link.connected else None
 
     async def _greet(self) -> None:
-        """Subscribe to the fleet's answers and send a hello, at every connection and when there is more."""
+        """Subscribe to the fleet's answers and send a hello, at every connection and after new items."""
         link, now_s = self._link, asyncio.get_running_loop().time()
         if link is None:
             return
@@ -292,9 +292,9 @@ class AircraftFleet:
         self._sent, self._wait_s = 0, CONFIRMED_WITHIN_S
 
     async def _send(self) -> None:
-        """Send the next few items, once the last few are confirmed or their time is over.
+        """Send the next window of items once the last one is confirmed or timed out.
 
-        After the last the first are sent again: one item that a collector does not take holds up no other.
+        After the last item, sending restarts at the first: an item that is never confirmed does not block others.
         """
         link, now_s = self._link, asyncio.get_running_loop().time()
         if link is None or not any(kept.waiting for kept in self._kept):
@@ -324,7 +324,7 @@ def _answer_topics(aircraft: str) -> tuple[str, str]:
 
 
 def parse(payload: bytes) -> tuple[str, list[Range]] | None:
-    """Return epoch and sequences that a collector has or wants; None: it says something else. Never raises."""
+    """Return the epoch and sequences of a collector's message; None: not such a message. Never raises."""
     try:
         said = decode(payload, dict[str, Any], FORMAT_VERSION)
         epoch, sequences = msgspec.convert((said.get("epoch"), said.get("sequences")), tuple[str, _Ranges])
@@ -338,7 +338,7 @@ def encode_item(waiting: Waiting, location: Location) -> bytes:
     try:
         body = msgspec.json.decode(item.body)
     except UNREADABLE:
-        body = {}  # the disk has spoilt it
+        body = {}  # damaged on the disk
     return msgspec.json.encode(
         {
             "format_version": FORMAT_VERSION,
@@ -365,5 +365,5 @@ def _less_place(value: Any, location: Location, key: str = "") -> Any:
         return _EARTHS.sub(r"\1 ?", value)
     if key in _ROUNDED:
         return None if location == "off" or value is None else round(value, _ROUNDED[key])
-    # Two digits of a sigma are what it is worth; more would tell the latitude, as above.
+    # A sigma is significant to two digits; more would reveal the latitude (see `_WORKED_OUT`).
     return float(f"{value:.2g}") if "sigma" in key and isinstance(value, float) else value

@@ -1,7 +1,7 @@
-"""Finds in the storage directory what the fleet has not been told yet, and tells each thing once.
+"""Search of the storage directory for results that are not yet items for the fleet; each becomes an item once.
 
 The files are read as plain JSON: the collector checks the bodies, and the types of the records would load numpy. The
-disk is the source, not the daemon's events: it has what happened before a crash, and before the fleet was configured.
+source is the disk, not the daemon's events: it includes results before a crash and before the fleet was configured.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ def utc(at: str) -> str:
 
 
 class CurrentAircraft(msgspec.Struct, frozen=True):
-    """Aircraft that the items found now belong to, and what tells how good the clock was at a time."""
+    """Aircraft of the items found now, and the function that rates the clock at a time."""
 
     aircraft: str
     system_id: int | None
-    """MAVLink system; records of another one do not belong to the aircraft. None: all do."""
+    """MAVLink system id; records of another one do not belong to the aircraft. None: all records belong to it."""
     clock: Callable[[str], Clock]
 
     def owns(self, system_id: int | None) -> bool:
@@ -68,7 +68,7 @@ class CurrentAircraft(msgspec.Struct, frozen=True):
 
 
 class Sources:
-    """Files of one storage directory; `items` keeps the marks of what was told. Reading blocks."""
+    """Files of one storage directory; `items` holds the read positions (marks). Reading blocks."""
 
     def __init__(self, directory: Path, items: FleetItems) -> None:
         self._directory, self._items = directory, items
@@ -78,7 +78,7 @@ class Sources:
     def has_news(self) -> bool:
         """Return whether something may have been written since the last call.
 
-        Once more after each change: a second write in the same tick of the file system's clock changes no time.
+        It is True once more after each change: a second write in one tick of the file system's clock changes no stamp.
         """
         seen = tuple(_stamp(self._directory / name) for name in _WATCHED)
         settled, self._settled = self._settled, seen == self._seen
@@ -86,7 +86,7 @@ class Sources:
         return not (settled and self._settled)
 
     def entries(self, current: CurrentAircraft) -> Iterator[SourceItems]:
-        """Yield what was not told yet.
+        """Yield the results that are not yet items.
 
         Raises:
             StorageError: a list or a folder cannot be read.
@@ -190,7 +190,7 @@ class Sources:
             items: list[Item] = []
             value, found = before, self._read(f"flights/{number}.json")
             flight = None if found is None else found[0].flight
-            # A flight whose log was read again is the same flight.
+            # Reading a log again gives the same flight: no new item.
             if found is not None and flight is not None and flight.key != before and current.owns(flight.system_id):
                 value = flight.key
                 items.append(current.item("flight", flight.began_at or found[0].read_at, found[1]))
@@ -198,7 +198,7 @@ class Sources:
 
 
 def _parts(current: CurrentAircraft, record: _Keys) -> dict[str, str]:
-    """Return the device ids of the record's IMUs as JSON, by the key of their marks; IMUs without ids are left out."""
+    """Return the device ids of the record's IMUs as JSON, by mark key; IMUs without ids are left out."""
     ids = {imu.get("name", ""): {key: imu.get(key) for key in ("gyro_id", "accel_id")} for imu in record.imus}
     known = {name: each for name, each in ids.items() if any(value is not None for value in each.values())}
     return {f"{IMU}{current.aircraft}/{name}": msgspec.json.encode(each).decode() for name, each in known.items()}

@@ -1,4 +1,4 @@
-"""The MQTT process: publishes the daemon's state, answers requests, and sends what the fleet has not confirmed yet."""
+"""MQTT process: publishes the daemon's state, answers requests, and sends items until the fleet confirms them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
 
 MEMORY_MIB: Final = 128
-"""The process needs 30 MiB, the fleet's part included."""
+"""Memory limit; the process needs 30 MiB, fleet client included."""
 FOUND_WITHIN_S: Final = 3.0
-"""Wait this long for the autopilot's system id; without it the vehicle is number 1, as on MAVLink."""
+"""Timeout for the autopilot's system id; after it the vehicle is number 1, MAVLink's default."""
 NEWS_WITHIN_S: Final = 1.0
 PROGRESS_S: Final = 0.5
 ANSWER_AT_END_S: Final = 0.5
@@ -43,7 +43,7 @@ _VEHICLE = ("system_id", "firmware", "armed", "summary")
 
 
 class MqttProcess:
-    """Work of the process. A test hands in the daemon's answers; otherwise they come from the control socket."""
+    """Work of the process. Tests pass the function that asks the daemon; by default it uses the control socket."""
 
     def __init__(self, settings: ChildSettings, asks: Ask | None = None) -> None:
         config = settings.config
@@ -68,7 +68,7 @@ class MqttProcess:
         return {**self.link.status(), "base_topic": self.topics.base, "fleet": fleet}
 
     async def run(self) -> None:
-        """Serve the broker until cancelled. In a check the broker is only connected to."""
+        """Serve the broker until cancelled; in a check, only connect to the broker."""
         if self._only_listening:
             self.topics = Topics(self._base())
             self.link = MqttLink(self._settings, client_id=f"{self._client_id(self.topics.base)}-check")
@@ -94,7 +94,7 @@ class MqttProcess:
         return self._settings.base_topic or f"companion/{self._known_system_id or 1}"
 
     def _client_id(self, base: str) -> str:
-        # The same after every restart: our old connection, and its last will with it, gives way to the new one.
+        # Same id after every restart: the new connection replaces the old one and its last will.
         return self._settings.client_id or base.replace("/", "-")
 
     async def _news(self) -> None:
@@ -110,7 +110,7 @@ class MqttProcess:
             await self._publish_as(Topics(self._base()))
 
     async def _publish_as(self, topics: Topics) -> None:
-        """Publish, and handle requests, under one base topic until the vehicle's base topic changes."""
+        """Publish and handle requests under one base topic, until the vehicle's base topic changes."""
 
         def respond(command: str, response: Object) -> None:
             droppable = response["state"] == "refused" or "repeated" in response
@@ -119,7 +119,7 @@ class MqttProcess:
         def on_message(message: Incoming) -> None:
             if message.topic == topics.status:
                 if message.payload != ONLINE and link.outbox.kept(topics.status) == ONLINE:
-                    # The last will of an earlier connection, come late.
+                    # The last will of an earlier connection arrived late: overwrite it.
                     link.outbox.keep(topics.status, ONLINE, again=True)
             elif message.topic.startswith(topics.request):
                 command = message.topic.removeprefix(topics.request)
@@ -147,11 +147,11 @@ class MqttProcess:
             logger.info("mqtt: the vehicle is %s, no longer %s", self._base(), topics.base)
             await requests.close(ANSWER_AT_END_S)
             for topic in topics.kept:
-                link.outbox.keep(topic, b"")  # the broker forgets it
+                link.outbox.keep(topic, b"")  # delete it at the broker
         except asyncio.CancelledError:
             await requests.close(ANSWER_AT_END_S)
             self.daemon.news.clear()
-            await self._news()  # such as the record of what was cancelled just now
+            await self._news()  # such as the record of a calibration that was just cancelled
             self._publish(link, topics)
             link.outbox.keep(topics.status, OFFLINE)
             raise
@@ -184,7 +184,7 @@ class MqttProcess:
 
 
 def summary(status: Object) -> Object:
-    """Return the part of the status that is published as the state: no figures that change all the time."""
+    """Return the part of the status that is published as the state: without figures that change all the time."""
     return {
         **{key: status[key] for key in _COPIED},
         "vehicle": {key: status["vehicle"][key] for key in _VEHICLE},
@@ -197,10 +197,10 @@ def summary(status: Object) -> Object:
 
 
 class Pace:
-    """Decides when a state is worth a message.
+    """Limits how often the state is published.
 
-    At once when the state itself changes, within a second when anything else does; every ten seconds when only words
-    change that tell how long ago something was.
+    A change of the state itself is published at once, any other change within a second. If only texts with the age of
+    an event change, the state is published every ten seconds.
     """
 
     def __init__(self) -> None:
@@ -226,7 +226,7 @@ def _lasting(state: Object) -> Object:
 
 
 class Topics:
-    """All topics under one base, such as "companion/1"; those of requests and responses lack the command's name."""
+    """Topics under one base, such as "companion/1"; those of requests and responses lack the command's name."""
 
     def __init__(self, base: str) -> None:
         self.base = base

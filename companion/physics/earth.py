@@ -21,7 +21,7 @@ _SEMI_MAJOR_M: Final = 6378137.0
 _FLATTENING: Final = 1 / 298.257223563
 _M: Final = 0.00344978650684
 
-WMM_VALID_YEARS: Final = (2025.0, 2030.0)  # The years for which the world magnetic model WMM2025 is made
+WMM_VALID_YEARS: Final = (2025.0, 2030.0)  # Years in which the world magnetic model WMM2025 is valid
 
 GAUSS_PER_NT: Final = 1e-5
 CompassUse = Literal["good", "poor", "none"]
@@ -30,7 +30,7 @@ CompassUse = Literal["good", "poor", "none"]
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
     """Return normal gravity by Somigliana's formula (WGS 84; method 3.6).
 
-    The height is above the ellipsoid; sea level serves (its 100 m at most are 31 micro-g).
+    The height is above the ellipsoid. Height above sea level will do: it differs by at most 100 m, or 31 micro-g.
     """
     s2 = math.sin(latitude_deg * DEG) ** 2
     surface = 9.7803253359 * (1 + 0.00193185265241 * s2) / math.sqrt(1 - 0.00669437999014 * s2)
@@ -72,8 +72,8 @@ class MagneticField:
 def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, date: datetime.date) -> MagneticField:
     """Compute the field of the world magnetic model WMM2025.
 
-    Outside the years of the model its nearest year is used: the field changes by a few tenths of a degree a year, so an
-    old model beats none. `WMM_VALID_YEARS` lets the caller say so.
+    Outside the model's years, use its nearest year: the field changes by a few tenths of a degree a year, so an old
+    model is better than none. The caller can warn by `WMM_VALID_YEARS`.
     """
     start = datetime.date(date.year, 1, 1)
     year = date.year + (date - start).days / 365.25
@@ -81,7 +81,7 @@ def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, d
     result = _world_magnetic_model().calculate(
         glat=latitude_deg, glon=longitude_deg, alt=height_m / 1000.0, time=min(max(year, first), last)
     )
-    # At the very pole the declination's error is infinite.
+    # At the pole itself the declination's error is infinite.
     result.h = max(result.h, 1.0)
     errors = result.calculate_uncertainty()
     return MagneticField(

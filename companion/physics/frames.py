@@ -25,8 +25,8 @@ Array = Floats
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
     """Return the direction cosine matrix C_n^b, 3x3: a vector's NED components to its FRD components.
 
-    Equation (5) of the paper with its errata mended: the second terms of T11 and T12 have the wrong sign, and row 2
-    has the cosine of the latitude for cos(theta) (method 1.3).
+    Equation (5) of the paper, with its errata corrected: the paper has the wrong sign in the second terms of T11 and
+    T12, and the cosine of the latitude instead of cos(theta) in row 2 (method 1.3).
     """
     sr, cr = math.sin(roll_rad), math.cos(roll_rad)
     st, ct = math.sin(pitch_rad), math.cos(pitch_rad)
@@ -41,11 +41,11 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
 
 
 def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
-    """Return the 3x3 matrix from a sensor's axes to the vehicle's, by a MAVLink rotation or roll, pitch, yaw in deg."""
+    """Return the 3x3 matrix from sensor to vehicle axes for a MAVLink rotation, or for roll, pitch, yaw in degrees."""
     angles_deg = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
     matrix = body_from_ned(*(angle * DEG for angle in angles_deg)).T
     if all(angle % 90.0 == 0.0 for angle in angles_deg):
-        return np.rint(matrix) + 0.0  # exact where it can be, and no negative zeros
+        return np.rint(matrix) + 0.0  # exact for multiples of 90 degrees, without negative zeros
     return matrix
 
 
@@ -64,14 +64,14 @@ def skew(vectors: Floats) -> Floats:
 
 
 def symmetric(beside: Floats) -> Floats:
-    """Return the matrices (..., 3, 3) with xy, xz and yz, (..., 3), beside a diagonal of zeros."""
+    """Return symmetric matrices (..., 3, 3) with a zero diagonal, from their elements xy, xz and yz, (..., 3)."""
     xy, xz, yz = np.moveaxis(beside, -1, 0)
     zero = np.zeros_like(xy)
     return np.stack([zero, xy, xz, xy, zero, yz, xz, yz, zero], axis=-1).reshape(*beside.shape, 3)
 
 
 def symmetric_by(vector: Array) -> Matrix:
-    """Return the derivative of `symmetric(beside) @ vector` by xy, xz and yz, 3x3."""
+    """Return the derivative of `symmetric(beside) @ vector` with respect to xy, xz and yz, 3x3."""
     x, y, z = vector
     return np.array([[y, z, 0.0], [x, 0.0, z], [0.0, x, y]])
 
@@ -89,7 +89,7 @@ def rotations(vectors: Floats) -> Floats:
 
 
 def running_products(turns: Floats) -> Floats:
-    """Return the products of the first, the first two, ... of (n, 3, 3), in a few calls (Hillis and Steele's scan)."""
+    """Return the running products of matrices (n, 3, 3), in a few numpy calls (Hillis and Steele's scan)."""
     found, step = turns.copy(), 1
     while step < len(found):
         found[step:] = found[:-step] @ found[step:]
@@ -102,5 +102,5 @@ def wrap_deg(angle_deg: float) -> float:
 
 
 def roll_pitch_from_up(up: Array) -> tuple[float, float]:
-    """Return roll gamma and pitch theta in radians of a body in whose axes `up`, (3,), points up."""
+    """Return roll gamma and pitch theta, rad, from the up direction (3,) in the body's axes."""
     return math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))

@@ -1,14 +1,14 @@
 """Laws of a gradienter's two readings.
 
-Equation (1) of the paper holds only for a sensor of which each output is the elevation of its own axis. A liquid cell
+Equation (1) of the paper holds only for a sensor whose outputs are the elevations of its own axes. A liquid cell
 reads the slope of the liquid's surface, and many modern devices give Euler angles. The wrong law costs 0.15 degrees
-(2.6 mg) at 10/10 degrees (method 1.2). So the law is a property of the sensor:
+(2.6 mg) at 10/10 degrees (method 1.2). The law is therefore a property of the sensor:
 
 | law     | outputs for (theta, gamma)                       | recovered by                                     |
 |---------|--------------------------------------------------|--------------------------------------------------|
 | "axis"  | qy = theta, qx = asin(sin gamma cos theta)       | theta = qy, gamma = asin(sin qx / cos theta)     |
 | "slope" | qy = atan(tan theta / cos gamma), qx = gamma     | gamma = qx, theta = atan(tan qy cos qx)          |
-| "euler" | qy = theta, qx = gamma                           | as they are                                      |
+| "euler" | qy = theta, qx = gamma                           | theta = qy, gamma = qx                           |
 
 qx: right side down +; qy: nose up +; both in the sensor's own frame.
 """
@@ -30,7 +30,7 @@ def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float,
     """Return pitch theta and roll gamma in radians.
 
     Raises:
-        ValueError: the readings cannot belong together ("axis" needs |qx| + |qy| <= 90 degrees).
+        ValueError: the readings are inconsistent ("axis" needs |qx| + |qy| <= 90 degrees).
     """
     qx, qy = x_deg * DEG, y_deg * DEG
     if law == "axis":
@@ -57,11 +57,11 @@ def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
 
 
 def readings_from_up(law: Law, up: Floats) -> Floats:
-    """Return the two readings in degrees, (..., 2), by specific force in the sensor's axes, (..., 3), of any length."""
+    """Return the readings (..., 2), degrees, for specific forces (..., 3) of any length in the sensor's axes."""
     x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
     if law == "axis":
         return np.asarray(np.stack([np.arcsin(-y), np.arcsin(x)], axis=-1) / DEG)
-    # By slope tan theta / cos gamma, with cos gamma = -z / hypot.
+    # "slope" reads tan theta / cos gamma, with cos gamma = -z / hypot.
     across = -z if law == "slope" else np.hypot(y, z)
     return np.asarray(np.stack([np.arctan2(-y, -z), np.arctan2(x, across)], axis=-1) / DEG)
 

@@ -1,4 +1,4 @@
-"""Heading by a magnetic field vector, and the error that a disturbance makes.
+"""Heading from a magnetic field vector, and the error that a disturbance causes.
 
 `up` is the unit vector of specific force at rest, `field` the field vector in any unit, both of shape (3,) and in the
 same axes: forward, right, down of the vehicle or of the sensor. Method 3.5.
@@ -15,16 +15,16 @@ from companion.physics.frames import Array
 from companion.physics.units import DEG
 
 BOUND_OF_TWO: Final = 3.043
-"""95 % bound of a third component over the root of the sum of squares of two that are known, where all three are drawn
-with one unknown size: Student's t with two degrees of freedom, 4.303 / sqrt(2). A direction that is uniform on the
-sphere gives the same, 0.95 / sqrt(1 - 0.95^2)."""
+"""95 % bound of an unknown third component over the length of the two known ones, if all three have one unknown sigma:
+Student's t with two degrees of freedom, 4.303 / sqrt(2). A direction uniform on the sphere gives the same value,
+0.95 / sqrt(1 - 0.95^2)."""
 BOUND_OF_ONE: Final = 12.71
-"""Bound where only one component is known: Student's t with one degree of freedom."""
+"""Bound if only one component is known: Student's t with one degree of freedom."""
 _VERTICAL: Final = 1e-9
 
 
 def horizontal(vector: Array, up: Array) -> Array:
-    """Return the part of a vector across up, (3,)."""
+    """Return the part of a vector perpendicular to `up`, (3,)."""
     return vector - (vector @ up) * up
 
 
@@ -42,10 +42,10 @@ def heading_rad(field: Array, up: Array) -> float:
 
 
 def heading_by_up(field: Array, up: Array) -> Array:
-    """Return the gradient of `heading_rad` by `up` (for changes across up), (3,): minus tan I along magnetic east.
+    """Return the gradient (3,) of `heading_rad` by a change of `up` across itself: minus tan I along magnetic east.
 
-    A wrong tilt lets the vertical field look like a horizontal one: tan I times the tilt error about magnetic north
-    (2.5 times at 68 degrees); tan theta times that about the heading comes from the definition of a heading.
+    A tilt error makes the vertical field look horizontal: tan I times the tilt error about magnetic north (2.5 times
+    at 68 degrees). The definition of a heading adds tan theta times the tilt error about the heading.
 
     Raises:
         ValueError: as `heading_rad`.
@@ -62,7 +62,7 @@ def inclination_rad(field: Array, up: Array) -> float:
 
 
 def inclination_by_up(field: Array, up: Array) -> Array:
-    """Return the gradient of `inclination_rad` by `up` (for changes across up), (3,): minus magnetic north.
+    """Return the gradient (3,) of `inclination_rad` by a change of `up` across itself: minus magnetic north.
 
     Raises:
         ValueError: as `heading_rad`.
@@ -75,9 +75,9 @@ def inclination_by_up(field: Array, up: Array) -> Array:
 
 
 def deflection_bound_deg(unseen_gauss: float, horizontal_gauss: float) -> float:
-    """Return the turn of a compass by an unseen field across the meridian; 180 where it may be as strong as the field.
+    """Return the largest turn of a compass by an unseen field across the meridian; 180 if it is as strong as the field.
 
-    `horizontal_gauss` is the measured field (method 3.5).
+    `horizontal_gauss` is the measured horizontal field (method 3.5).
     """
     if unseen_gauss >= horizontal_gauss:
         return 180.0

@@ -19,7 +19,7 @@ MG: Final = 9.80665e-3  # m/s^2 per milli-g of the standard gravity, the unit in
 class Unit(NamedTuple):
     si: float  # The unit in SI units
     name: str
-    digits: int  # Decimals that a bias is worth
+    digits: int  # Decimals shown for a bias
 
 
 UNITS: Final[dict[Triad, Unit]] = {"gyro": Unit(DEG_H, "deg/h", 0), "accel": Unit(MG, "mg", 1)}

@@ -1,1 +1,1 @@
-"""Bytes to samples, samples to commands; no I/O, no clock."""
+"""Protocols of sensors: decoders from bytes to samples, and commands to devices; no I/O, no clock."""

@@ -1,6 +1,6 @@
-"""Recognise a speaker by its bytes: a sensor, an autopilot, or something else.
+"""Detection of a port's device by its bytes: a sensor, an autopilot, or something else.
 
-Every decoder of the registry reads the bytes, and the one that accepts most wins.
+Every decoder of the registry reads the bytes; the decoder that accepts the most frames wins.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from companion.messages import message
 from companion.protocols.registry import DEVICES, Kind, main_kind
 
 COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
-ENOUGH_BYTES: Final = 1500  # six frames of the longest kind: if no decoder has understood one, none will
+ENOUGH_BYTES: Final = 1500  # six frames of the longest protocol; if no decoder has accepted one, none will
 
 _LEAST_FRAMES: Final = 2
 _SURE_FRAMES: Final = 4
@@ -27,7 +27,7 @@ _MAVLINK_RUN: Final = 4
 
 
 class Line(NamedTuple):
-    """Setting of a line, always with 8 data bits and one stop bit."""
+    """Setting of a serial line, always with 8 data bits and one stop bit."""
 
     baud: int
     parity: Parity
@@ -38,7 +38,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A protocol that the bytes may be."""
+    """A protocol that may have produced the bytes."""
 
     protocol: str
     kinds: tuple[Kind, ...]
@@ -55,11 +55,11 @@ class Candidate:
 
 
 def candidates(data: bytes) -> list[Candidate]:
-    """List the protocols that these bytes may be, the likeliest first."""
+    """List the protocols that may have produced the bytes, the likeliest first."""
     found = []
     for info, kinds in DEVICES.items():
         decoder = info.decoder()
-        decoder.interrupted()  # the first frame lacks its beginning
+        decoder.interrupted()  # the first frame may lack its beginning
         decoder.feed(data, 0.0)
         if decoder.accepted:
             rejected = max(decoder.rejected.total() - 1, 0)
@@ -73,7 +73,7 @@ def likeliest(data: bytes) -> Candidate | None:
 
 
 def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
-    """Yield line settings, the likeliest first, each once; `first`: settings believed already."""
+    """Yield each line setting once, the likeliest first; `first`: settings to try before all others."""
     defaults = [Line(info.baud, info.parity) for info in DEVICES]
     bauds = dict.fromkeys([*(line.baud for line in (*first, *defaults)), *COMMON_BAUDS])
     parities: tuple[Parity, ...] = ("none", "even", "odd")
@@ -82,7 +82,7 @@ def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
 
 
 def strangers(data: bytes) -> str | None:
-    """Name a speaker that is no sensor: a login console, a modem's commands, an autopilot."""
+    """Name a device that is no sensor: a login console, a program that sends modem commands, an autopilot."""
     if _CONSOLE.search(data):
         return "a login console or kernel messages"
     if _MODEM.search(data):
@@ -97,7 +97,7 @@ def plain_share(data: bytes) -> float:
 
 
 def is_mavlink(data: bytes) -> bool:
-    """Return whether a few packets follow one another without a gap."""
+    """Return whether the bytes hold several MAVLink packets in a row without a gap."""
     for start in range(len(data)):
         at = start
         for _ in range(_MAVLINK_RUN):
@@ -111,7 +111,7 @@ def is_mavlink(data: bytes) -> bool:
     return False
 
 
-AUTOPILOT_NAMES: Final = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT of those that the companion can calibrate
+AUTOPILOT_NAMES: Final = {3: "ArduPilot", 12: "PX4"}  # by MAV_AUTOPILOT: firmwares that the companion can calibrate
 
 _FRAMES: Final = (
     # Version 2: length 9, two bytes of flags, sequence, system, component, the message's number in three bytes.
@@ -150,7 +150,7 @@ class Heartbeat:
 def heartbeats(data: bytes) -> list[Heartbeat]:
     """List the senders of whole HEARTBEATs, autopilots first, each once.
 
-    One is enough to know the speed: its nine bytes end with one that is never zero, so version 2 never cuts it short.
+    One HEARTBEAT confirms the baud rate. Its last byte is never zero, so MAVLink 2 never truncates its nine bytes.
     """
     found = [
         Heartbeat(match[2][0], match[2][1], match[3][_TYPE_AT], match[3][_AUTOPILOT_AT])

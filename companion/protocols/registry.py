@@ -1,6 +1,6 @@
 """Protocols by their names in the configuration, and their devices' default line settings.
 
-A decoder gives the tilt of a frame once, as `TiltSample` or in its `CompassSample`; `part_for` splits it by role.
+A decoder returns the tilt of a frame once, as `TiltSample` or in its `CompassSample`; `part_for` splits it by role.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ Kind = Literal["imu", "gradienter", "compass"]
 
 @dataclass(frozen=True, slots=True)
 class ProtocolInfo:
-    """One protocol as a device of one kind: its decoder, and the factory's setting of its line.
+    """One protocol for one kind of device: its decoder, and the factory setting of its line.
 
-    `sigma_deg` (of tilt, or of a level heading) and `tilted_sigma_deg` hold where none is configured.
+    `sigma_deg` (of tilt, or of a level heading) and `tilted_sigma_deg` apply unless the configuration sets them.
     """
 
     name: str
     baud: int
     decoder: type[Decoder]
     dialogue: Callable[[], Dialogue] | None = None
-    lag_s: float = 0.0  # time constant with which its reading follows the truth: fluid, pendulum, filters
+    lag_s: float = 0.0  # time constant of the device's response: fluid, pendulum, filters
     sigma_deg: float | None = None
     tilted_sigma_deg: float | None = None
-    law: Law | None = None  # meaning of a gradienter's two readings by its documents; None: the user must say
+    law: Law | None = None  # meaning of a gradienter's two readings by its documents; None: must be configured
     parity: Parity = "none"
 
 
@@ -60,18 +60,18 @@ DEVICES: Final[dict[ProtocolInfo, dict[Kind, dict[str, Any]]]] = {
     # The 3DM-GX5's and CV5's rate, from memory and not from a document.
     ProtocolInfo("mip", 115200, MipDecoder, MipDialogue): {"imu": {}},
     ProtocolInfo("xsens", 115200, XsensDecoder, XsensDialogue): {"imu": {}},
-    # Of the rates that can be ordered (TS1524, table 5-11: 374400 to 1843200) the usual one, from memory. Lag: the
-    # slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
+    # The usual one of the rates that can be ordered (TS1524, table 5-11: 374400 to 1843200), from memory. Lag: that of
+    # its slowest filter, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
     ProtocolInfo("stim300", 921600, Stim300Decoder): {"imu": {}, "gradienter": {"lag_s": 0.01, "law": "axis"}},
     # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
     # parity.
     ProtocolInfo("inclinometer_xy", 9600, InclinometerXyDecoder, InclinometerXyDialogue): {
         "gradienter": {"lag_s": 0.43}
     },
-    # MD900-T. How long its fluid takes is not documented.
+    # MD900-T. The settling time of its fluid is not documented.
     ProtocolInfo("jewell", 9600, JewellDecoder, JewellDialogue): {"gradienter": {}},
-    # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most. Heading:
-    # 1 deg rms level, 3 deg to 30 deg of tilt.
+    # Honeywell: null 0.4 deg, 0.5 deg up to 30 deg of tilt; thermal hysteresis of up to 1 deg is not included.
+    # Heading: 1 deg rms level, 3 deg up to 30 deg of tilt.
     ProtocolInfo("hmr3300", 19200, Hmr3300Decoder, Hmr3300Dialogue): {
         "gradienter": {"sigma_deg": math.hypot(0.4, 0.5), "law": "euler"},
         "compass": {"sigma_deg": 1.0, "tilted_sigma_deg": 3.0},
@@ -81,17 +81,17 @@ DEVICES: Final[dict[ProtocolInfo, dict[Kind, dict[str, Any]]]] = {
         "gradienter": {"law": "axis"},
         "compass": {},
     },
-    # OceanServer: 0.5 deg rms level, 1 deg to 30 deg of tilt.
+    # OceanServer: 0.5 deg rms level, 1 deg up to 30 deg of tilt.
     ProtocolInfo("os5000", 19200, Os5000Decoder): {
         "gradienter": {},
         "compass": {"sigma_deg": 0.5, "tilted_sigma_deg": 1.0},
     },
-    # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
+    # 38400: public drivers of the TRAX open the port at this rate; no PNI document with it was found.
     ProtocolInfo("pni", 38400, PniDecoder, PniDialogue): {"gradienter": {"law": "euler"}, "compass": {}},
-    # Of the compass' frame the law would be "euler", of the inclinometer's "axis" is likely: not said.
+    # No default law: the compass' frame would have "euler", the inclinometer's frame probably "axis".
     ProtocolInfo("rion", 9600, RionDecoder, RionDialogue): {"gradienter": {}, "compass": {}},
 }
-"""One device of each protocol, and what differs where it serves as one kind or another."""
+"""One device of each protocol, with the settings that differ by the kind for which it is used."""
 
 _KINDS: Final[tuple[Kind, ...]] = ("imu", "gradienter", "compass")
 PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {

@@ -1,4 +1,4 @@
-"""Faults of a stream of bytes and samples, as far as the stream itself shows them. Pure: time comes in."""
+"""Detection of faults in a stream of bytes and samples. Pure: the caller passes the time."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ SPAN_S: Final = 2.0
 GUESS_EVERY_S: Final = 5.0
 STUCK_S: Final = 1.0
 STUCK_SAMPLES: Final = 20
-"""Equal readings of an IMU that prove a fault: six channels always move. A still gradienter repeats its digits."""
+"""Equal IMU readings in a row that prove a fault: one of six channels always changes. A gradienter may repeat one."""
 NEAR_DEG: Final = 0.5
-"""A reading this near the last counts as near; whoever moves the aircraft may be the cause of a hang."""
+"""Largest angle within which readings count as unchanged for `near_since_s`: motion itself may have caused a hang."""
 
 _HARMLESS: Final = frozenset(
     {
@@ -39,7 +39,7 @@ _HARMLESS: Final = frozenset(
         "unknown sentence",
     }
 )
-_MUCH_TEXT: Final = 0.9  # least share of plain text; a line with less is read at a wrong speed or parity
+_MUCH_TEXT: Final = 0.9  # least share of plain text; with less, the line's baud rate or parity is wrong
 _DAMAGED_SHARE: Final = 0.1
 _DAMAGED_FRAMES: Final = 3
 _MOST_DAMAGE_NAMED: Final = 3
@@ -47,7 +47,7 @@ _MOST_DAMAGE_NAMED: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """A fault: a key to count it under, and one line for people."""
+    """A fault: its key for counters, and one line for people."""
 
     key: str
     words: str
@@ -58,7 +58,7 @@ _Counts = tuple[int, Counter[str]]  # frames accepted, and rejected by reason
 
 
 class StreamHealth:
-    """Watches one stream; `protocol`: its name in the configuration."""
+    """Monitor of one stream; `protocol`: its name in the configuration."""
 
     def __init__(self, protocol: str, decoder: Decoder) -> None:
         self._protocol, self._decoder = protocol, decoder
@@ -142,7 +142,7 @@ class StreamHealth:
         if since_s is None or last_s is None or self._same < STUCK_SAMPLES or last_s - since_s < STUCK_S:
             return None
         if not isinstance(self._reading[0], tuple):
-            return None  # no IMU: a still gradienter or compass repeats its digits
+            return None  # not an IMU: a gradienter or compass at rest repeats its reading
         words = message("sensor_stuck", evidence=f"{self._same + 1} equal readings")
         return Trouble("stuck", words, implausible=True)
 

@@ -1,1 +1,1 @@
-"""Recordings: MCAP files of the bytes that came in, and what else a calibration was made from."""
+"""Recordings: MCAP files of the received bytes and of all other inputs of a calibration."""

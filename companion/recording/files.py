@@ -1,7 +1,7 @@
-"""The thread's side of recording: MCAP files, one or a ring of them. Nothing here is called on the event loop.
+"""MCAP files of a recording: a single file, or a ring of files. Write them in a thread, not on the event loop.
 
-An MCAP file may be cut anywhere: each chunk is compressed by itself, and one is finished and synced at every `write`,
-once a second. Writing raises StorageError, in one line, where the disk refuses.
+An MCAP file may be cut anywhere: each chunk is compressed independently, and every `write`, once a second, finishes and
+syncs a chunk. Writing raises StorageError, in one line, if the disk fails.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from companion.recording.messages import Message, Start
 
 CHUNK_BYTES: Final = 256 * 1024  # a second of a busy aircraft has less
 RESERVE_BYTES: Final = 32 * 1024 * 1024
-"""Bytes left free on the disk: the values for undo and the records are worth more than any recording."""
+"""Bytes left free on the disk for the undo values and the records, which are worth more than any recording."""
 LEAST_FREE: Final = 0.1
-"""Share of the disk that a recording on request leaves free, since nothing deletes its files."""
+"""Share of the disk that a recording on request leaves free: its files are never deleted."""
 PARTS: Final = 8
-"""A ring's files are at most this part of it, so that the oldest can go without taking much along."""
+"""Least number of files in a full ring: the deletion of the oldest file then loses only a small part."""
 
 FOLDER_MODE: Final = 0o700
 
@@ -37,13 +37,13 @@ _NAME = re.compile(r"(\d{6,})\.mcap")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Beginning:
-    """Content of a file before its messages, if it begins now."""
+    """Header data of a file that begins now."""
 
     t_s: float
     offset_ns: int
-    """UTC minus the daemon's clock, fixed when the daemon started: setting the host's clock makes no jump."""
+    """UTC minus the daemon's clock, fixed at the daemon's start: a change of the host's clock makes no jump."""
     config: bytes  # JSON
-    states: Sequence[Message]  # states in force at `t_s`
+    states: Sequence[Message]  # states that apply at `t_s`
 
 
 def free_bytes(folder: Path) -> int:
@@ -51,7 +51,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def disk_shortage(folder: Path) -> str | None:
-    """Say that a recording on request must not take more of this disk; None while it may, or while nothing is known."""
+    """Return the reason why a recording on request must not use more of this disk; None: it may, or unknown."""
     try:
         usage = shutil.disk_usage(folder)
     except OSError:
@@ -62,7 +62,7 @@ def disk_shortage(folder: Path) -> str | None:
 
 
 def open_new(path: Path) -> IO[bytes]:
-    """Create a file that does not exist yet, for its owner alone: positions and signatures are in it."""
+    """Create a new file that only its owner can read: a recording contains positions and signatures."""
     return open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600))
 
 
@@ -78,7 +78,7 @@ def _failed(path: Path, step: str, reason: OSError | str) -> StorageError:
 
 
 class RecordingFile:
-    """One MCAP file in the making."""
+    """One MCAP file that is being written."""
 
     def __init__(self, path: Path) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
@@ -94,7 +94,7 @@ class RecordingFile:
             raise _failed(path, "created", f"there is no folder {path.parent}") from None
         except OSError as error:
             raise _failed(path, "created", error) from None
-        # Without an index of messages: it would hold as many entries as the file has messages.
+        # No index of messages: it would need memory for one entry per message.
         self._writer: Any = Writer(
             self._file,
             chunk_size=CHUNK_BYTES,
@@ -152,7 +152,7 @@ class RecordingFile:
             self._add(*state)
 
     def _ns(self, t_s: float) -> int:
-        """Return UTC in nanoseconds of a time on the daemon's clock; a replay subtracts the same whole offset."""
+        """Convert a time on the daemon's clock to UTC in ns; a replay subtracts the same whole offset."""
         return 0 if self._begun is None else max(0, round(t_s * 1e9) + self._begun.offset_ns)
 
     def _add(self, topic: str, t_s: float, data: bytes) -> None:
@@ -170,7 +170,7 @@ class RecordingFile:
             try:
                 os.fdatasync(self._file.fileno())
             except OSError as error:
-                if error.errno != errno.EINVAL:  # a pipe has nothing to sync
+                if error.errno != errno.EINVAL:  # raised for a pipe, which needs no sync
                     raise
 
     def _abandon(self) -> None:
@@ -181,7 +181,7 @@ class RecordingFile:
 
 
 def unused_path(folder: Path) -> Path:
-    """Path of a recording on request that was given no name; creates the folder."""
+    """Create the folder and return an unused path for a recording on request without a name."""
     try:
         folder.mkdir(FOLDER_MODE, exist_ok=True)
         numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
@@ -197,13 +197,13 @@ def create_on_request(path: Path) -> RecordingFile:
 
 
 class Ring:
-    """Files of limited size in all, numbered, as the wall clock may be wrong in the field; the oldest go first."""
+    """Ring of files with a limited total size; the oldest are deleted. Numbered: the wall clock may be wrong."""
 
     def __init__(self, folder: Path, most_bytes: int) -> None:
         self.folder, self.most_bytes = folder, most_bytes
         self.bytes_in_all = 0
         self._current: RecordingFile | None = None
-        self._continues = False  # True: the next file begins where the one before ended
+        self._continues = False  # True: the next file begins where the previous one ended
 
     @property
     def path(self) -> Path | None:
@@ -257,7 +257,7 @@ class Ring:
         files = self._files()
         in_all = sum(size for _, _, size in files)
         present = self.path
-        # A file that is yet to be written needs its share too.
+        # Reserve room for the file that will be created next.
         limit = self.most_bytes - (self.most_bytes // PARTS if present is None else 0)
         for _, path, size in files:
             if (in_all <= limit and free_bytes(self.folder) >= RESERVE_BYTES) or path == present:

@@ -1,7 +1,7 @@
 """Topics of a recording, the messages on them, and the queue to the thread that writes them.
 
-Raw bytes are recorded as they came; an empty message means that bytes are missing there. Records are JSON. Everything
-else is MessagePack, which keeps every float to the last bit, infinities included.
+Raw bytes are recorded unchanged; an empty message marks missing bytes. Records are JSON. All other messages are
+MessagePack, which preserves every float exactly, infinities included.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from companion.estimation.turning.turn import Turn
 
 FORMAT_VERSION: Final = "4"
 METADATA: Final = "companion"  # name of the metadata record with versions and clocks
-CONFIG: Final = "configuration.json"  # name of the attachment with the configuration in force
+CONFIG: Final = "configuration.json"  # name of the attachment with the active configuration
 SERIAL: Final = "/serial/"  # prefix of the raw bytes of a port; the name of the device follows
 MAVLINK: Final = "/mavlink/in"
 IMU: Final = "/autopilot/imu/"  # prefix of `ImuState`; the name of the IMU follows
@@ -30,32 +30,32 @@ EKF_BIAS: Final = "/autopilot/ekf_bias"
 RAW_MEAN: Final = "/autopilot/raw_mean"
 PLACE: Final = "/companion/place"
 START: Final = "/companion/start"
-TICK: Final = "/companion/tick"  # empty: the collector was told the time
+TICK: Final = "/companion/tick"  # empty message: a tick of the collector, at the message's time
 MEASURED, SOLVED, RECORD = "/companion/measured", "/companion/solved", "/companion/record"
 
 Message = tuple[str, float, bytes]  # topic, time on the daemon's clock, data
 
 
 class Start(msgspec.Struct, frozen=True):
-    """A recording begins here, or begins anew after a gap."""
+    """Start of a recording, or its restart after a gap."""
 
-    lost: int = 0  # messages dropped right before, because the disk did not keep up
-    continues: bool = False  # True: the file before this one in the ring ends where this one begins
+    lost: int = 0  # messages dropped just before, because the disk was too slow
+    continues: bool = False  # True: this file begins where the previous one of the ring ends
 
 
 class ImuState(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU of the autopilot from here on: its messages, and the parameters that correct it."""
+    """State of one IMU of the autopilot from here on: its messages, and its calibration parameters."""
 
     sender: tuple[int, int]  # system and component id of the autopilot
     firmware: FirmwareName | None
     instance: int
-    message: str | None  # name of the `ImuMessage` that its samples come in; None: none come
+    message: str | None  # name of the `ImuMessage` with its samples; None: no samples
     input: ImuInput
-    calibration: ImuCalibration | None  # None: not known, so that its samples do not count
+    calibration: ImuCalibration | None  # None: unknown, so its samples are not used
 
 
 class RawOutput(msgspec.Struct, frozen=True):
-    """A mean in floats beside an IMU's stream of integers, less the offsets in force."""
+    """Mean of an IMU in floats, beside its stream of integers, corrected by the active offsets."""
 
     imu: str
     output: tuple[float, float, float, float, float, float]
@@ -64,7 +64,7 @@ class RawOutput(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """A window was measured. All but its ends may be known from before the recording began."""
+    """Measurement of a window. Values other than its ends may depend on time before the recording."""
 
     start_s: float
     end_s: float
@@ -74,11 +74,11 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):
-    """A calibration was solved from the latest window: its other inputs."""
+    """Calibration from the latest window: all other inputs of the estimator."""
 
     where: Whereabouts
     what: str
-    alignment: tuple[float, float, float] | None  # the gradienter's zero: offset x and y, and sigma, in degrees
+    alignment: tuple[float, float, float] | None  # zero of the gradienter: offset x and y, and sigma, in degrees
     otherwise: Otherwise
     expectation: Expectation
 
@@ -91,7 +91,7 @@ _TYPES: Final[dict[str, Any]] = {
     MEASURED: Measured,
     SOLVED: Solved,
 }
-MOST_BYTES: Final = 1024 * 1024  # the most bytes of one of these messages; ours have some thousand
+MOST_BYTES: Final = 1024 * 1024  # most bytes of one of these messages; usual ones have some thousand
 
 
 def encoding(topic: str) -> str:
@@ -124,16 +124,16 @@ def _array(_kind: Any, plain: Any) -> Any:
 
 
 MOST_MESSAGES: Final = 12_000
-"""The most messages that wait: 15 s of a 200 Hz IMU beside 100 Hz telemetry, longer than a memory card stalls."""
-MOST_WAITING_BYTES: Final = 2 * 1024 * 1024  # the most bytes among them: 15 s of an IMU at 1 kHz have 1.4 MB
+"""Most queued messages: 15 s of a 200 Hz IMU and 100 Hz telemetry, which exceeds the stalls of a memory card."""
+MOST_WAITING_BYTES: Final = 2 * 1024 * 1024  # most queued bytes: 15 s of an IMU at 1 kHz have 1.4 MB
 
 
 class Tape:
-    """Bounded queue. What finds no room is dropped together with all that waits: no replay bridges a gap."""
+    """Bounded queue to the writer. On overflow all queued messages are dropped: a replay cannot bridge a gap."""
 
     def __init__(self) -> None:
-        self.is_on = False  # True: messages are kept; states always are
-        self.lost = 0  # messages dropped since `begin`; while there are any, nothing is taken
+        self.is_on = False  # True: messages are queued; states are always kept
+        self.lost = 0  # messages dropped since `begin`; above 0, all further messages are dropped
         self.lost_in_all = 0
         self._waiting: list[Message] = []
         self._bytes = 0
@@ -171,7 +171,7 @@ class Tape:
             self._waiting.append((topic, t_s, data))
 
     def put_state(self, topic: str, t_s: float, data: bytes) -> None:
-        """Add a message that stays in force until the next on its topic, so that later files begin with it."""
+        """Add a message that applies until the next one on its topic; later files begin with it."""
         self._states[topic] = (topic, t_s, data)
         self.put(topic, t_s, data)
 
@@ -188,14 +188,14 @@ _MARKER: Final = 0xFD
 
 
 class KeyFilter:
-    """Replaces the payload of SETUP_SIGNING by zeros: autopilots forward it to us, and a recording may be shared.
+    """Filter that zeroes the key in SETUP_SIGNING: autopilots forward this message, and recordings may be shared.
 
-    For one direction of one link; give it all bytes in their order.
+    Use one filter for each direction of each link, and pass it all bytes in order.
     """
 
     def __init__(self) -> None:
         self._before = b""
-        self._left = 0  # bytes of such a payload that are still to come
+        self._left = 0  # bytes still to come of a payload that has begun
 
     def __call__(self, data: bytes) -> bytes:
         known = self._before + data
@@ -205,7 +205,7 @@ class KeyFilter:
         return self._blank(known, len(known) - len(data))
 
     def restart(self) -> None:
-        """Forget what was half received: some bytes are missing here."""
+        """Discard a partly received message: bytes are missing at this point."""
         self._before, self._left = b"", 0
 
     def _blank(self, known: bytes, behind: int) -> bytes:

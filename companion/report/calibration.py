@@ -49,11 +49,11 @@ def read_material(directory: Path, wanted: int | None) -> tuple[Numbered, list[A
     """Read a calibration by its number; None: the latest.
 
     Returns:
-        The calibration, last, with the earlier ones; the armings while it was active, oldest first; damaged files.
+        Earlier calibrations, then the wanted one; armings while it was active, oldest first; damaged files.
     """
     store, records = RecordStore(directory), directory / "records"
     try:
-        # Else a folder that only root may enter looks like one that is not there.
+        # Without this, a folder that only root may enter looks like a missing one.
         next(iter(records.iterdir()), None)
     except FileNotFoundError:
         raise StorageError(f"no calibration yet: there is no {records} (--storage DIR names another folder)") from None

@@ -17,9 +17,9 @@ from typing import Final
 import msgspec
 
 MAX_TEXT: Final = 600
-"""Most characters of one piece of text: a page stays bounded whatever a file holds."""
+"""Maximum characters in one piece of text: bounds the size of a page for any file."""
 
-# Controls (but line breaks and tabs), direction marks and overrides, zero-width characters, lone surrogates.
+# Controls (except line breaks and tabs), direction marks and overrides, zero-width characters, lone surrogates.
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 _VOID: Final = frozenset({"meta", "path", "line", "rect", "circle", "br"})
 
@@ -31,7 +31,7 @@ _MOST: Final = 1e12
 
 Pair = tuple[float, float]
 Dot = tuple[float, float, float]
-"""Place on both axes, and half the length of the bar."""
+"""Position on both axes, and half the length of the error bar."""
 
 
 class Markup(str):
@@ -55,7 +55,7 @@ def join(*children: Child) -> Markup:
 
 
 def tag(element: str, /, *children: Child, **attributes: str | float | None) -> Markup:
-    """Make an element; `class_` is class, other underscores in attribute names become dashes, None leaves one out."""
+    """Make an element; `class_` becomes class, other underscores become dashes, an attribute of None is omitted."""
     given = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{text(value if isinstance(value, str) else str(value))}"'
         for key, value in attributes.items()
@@ -90,7 +90,7 @@ def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Ax
     middle = (low + high) / 2.0
     low, high = middle - 0.56 * width, middle + 0.56 * width
     step = _nice((high - low) / ticks)
-    if step > (high - low) / 2.0:  # there might be one tick only, from which nobody reads a scale
+    if step > (high - low) / 2.0:  # a single tick would show no scale
         step = _nice(step / 2.6)
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
     first = math.ceil(low / step - 1e-9)
@@ -105,7 +105,7 @@ def in_order(labels: Sequence[str]) -> Axis:
 
 
 def dates(values: Sequence[float]) -> Axis:
-    """Make an axis of UTC times (s since 1970) in their order; within one day the labels are times of day."""
+    """Make an evenly spaced axis of UTC times (s since 1970); within one day the labels are times of day."""
     moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
     form = "%H:%M" if len({each.date() for each in moments}) == 1 else "%-d %b %y"
     return in_order([each.strftime(form) for each in moments])
@@ -117,10 +117,10 @@ def _nice(step: float) -> float:
 
 
 class Plot:
-    """One frame with axes; what is drawn first lies below.
+    """SVG plot in one frame with axes; later marks cover earlier ones.
 
-    Without an `x_label` there are no ticks either, for a plot with another one below it; empty: ticks only. `name` and
-    `told` are for a screen reader.
+    `x_label` None: neither label nor ticks, for a plot above another one; empty: ticks only. `name` and `told` are for
+    a screen reader.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Plot:
         self._parts.append(_path("".join(bars), f"bar {class_}"))
         places = [self.at(x, y) for x, y, _ in dots]
         if class_ not in {"sy", "sz"}:
-            # A round end of a line without length: a quarter of the characters that a circle takes.
+            # Zero-length line with round caps: a quarter of the characters of a circle element.
             self._parts.append(_path("".join(f"M{_xy(*place)}h.01" for place in places), f"dot {class_}"))
             return
         marker = _square if class_ == "sy" else _triangle
@@ -232,6 +232,6 @@ def _xy(x: float, y: float) -> str:
 
 
 def _n(value: float) -> str:
-    """Format to a tenth of a unit, a tenth of a pixel."""
+    """Format a coordinate to a tenth of a pixel."""
     found = f"{value:.1f}"
     return found.removesuffix(".0") if found != "-0.0" else "0"

@@ -1,4 +1,4 @@
-"""The frame of every page, and parts that several pages share: cards, biases over time and over temperature."""
+"""Frame of every page, and parts that several pages share: cards, biases over time and over temperature."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
 AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
-"""Largest value in a plot (SI): a larger one comes from a damaged file, and must not squash the rest."""
+"""Largest value in a plot (SI): a larger one comes from a damaged file and would compress the scale."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
-"""Three of an autopilot and our own; others are mentioned only: a page stays below half a megabyte."""
+"""Three of an autopilot and our own. Others are listed without plots: a page stays below half a megabyte."""
 
-# No script, nothing fetched, nothing sent: what is not inline does not exist.
+# No script, no fetch, no form: a page contains everything inline.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 _STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
@@ -103,7 +103,7 @@ def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> li
 
 
 def unix_s(moment: str) -> float | None:
-    """Convert an ISO 8601 time, UTC unless it says otherwise, to s since 1970; None: not of this age."""
+    """Convert an ISO 8601 time (default zone: UTC) to s since 1970; None: invalid, or outside an axis' range."""
     try:
         parsed = datetime.datetime.fromisoformat(moment)
         return seconds_of(parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC))
@@ -118,7 +118,7 @@ def seconds_of(moment: datetime.datetime) -> float | None:
 
 
 def clock_is_sound(points: Sequence[PlotPoint]) -> bool:
-    """Return whether times ascend: a computer without a clock battery starts in the past at every boot."""
+    """Return whether the times ascend: a computer without a clock battery starts in the past at every boot."""
     known = [point.unix_s for point in points]
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 

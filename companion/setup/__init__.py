@@ -1,1 +1,1 @@
-"""First-run set-up: listen, ask the owner, and write the configuration."""
+"""First-run set-up: detect devices by listening, ask the operator, and write the configuration."""

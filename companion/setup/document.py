@@ -1,4 +1,4 @@
-"""The configuration file as text: values are changed in it, comments stay, commented lines and sections switch on."""
+"""Editor of the configuration file's text: sets values, keeps comments, uncomments lines and sections."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Block:
         return keys[-1] if keys else 0
 
     def set(self, key: str, value: Any) -> None:
-        """Let the section say so; None: let it say nothing of it."""
+        """Set a key of the section; None: comment it out."""
         places = [(index, match) for index, line in enumerate(self.lines) if (match := _KEY.match(line))]
         mine = sorted(
             ((match["off"] is not None, index, match) for index, match in places if match["key"] == key),
@@ -51,7 +51,7 @@ def toml(value: Any) -> str:
 
 
 def render(text: str, wanted: Mapping[str, Any]) -> str:
-    """Change a text until it says what is wanted, line by line; raise CompanionError where that is impossible."""
+    """Change a text line by line until its values equal `wanted`; raise CompanionError if that is impossible."""
     blocks = list(_blocks(text))
     now = tomllib.loads(text)
     for name, section in wanted.items():
@@ -102,7 +102,7 @@ def _set_list(blocks: list[_Block], name: str, now: Sequence[Table], wanted: Seq
         if index < len(there):
             _set_table(there[index], now[index], table)
             continue
-        # The commented table of the sample is a device on a port, and stands behind all others.
+        # The sample's commented table is for a device on a port, and comes after all other tables.
         block = _switched_on(blocks, name) if "port" in table else None
         _set_table(block or _behind(blocks, name), {}, table)
 

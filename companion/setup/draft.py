@@ -1,4 +1,4 @@
-"""Draft of a configuration: the present file, or the sample, changed by findings and answers."""
+"""Draft of a configuration: the present file, or the sample, changed by detected devices and answers."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class Question:
     words: str
     now: str  # Present answer
     put: Callable[[str], None]
-    """Accepts an answer; raises ConfigError, in one line, for a wrong one."""
+    """Function that stores an answer; raises ConfigError, in one line, for a wrong one."""
     hint: str = ""
     choices: Sequence[str] = ()  # Answers that a page shows as buttons
     key: str = ""
 
 
 class Draft:
-    """Text of a configuration file under edit, and the values to save; a new text is the sample, with defaults only."""
+    """Edited text of a configuration file, and the values to save; a new text is the sample, with only defaults."""
 
     def __init__(self, text: str, *, is_new: bool) -> None:
         self.text, self.is_new = text, is_new
@@ -54,12 +54,12 @@ class Draft:
         self.guessed: set[str] = set()
 
     def result(self) -> str:
-        """Return the new text; raise CompanionError where single lines of it cannot be changed."""
+        """Return the new text; raise CompanionError if single lines of the text cannot be changed."""
         return render(self.text, self.wanted)
 
     def parsed(self) -> Config:
-        """Parse the new text; raise ConfigError with one line where it is wrong."""
-        # Names of saved profiles are for the daemon to look up.
+        """Parse the new text; raise ConfigError, in one line, if it is wrong."""
+        # Do not look up saved profiles: the daemon does.
         return config.parse(self.result(), "answer", lambda _, name: name)
 
     @property
@@ -87,12 +87,12 @@ class Draft:
         self.is_new = False
 
     def keep_beside(self, path: Path) -> None:
-        """Keep records and socket beside the file: its owner may not write into the service's folders."""
+        """Set storage and socket to paths beside the file: its owner may not write to the service's folders."""
         self._put("storage", "directory", str(storage_beside(path)))
         self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
     def show_page(self, bind: str) -> None:
-        """Add the page at an address unless there is one; raise ConfigError where it is no address."""
+        """Add the web page at an address unless the file has one; raise ConfigError for an invalid address."""
         if "web" not in self.wanted:
             self._put("web", "bind", bind)
 
@@ -103,7 +103,7 @@ class Draft:
         return found
 
     def take(self, kind: Kind, port: str, protocol: str, line: Line) -> None:
-        """Put a device into its section; of another make than before, it keeps no setting of that one."""
+        """Put a device into its section; for a new protocol, delete the settings of the previous device."""
         section = self.section(kind)
         if section is None:
             section = {"name": "own", "source": "serial"} if kind == "imu" else {}
@@ -119,7 +119,7 @@ class Draft:
         info = PROTOCOLS[kind][protocol]
         for key in ("baud", "parity")[: 1 if kind == "imu" else 2]:
             value = getattr(line, key)
-            # A setting from the factory need not be written for a device that works without.
+            # Do not add a factory setting for a configured device: it works without.
             if key in section or not is_there or value != getattr(info, key):
                 section[key] = value
         if kind == "gradienter" and "law" not in section:
@@ -172,7 +172,7 @@ class Draft:
                 )
 
     def part_questions(self, names: Collection[str]) -> Iterator[Question]:
-        """Ask for the parts of these IMUs: the estimator knows their noise by them."""
+        """Yield questions for the parts of these IMUs, which give the estimator their noise."""
         from companion.configured.models import gyro_sigmas_deg_h  # numpy takes a second on a small board
 
         sigmas = gyro_sigmas_deg_h(self.parsed())
@@ -195,7 +195,7 @@ class Draft:
             )
 
     def _put_part(self, imu: Table, key: str, choices: Sequence[str], words: str) -> None:
-        # As it is printed on the board: ICM-42688-P.
+        # Accept names as printed on the board: ICM-42688-P.
         part = words if words in choices else one_of(re.sub(r"[-_ ]", "", words), choices)
         if part != imu.get("profile", UNKNOWN):
             imu["profile"] = part
@@ -266,7 +266,7 @@ def sample() -> str:
 
 
 def begin(path: Path) -> Draft:
-    """Load the configuration, or the sample where there is none; raise ConfigError where it cannot be used."""
+    """Load the configuration, or the sample if there is none; raise ConfigError if it cannot be used."""
     try:
         text = read_regular(path, config.MOST_BYTES).decode()
     except FileNotFoundError:
@@ -294,8 +294,8 @@ def holds(path: Path, text: str) -> bool:
 
 
 def put(path: Path, text: str) -> Path | None:
-    """Write the file atomically, keep the old one beside it, and return that path; None where nobody owned it."""
-    # What is behind a link is replaced, not the link.
+    """Write the file atomically; return the path of the kept old file, or None if nothing had to be kept."""
+    # Replace the target of a link, not the link.
     path = path.resolve()
     kept, mode = None, installing.MODE
     if path.exists() and not holds(path, sample()):

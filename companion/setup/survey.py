@@ -1,4 +1,4 @@
-"""Finds autopilots on serial and UDP ports, and devices on serial ports, by listening alone."""
+"""Detection of autopilots on serial and UDP ports, and of devices on serial ports, only by listening."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from companion.protocols.guess import Heartbeat, Line, heartbeats
 from companion.protocols.registry import Kind, main_kind
 
 AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 115200))
-"""ArduPilot's usual speed, PX4's TELEM 2's, and what both are set to by hand; believed first on every port."""
+"""Line settings to try first on every port: ArduPilot's default, that of PX4's TELEM 2, and a common manual one."""
 Believed = Mapping[str, Line]
-"""Line settings of configured ports: a port that takes any speed, as on USB, is heard at that one."""
+"""Line settings of configured ports, tried first: a USB port without a UART can be read at any speed."""
 
 
 USUAL_PORTS: Final = (14540, 14550, 14551)
-"""PX4's for companions, the ground stations', and the second one that routers are usually given."""
+"""UDP ports of PX4 for companions, of ground stations, and the usual second output of routers."""
 LISTEN_S: Final = 3.0
 LISTEN_TURNS: Final = 30
-"""Turns of the loop in that time, each of which reads what has arrived: a process that gets little of the processor
+"""Number of loop turns while listening; each reads the arrived messages, so a process with little processor time
 listens longer."""
 
 
 class HeardUdp(asyncio.DatagramProtocol):
-    """Messages heard on a UDP port."""
+    """Senders heard on a UDP port."""
 
     def __init__(self, senders: Iterable[Heartbeat] = (), *, from_here: bool = True) -> None:
         self.senders = dict.fromkeys(senders)
@@ -53,7 +53,7 @@ class HeardUdp(asyncio.DatagramProtocol):
 
 
 async def listen_udp(port: int) -> HeardUdp:
-    """Receive until an autopilot is heard or time is over; raise LinkError where the port cannot be opened."""
+    """Receive until an autopilot is heard or the time is over; raise LinkError if the port cannot be opened."""
     try:
         transport, heard = await asyncio.get_running_loop().create_datagram_endpoint(
             HeardUdp,
@@ -72,7 +72,7 @@ async def listen_udp(port: int) -> HeardUdp:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Result of the set-up scan: devices heard on each serial and UDP port, or why it was not scanned."""
+    """Result of the set-up scan: devices heard on each serial and UDP port, or the reason why it was not scanned."""
 
     serial: dict[str, Heard | str]
     udp: dict[int, HeardUdp | str]
@@ -91,7 +91,7 @@ class Survey:
         ]
 
     def devices(self, kind: Kind) -> list[tuple[str, str, Line]]:
-        """List port, protocol and line of the devices that are mainly bought as this kind."""
+        """List port, protocol and line setting of the devices whose main use is this kind."""
         return [
             (port, heard.candidate.protocol, heard.line)
             for port, heard in self.serial.items()
@@ -100,7 +100,7 @@ class Survey:
         ]
 
     def silent(self, port: str) -> bool:
-        """Return whether nobody of use is at a serial port; False for one that another program holds."""
+        """Return whether a serial port is absent or was scanned; False if it could not be opened."""
         if port.startswith("/") and not os.path.exists(port):
             return True
         heard = [found for name, found in self.serial.items() if same_port(name, port)]
@@ -118,7 +118,7 @@ def same_port(one: str, other: str) -> bool:
 
 
 def same_url(one: str, other: str) -> bool:
-    """Return whether two MAVLink urls lead to the same place; of a UDP port only the number counts."""
+    """Return whether two MAVLink urls lead to the same endpoint; for udpin only the port number counts."""
     (kind, where, number), theirs = parse_url(one), parse_url(other)
     if kind == "udpin":
         return theirs[::2] == (kind, number)

@@ -1,8 +1,8 @@
-"""Changes of an autopilot: kept before the first write, so that they can be restored after any interruption.
+"""Journal of parameter writes: saved before the first write, so that old values can be restored after an interruption.
 
-`journal.json` exists only while a write is under way (found at start, it means that the daemon died in the middle);
-`undo-N.json` holds the values before the last finished writes on the vehicle with system id N. Their values are written
-to an autopilot: only parameters that the companion writes are accepted, within their ranges.
+`journal.json` exists only during a write (if it exists at start, the daemon ended in the middle of one).
+`undo-N.json` holds the values before the last finished writes on the vehicle with system id N. A restore writes these
+values to an autopilot, so only parameters that the companion writes are accepted, within their ranges.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from companion.storage.state import BoundedList, StateFile, numbers_in, remove_d
 
 _UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
-MOST_STEPS: Final = 10  # writes that can be undone one after the other; the oldest one makes room
+MOST_STEPS: Final = 10  # writes that can be undone one after the other; further ones replace the oldest
 AUTOMATIC: Final = "auto calibration"
 BY_TEMPERATURE: Final = "temperature"
 PREDICTION: Final = "gyro prediction"
-"""Gyro offsets that versions before 0.2 predicted and wrote: still in their files, and still undone."""
+"""Name of gyro offsets that versions before 0.2 predicted and wrote; their files can still be read and undone."""
 BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
-"""Writes without the record of a calibration."""
+"""Kinds of writes that have no calibration record."""
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One parameter: its old value, its new one, and the far value between them (`Change.via`), if any.
+    """One parameter: its old value, its new value, and the far value between them (`Change.via`), if any.
 
-    `after` is None while the firmware's own gyro calibration, started by us, sets it: any value is ours then. `also`
-    are values that our writes may leave there while several are set one after the other.
+    `after` is None while the firmware's own gyro calibration, started by us, sets the parameter: any value is then
+    ours. `also` lists further values of ours that an interrupted sequence of writes may leave.
     """
 
     parameter: str
@@ -50,15 +50,15 @@ Moment = Annotated[str, msgspec.Meta(pattern=r"^[-+:.0-9T]{0,40}\Z")]
 
 
 class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Kind of a write ("calibration", "auto calibration", or one of `BY_HAND`) and its begin; empty: not kept.
+    """Kind and start time of a write; empty: unknown.
 
     Times are UTC, ISO 8601, by the host's clock; `at` of a calibration is `started_at` of its record.
     """
 
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
-    """Name: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
+    """Kind: "calibration", "auto calibration", or one of `BY_HAND`; empty: unknown."""
     at: Moment = ""
-    since: Moment = ""  # begin of the first of several writes in one step; empty: it is the only one
+    since: Moment = ""  # start of the first of several writes in one step; empty: a single write
 
     @property
     def first(self) -> str:
@@ -82,7 +82,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ) -> ChangeSet:
         """Make the set before the first change; `unforeseen`: old values that the firmware will overwrite.
 
-        Changes of an unknown vehicle cannot be kept.
+        A set for an unknown vehicle (system id 0) cannot be saved.
         """
         found = [Changed(change.parameter, change.before, change.after, change.via) for change in changes]
         found += [Changed(name, before, None) for name, before in (unforeseen or {}).items()]
@@ -97,7 +97,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names}
 
     def after(self, older: ChangeSet) -> ChangeSet:
-        """Join this write and the one before it to one step, which goes back to the values before both."""
+        """Join this write and the `older` one to one step; its undo restores the values before both."""
         were = {changed.parameter: changed for changed in older.changes}
         joined = [_joined(were.pop(changed.parameter, None), changed) for changed in self.changes]
         origin = self.origin
@@ -106,7 +106,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return ChangeSet(self.system_id, (*were.values(), *joined), origin)
 
     def without(self, latest: ChangeSet) -> ChangeSet:
-        """Return the rest of a step after the restore of its latest write, or of all of it."""
+        """Return the changes of this step that remain after the restore of `latest`; none after a full restore."""
         back = {changed.parameter: changed.before for changed in latest.changes}
         left = [
             msgspec.structs.replace(changed, after=back.get(changed.parameter, changed.after))
@@ -117,12 +117,12 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _joined(older: Changed | None, newer: Changed) -> Changed:
-    """Join two changes of one parameter, unless somebody else has set another value between them."""
+    """Join two changes of one parameter; keep only the newer one if another value was set between them."""
     if older is None or older.after != newer.before:
         return newer
     via = newer.via
     if via is not None and newer.after is not None and older.via is not None:
-        # The farther one is as far from all values as the firmware wants it.
+        # The farther of the two has the distance from all values that the firmware needs.
         via = (max if via > newer.after else min)(via, older.via)
     return msgspec.structs.replace(newer, before=older.before, via=via)
 
@@ -132,22 +132,22 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
     system_id: int
     steps: tuple[ChangeSet, ...] = ()
-    changes: tuple[Changed, ...] = ()  # step of versions that kept a single one
+    changes: tuple[Changed, ...] = ()  # the only step, in files of versions that kept one
 
     @property
     def all(self) -> tuple[ChangeSet, ...]:
-        """Return the steps, of files of earlier versions too."""
+        """Return all steps, including the single step of earlier versions' files."""
         return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
 
     def and_then(self, latest: ChangeSet) -> Undoable:
-        """Add a write; automatic calibrations in a row are one step."""
+        """Return the steps with a write added; automatic calibrations in a row form one step."""
         steps = self.all
         while steps and latest.origin.what == steps[0].origin.what == AUTOMATIC:
             latest, steps = latest.after(steps[0]), steps[1:]
         return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
 
     def without(self, latest: ChangeSet) -> Undoable:
-        """Remove a write that was restored, or its whole step; nothing where it is not the latest."""
+        """Return the steps without a restored write or step; unchanged if it does not belong to the latest step."""
         steps = self.all
         if not steps or not (latest == steps[0] or (latest.origin.at and latest.origin.at == steps[0].origin.at)):
             return self
@@ -156,7 +156,7 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 class ChangeLog:
-    """The change files of one storage folder."""
+    """Journal and undo files of one storage folder."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
@@ -175,10 +175,10 @@ class ChangeLog:
         try:
             return [self.undo_of(number) for number in numbers_in(self._directory, _UNDO)]
         except StorageError:
-            return []  # `check_writable` has said so
+            return []  # `check_writable` has reported the error
 
     def check_writable(self) -> None:
-        """Raise StorageError now, not at the first write, where nothing can be kept here."""
+        """Raise StorageError if no file can be written here: at start, not at the first write."""
         write_atomically(self._probe, b"")
         remove_durably(self._probe)
 
@@ -196,14 +196,14 @@ class ChangeLog:
                     raise msgspec.ValidationError(f"found {name} = {value:.9g}; allowed: {self._allowed[name]}")
 
 
-KEEP_INTERRUPTIONS: Final = 50  # years of interruptions
+KEEP_INTERRUPTIONS: Final = 50  # enough for years
 
 
 class Interruption(msgspec.Struct, frozen=True, kw_only=True):
     """One interrupted write."""
 
-    what: str  # Kind of write, as `Origin.what`
-    began_at: str  # begin of the calibration or alignment that wrote, UTC, ISO 8601; empty: not kept
+    what: str  # Kind of write (see `Origin.what`)
+    began_at: str  # start of the calibration or alignment that wrote, UTC, ISO 8601; empty: unknown
     ended_at: str | None  # end of the restore, UTC, ISO 8601; None: pending
     system_id: int
     parameters: tuple[str, ...]

@@ -1,7 +1,7 @@
-"""Items for the fleet of each aircraft: numbered, kept until confirmed, and for as long as there is room.
+"""Store of numbered items for the fleet, by aircraft; for lack of room, old confirmed items are dropped first.
 
-One SQLite file (`fleet.sqlite` in the storage directory): items and the marks of what they were made of come and go
-together, so that nothing is lost or taken twice, whatever a power cut leaves. Every call blocks.
+One SQLite file (`fleet.sqlite` in the storage directory) holds the items and the read positions ("marks") of their
+sources. Both change in one transaction, so that a power cut neither loses nor repeats an item. Every call blocks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from companion.storage.state import file_error, set_aside
 FILE: Final = "fleet.sqlite"
 FORMAT_VERSION: Final = 1
 MOST_BYTES: Final = 16 * 1024 * 1024  # most bytes of all items; some 2500 calibrations
-MAKE_ROOM: Final = 1 / 16  # share that is dropped at once when it is full, so that a loss is reported rarely
+MAKE_ROOM: Final = 1 / 16  # share that is dropped at once when the file is full, so that losses are reported rarely
 CACHE_KIB: Final = 128
 LOG_PAGES: Final = 64
 
@@ -30,7 +30,7 @@ Range = tuple[int, int]  # first and last sequence, both included
 
 
 class Item(NamedTuple):
-    """Item for the fleet."""
+    """One item for the fleet: an event or a result, as JSON."""
 
     kind: str
     at: str  # time of the event: UTC, ISO 8601
@@ -39,26 +39,26 @@ class Item(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """State up to which a source has been read."""
+    """Position up to which a source has been read."""
 
     stamp: str  # stamp of the source's file, to notice a change quickly
     value: str
 
 
 class SourceItems(NamedTuple):
-    """Items, and the marks of their sources."""
+    """Items of one read, and the new marks of their sources."""
 
     marks: dict[str, Mark]
     items: Sequence[Item] = ()
 
 
 class Kept(NamedTuple):
-    """Items of one aircraft."""
+    """Range and status of the items kept for one aircraft."""
 
     aircraft: str
     epoch: str
-    first: int  # first sequence that is kept; `last` + 1: none is
-    last: int  # last sequence that was given; 0: none yet
+    first: int  # first kept sequence; `last` + 1: none
+    last: int  # last assigned sequence; 0: none
     waiting: int
     confirmed_at: str | None
 
@@ -74,7 +74,7 @@ class Waiting(NamedTuple):
 
 
 class FleetItems:
-    """The file. A method that raises StorageError has changed nothing."""
+    """Database of the items. A method that raises StorageError has changed nothing."""
 
     def __init__(self, directory: Path, *, most_bytes: int = MOST_BYTES) -> None:
         self.path = directory / FILE
@@ -94,7 +94,7 @@ class FleetItems:
                 connection.close()
 
     def add(self, aircraft: str, entries: Iterable[SourceItems], now: str) -> None:
-        """Number and keep the items, and keep the marks; where older items are dropped for room, an event says so."""
+        """Number and save the items, and save the marks. If older items are dropped for room, add an event."""
         with self._transaction() as db:
             for entry in entries:
                 for item in entry.items:
@@ -130,7 +130,7 @@ class FleetItems:
             return [Waiting(number, of, epoch, sequence, Item(*told)) for number, of, epoch, sequence, *told in found]
 
     def confirm(self, aircraft: str, epoch: str, ranges: Iterable[Range], now: str | None) -> bool:
-        """Mark items as confirmed, or as lacking in the fleet (`now`: None); False: it means another epoch."""
+        """Mark items as confirmed, or as missing in the fleet (`now`: None); return False for another epoch."""
         with self._transaction() as db:
             if db.execute("SELECT 1 FROM aircraft WHERE (id, epoch) = (?, ?)", (aircraft, epoch)).fetchone() is None:
                 return False
@@ -147,7 +147,7 @@ class FleetItems:
         if held <= self._most_bytes:
             return
         lost: dict[str, list[Range]] = {}
-        # Events are few, and what says that something was lost must not be lost.
+        # Never drop events: they are few, and a report of lost items must not be lost.
         oldest = db.execute(
             "SELECT number, aircraft, sequence, bytes, confirmed FROM item WHERE kind != 'event'"
             " ORDER BY confirmed DESC, number"
@@ -201,7 +201,7 @@ class FleetItems:
         os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600))
         db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=1.0)
         try:
-            # Ours alone, so that its log needs no shared memory; whole after a power cut, and small in memory.
+            # Exclusive, so the log needs no shared memory; intact after a power cut; small in memory.
             db.execute("PRAGMA locking_mode = EXCLUSIVE")
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = FULL")
@@ -232,7 +232,7 @@ class FleetItems:
         return db
 
     def _begin_anew(self) -> str:
-        """Set a damaged file aside; its log would spoil the next one."""
+        """Set a damaged file aside; delete its log, which would damage the next file."""
         words = set_aside(self.path)
         for end in ("-wal", "-shm", "-journal"):
             with contextlib.suppress(OSError):

@@ -1,6 +1,6 @@
 """Noise profiles learned from recordings: `profiles/NAME.json` in the storage directory.
 
-Functions raise StorageError, in one line, for what cannot be read or written.
+Functions raise StorageError, in one line, if a file cannot be read or written.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _FILE: Final = re.compile(rf"({_NAME.pattern})\.json")
 
 
 class ProfileSource(msgspec.Struct, frozen=True, kw_only=True):
-    """One recording that a profile was learned from."""
+    """One recording from which a profile was learned."""
 
     file: str
-    began_at: str | None  # UTC, where the recording tells it
+    began_at: str | None  # UTC; None: not in the recording
     still_s: float
     temperature_degc: tuple[float, float] | None  # lowest and highest
 
 
 class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
-    """The file."""
+    """Content of a profile's file."""
 
     format_version: int
     name: str
@@ -47,12 +47,12 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     imu: str
     gyro: AllanModel
     accel: AllanModel
-    kept_from: str  # the profile whose figures stand for those in `kept`
-    kept: tuple[str, ...]  # figures that the recordings were too short to tell
+    kept_from: str  # profile that supplied the figures in `kept`
+    kept: tuple[str, ...]  # figures that could not be estimated: the recordings were too short
     sources: tuple[ProfileSource, ...]
     notes: tuple[str, ...] = ()
     warm_up: tuple[float, float] | None = None
-    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; null: not known."""
+    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; null: unknown."""
 
     @property
     def profile(self) -> NoiseProfile:
@@ -63,7 +63,7 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check_name(name: str) -> None:
-    """Raise StorageError where a profile may not be saved under this name: the catalogue's, or no name for a file."""
+    """Raise StorageError for a name of the catalogue and for one that is not allowed as a file name."""
     if _plain(name) in CATALOGUE or not _NAME.fullmatch(name):
         raise StorageError(message("profile_name_not_allowed", name=repr(name)))
 
@@ -94,17 +94,17 @@ class ProfileStore:
         return found
 
     def write(self, profile: SavedProfile) -> Path:
-        """Save a profile, in the place of one of that name; return its file. Raises StorageError."""
+        """Save a profile, replacing one of the same name; return its file. Raises StorageError."""
         check_name(profile.name)
         path = self.path(profile.name)
-        # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.
+        # Readable for all: a profile is not secret, and any user of the folder may run `check` with it.
         data = sealed(msgspec.json.format(msgspec.json.encode(profile), indent=2))
         write_atomically(path, data, mode=0o644)
         return path
 
 
 def read_profile(path: Path) -> SavedProfile:
-    """Read a profile from any file; raises for a damaged one, and for one of a newer version."""
+    """Read a profile from any file; raise StorageError for a damaged file or a newer version."""
     try:
         found: SavedProfile = formats.decode(unsealed(read_regular(path)), SavedProfile, FORMAT_VERSION)
         for model in (found.gyro, found.accel):
@@ -121,8 +121,8 @@ def read_profile(path: Path) -> SavedProfile:
 def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> NoiseProfile:
     """Read one profile for the configuration.
 
-    `forgiving`: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
-    Raises ConfigError where there is none of that name, StorageError where it cannot be read.
+    `forgiving`, for the daemon: replace an unusable profile by the figures of the worst common parts, with a warning.
+    Raises ConfigError if there is no such profile, StorageError if it cannot be read.
     """
     store = ProfileStore(directory)
     try:
@@ -139,9 +139,9 @@ def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> N
 
 
 def given_profile(wanted: str, directory: Callable[[], Path]) -> str | NoiseProfile:
-    """Find a part of the catalogue, a saved profile, or the file of one (a slash in it, or .json).
+    """Find a part of the catalogue, a saved profile, or a profile's file (with a slash or .json).
 
-    Calls `directory` only where it matters. Raises ConfigError where there is none, StorageError for a damaged file.
+    Calls `directory` only for a saved profile. Raises ConfigError if there is none, StorageError for a damaged file.
     """
     if (plain := _plain(wanted)) in CATALOGUE:
         return plain

@@ -1,6 +1,6 @@
-"""Files of results: records of calibrations and flights, and what later calibrations learn from.
+"""Files of results: records of calibrations and flights, and the data from which later calibrations learn.
 
-Numbered files in `records` and `flights`; alignments, armings, biases of each IMU, the time in our signatures.
+Numbered files are in `records` and `flights`; other files hold alignments, armings, biases by IMU, signature time.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ T = TypeVar("T")
 class NumberedFiles(Generic[T]):
     """Files `000001.json`, ... in a folder, numbered because the wall clock may be wrong in the field.
 
-    Methods raise StorageError; nothing is half written.
+    Methods raise StorageError; no file is left half written.
     """
 
     name: ClassVar[str]  # Name of the folder
     kind: ClassVar[Any]
     newest_format: ClassVar[int]
-    keep: ClassVar[int]  # most files; the oldest make room
+    keep: ClassVar[int]  # most files; new ones replace the oldest
     mode: ClassVar[int] = 0o600
 
     def __init__(self, directory: Path) -> None:
         self.folder = directory / self.name
 
     def numbers(self) -> list[int]:
-        """List all numbers, ascending, of unreadable files too; raises StorageError."""
+        """List the numbers of all files, ascending, unreadable ones included; raises StorageError."""
         return numbers_in(self.folder, _NAME)
 
     def file(self, number: int) -> StateFile[T]:
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
-        """Add a file; return its number. Raises StorageError; nothing is half written."""
+        """Add a file; return its number. Raises StorageError; no file is left half written."""
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 1
         self.file(number).write(value)
@@ -86,7 +86,7 @@ class RecordStore(NumberedFiles[Record]):
         return list(self.newest(limit).values())
 
     def mark_undone(self, step: ChangeSet, undone_at: str) -> list[str]:
-        """Note in the records of a step that it was undone; return their `started_at`."""
+        """Mark the records of an undone step; return their `started_at`."""
         found: dict[int, Record] = {}
         for number, each in self.latest():
             if each.undone_at or each.state != "done" or each.system_id != step.system_id:
@@ -97,7 +97,7 @@ class RecordStore(NumberedFiles[Record]):
             if each.started_at == step.origin.first:
                 break
             if not step.origin.first:
-                # Of a version that did not keep whose the step was.
+                # An earlier version wrote this step, without its origin.
                 if any(written.get(changed.parameter) == changed.after for changed in step.changes):
                     break
                 return []
@@ -112,10 +112,10 @@ class FlightStore(NumberedFiles[KeptFlight]):
     """Flights read from logs: some 10 kB for each IMU."""
 
     name, kind, newest_format, keep = "flights", KeptFlight, flight_record.FORMAT_VERSION, 100
-    mode = 0o644  # root reads the logs; the service, with an account of its own, reads the flights
+    mode = 0o644  # root reads the logs and writes flights; the service, under its own account, reads them
 
     def save(self, value: KeptFlight) -> int:
-        """Add a flight, or replace the same flight of an earlier reading; return its number."""
+        """Add a flight, or replace it if its log was read before; return its number."""
         for number, one in self.latest():
             if one.flight.key == value.flight.key:
                 self.file(number).write(value)
@@ -162,7 +162,7 @@ KEEP_IMUS: Final = 8
 
 
 class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
-    """Identity and points of one IMU, oldest first."""
+    """Identity and bias history of one IMU."""
 
     identity: dict[str, str]
     points: tuple[history.Point, ...] = ()  # oldest first
@@ -174,7 +174,7 @@ class _File(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BiasStore:
-    """`biases.json` in the storage directory."""
+    """Bias histories of all IMUs: `biases.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
         self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=BIASES_VERSION)
@@ -200,16 +200,16 @@ _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 class SigningTime(msgspec.Struct, frozen=True):
-    """Latest time in our signatures. Ticks are 10 us since 2015."""
+    """Latest time used in our signatures. Ticks are 10 us since 2015."""
 
     ticks: int
     reserved: int  # largest tick that may have been used before the next write
     uptime_s: float  # Uptime of the board at the write
-    boot_id: str  # boot of the board; empty: unknown
+    boot_id: str  # id of the board's boot; empty: unknown
 
 
 def this_boot() -> str:
-    # The service's unit hides the file, and hands the id over instead.
+    # The service's unit hides the file and passes the id in the environment instead.
     handed = os.environ.get("COMPANION_BOOT_ID", "")
     if handed:
         return handed.replace("-", "")

@@ -1,8 +1,8 @@
-"""Files of state: there whole or not at all, with a checksum, read with suspicion, set aside where they are unusable.
+"""State files: written atomically, with a checksum, validated when read, and set aside if they are unusable.
 
-No content of such a file may end or hold up the daemon, or be half believed. What lies in its place and is no regular
-file (a FIFO, a device, a folder) is not even opened. The checksum is the last key of the JSON object, the SHA-256 of
-the bytes before it; a file from before there were checksums is believed as far as its content goes.
+No content of a state file may end or block the daemon, or be accepted in part. A FIFO, a device or a folder in its
+place is not even opened. The checksum is the last key of the JSON object: the SHA-256 of the bytes before it. A file of
+a version without checksums is accepted if its content is valid.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from companion.messages import message
 
 
 def file_error(path: Path, done: str, reason: OSError | Exception | str) -> StorageError:
-    """Make the one-line error of a file or folder that cannot be `done` (read, written, used ...)."""
+    """Make the one-line error for a file or folder that cannot be `done` ("read", "written", "used", ...)."""
     words = getattr(reason, "strerror", None) or reason
     return StorageError(message("file_not_usable", path=path, done=done, reason=words))
 
@@ -36,8 +36,8 @@ def file_error(path: Path, done: str, reason: OSError | Exception | str) -> Stor
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o600, parents: bool = False) -> None:
     """Replace a file's content so that a power cut at any byte leaves the old or the new content.
 
-    Temporary file in the same folder, fsync, rename, fsync of the folder. The folder is created if its parent exists:
-    a typing error in a path must not create a tree. `parents` creates the whole path. Raises StorageError in one line.
+    Steps: temporary file in the same folder, fsync, rename, fsync of the folder. The folder is created only if its
+    parent exists, so that a typo in a path creates no tree. `parents` creates the whole path. Raises StorageError.
     """
     try:
         path.parent.mkdir(parents=parents, exist_ok=True)
@@ -69,7 +69,7 @@ def remove_durably(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have what was made, renamed or removed in it on the disk; raises OSError."""
+    """Flush created, renamed and removed entries of a folder to the disk; raises OSError."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -80,13 +80,13 @@ def sync_folder(folder: Path) -> None:
 logger = logging.getLogger(__name__)
 
 MOST_BYTES: Final = 2_000_000
-"""The most bytes of a state file; the largest of ours, with the earlier biases of eight IMUs, has 1.7 MB at most."""
+"""Largest accepted state file. The largest written one, with the bias history of eight IMUs, has 1.7 MB at most."""
 
 ASIDE: Final = ".unusable"
-MOST_ASIDE: Final = 3  # The most set-aside files of each name; the last one makes room
+MOST_ASIDE: Final = 3  # Most set-aside files of each name; further ones replace the last
 
 UNREADABLE: Final = (ValueError, RecursionError, OverflowError, msgspec.MsgspecError)
-"""Errors of reading any bytes as JSON of a type."""
+"""Exceptions that may be raised when arbitrary bytes are decoded as JSON of a type."""
 
 _SEAL: Final = re.compile(rb',\s*"sha256":\s*"([0-9a-f]{64})"\s*\}\s*\Z')
 _SEAL_BYTES: Final = 120
@@ -95,8 +95,8 @@ T = TypeVar("T")
 
 
 def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read a regular file, or a link to one, without ever waiting; raises OSError, also for a longer file."""
-    # Looked at before it is opened: a device may do something when it is.
+    """Read a regular file, or a link to one, without blocking; raises OSError, also for a file above `most_bytes`."""
+    # Check before opening: opening a device may have an effect.
     _require_regular(path.stat())
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY), "rb") as file:
         _require_regular(os.fstat(file.fileno()))
@@ -107,7 +107,7 @@ def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
-    """Return the first group of such file names, sorted; empty where there is no folder; raises StorageError."""
+    """Return the first group of the file names that match, sorted; empty without a folder; raises StorageError."""
     try:
         names = [entry.name for entry in folder.iterdir()]
     except FileNotFoundError:
@@ -118,7 +118,7 @@ def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
 
 
 def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
-    """Return the numbers in such names, ascending; raises as `named_in`."""
+    """Return the numbers in the file names that match, ascending; raises StorageError."""
     return sorted(map(int, named_in(folder, kind)))
 
 
@@ -134,7 +134,7 @@ def sealed(data: bytes) -> bytes:
 
 
 def unsealed(data: bytes) -> bytes:
-    """Return the JSON without its checksum, if it has one; raises msgspec.ValidationError where that does not fit."""
+    """Return the JSON without its checksum, if it has one; raise msgspec.ValidationError for a wrong checksum."""
     seal = _SEAL.search(data, max(0, len(data) - _SEAL_BYTES))
     if seal is None:
         return data
@@ -145,7 +145,7 @@ def unsealed(data: bytes) -> bytes:
 
 
 class StateFile(Generic[T]):
-    """One state file; `check` raises msgspec.ValidationError for content that cannot be, read or to be written."""
+    """One state file; `check` raises msgspec.ValidationError for impossible content, on reading and on writing."""
 
     def __init__(
         self,
@@ -157,10 +157,10 @@ class StateFile(Generic[T]):
     ) -> None:
         self.path, self._mode = path, mode
         self._kind, self._check, self._newest = kind, check, newest
-        self.unusable: str | None = None  # error of the last `load`, in one line; None: there was none
+        self.unusable: str | None = None  # one-line error of the last `load`; None: no error
 
     def read(self) -> T | None:
-        """Read the file; None: there is none. Raises StorageError in one line."""
+        """Read the file; return None if there is none. Raises StorageError in one line."""
         try:
             return self._of(read_regular(self.path))
         except (FileNotFoundError, NotADirectoryError):
@@ -178,7 +178,7 @@ class StateFile(Generic[T]):
         return found
 
     def load(self) -> T | None:
-        """Read the file for the daemon: an unusable one is set aside, logged, and counts as none."""
+        """Read the file for the daemon: an unusable file is set aside and logged, and None is returned."""
         self.unusable = None
         try:
             return self.read()
@@ -188,10 +188,10 @@ class StateFile(Generic[T]):
             return None
 
     def write(self, value: T) -> None:
-        """Replace the content; a StorageError leaves the old one."""
+        """Replace the content; after a StorageError the old content remains."""
         try:
             data = sealed(msgspec.json.encode(value))
-            # What could not be read again would cost what was there before, too.
+            # Never replace a readable file by an unreadable one.
             self._of(data)
         except UNREADABLE as error:
             raise StorageError(f"{error} ({self.path.name})") from error
@@ -203,7 +203,7 @@ class StateFile(Generic[T]):
 
 
 def set_aside(path: Path) -> str:
-    """Rename an unusable file, so that it is neither read again nor lost; return the result in words."""
+    """Rename an unusable file, so that it is neither read again nor lost; return the result as text."""
     names = [f"{path.name}{ASIDE}", *(f"{path.name}{ASIDE}-{number}" for number in range(2, MOST_ASIDE + 1))]
     name = next((name for name in names if not os.path.lexists(path.with_name(name))), names[-1])
     with contextlib.suppress(OSError):
@@ -220,7 +220,7 @@ class BoundedList(Generic[T]):
     """List of the latest `keep` entries in a file, oldest first. Methods but `read` raise StorageError."""
 
     def __init__(self, path: Path, kind: type[T], keep: int) -> None:
-        # Before there were checksums, the list was all there was.
+        # Files of versions without checksums hold only the list.
         self._file: StateFile[_Entries[T] | list[T]] = StateFile(path, _Entries[kind] | list[kind])  # type: ignore[valid-type]
         self._keep = keep
 
@@ -247,17 +247,17 @@ def _listed(found: _Entries[T] | list[T] | None) -> list[T]:
 
 @contextlib.contextmanager
 def only_daemon(directory: Path) -> Iterator[None]:
-    """Hold a storage directory for this process; the kernel releases it however the process ends.
+    """Lock a storage directory for this process; the kernel unlocks it however the process ends.
 
     Two daemons would read each other's journal as an interrupted write. The directory itself is locked, so that no
-    file has to be there. Where it can be neither made nor locked (a network file system), the daemon goes on without.
-    Raises StorageError where another daemon holds it.
+    lock file is needed. If it cannot be created or locked (network file system), the daemon continues without a lock.
+    Raises StorageError if another daemon has locked it.
     """
     try:
         directory.mkdir(exist_ok=True)
         descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:
-        yield  # the ledger says why nothing can be kept, and nothing is written
+        yield  # the write journal reports why nothing can be saved, and no parameter is written
         return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

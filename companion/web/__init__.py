@@ -1,1 +1,1 @@
-"""The page: the state of the daemon in a browser, and three buttons. Off unless `[web]` names an address."""
+"""Web page with the state of the daemon, and three buttons. Off unless `[web]` names an address."""

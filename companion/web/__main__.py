@@ -1,4 +1,4 @@
-"""Process of the page: `python -m companion.web`, a child of the daemon and a client of its control socket."""
+"""Process of the web page, `python -m companion.web`: a child of the daemon and a client of its control socket."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Final
 from companion.links.system.process import ChildSettings, ChildWork, run_child
 
 MEMORY_MIB: Final = 80
-"""Twice the largest use measured: 22 MiB with a viewer, 39 with 16 deaf viewers and 1000 hostile connections."""
+"""Memory limit, twice the largest use: 22 MiB with a viewer, 39 with 16 stalled viewers and 1000 hostile clients."""
 
 
 def _page(settings: ChildSettings) -> ChildWork:
-    # Imported here: by now the process is nice, so that the daemon's start does not wait for it.
+    # Imported here: the process now has its low priority, so the import does not delay the daemon's start.
     from companion.links.system.connection import ask
     from companion.web.server import Page
 

@@ -1,7 +1,7 @@
-"""Serve a web application at one address with uvicorn: for the page and for the fleet's page.
+"""Server of a web application at one address, on uvicorn: for the web page and for the fleet pages.
 
-A connection carries one request, and ends when it is answered or `ANSWERED_WITHIN_S` are over. Beyond `MAX_CONNECTIONS`
-the oldest connection makes way for the next one. A stream is exempt from both: its application bounds it.
+A connection carries one request, and ends with the answer or after `ANSWERED_WITHIN_S`. Beyond `MAX_CONNECTIONS` the
+oldest connection is closed for the next one. A stream is exempt from both limits: its application bounds it.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ HEADERS: Final = (
 )
 
 ANSWERED_WITHIN_S: Final = 20.0
-"""Request, work and answer together; an action takes 10 s at most."""
+"""Timeout of request, work and answer together; an action takes 10 s at most."""
 MAX_CONNECTIONS: Final = 48
 MAX_HEAD_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 4096
 KERNEL_BYTES: Final = 64 * 1024
 UNHEARD_MS: Final = 10_000
-"""The kernel gives up a client that acknowledges nothing for this long: out of range, or asleep."""
+"""Timeout of the kernel for a client that acknowledges nothing: it is out of range, or asleep."""
 
 
 class Connection(H11Protocol):
-    """Connection of one client; its request's handler finds it in `request.state.connection`."""
+    """Connection of one client; the handler of its request gets it as `request.state.connection`."""
 
     def __init__(self, config: Config, state: ServerState, unanswered: dict[Connection, None]) -> None:
         super().__init__(config, state, {"connection": self})
@@ -93,7 +93,7 @@ async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) 
         lifespan="off",
         interface="asgi3",
         log_config=None,
-        # A client can cause any number of warnings.
+        # Clients could fill the log with warnings.
         log_level="error",
         access_log=False,
         proxy_headers=False,
@@ -104,7 +104,7 @@ async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) 
     config.load()
     state, unanswered = ServerState(), dict[Connection, None]()
     state.default_headers = config.encoded_headers
-    # Not by uvicorn.Server: it takes over the signals, ends the process where an address is in use, and wakes up ten
+    # Not uvicorn.Server: it replaces the signal handlers, ends the process if an address is in use, and wakes up ten
     # times a second.
     loop = asyncio.get_running_loop()
     server = await loop.create_server(lambda: Connection(config, state, unanswered), host, port)
@@ -121,7 +121,7 @@ async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) 
 
 
 def _guarded(app: ASGIApp) -> ASGIApp:
-    """Keep from uvicorn what it would log as a fault and go on with."""
+    """Handle cancellation and lack of memory, which uvicorn would log as faults before it continues."""
 
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
         try:
@@ -129,7 +129,7 @@ def _guarded(app: ASGIApp) -> ASGIApp:
         except asyncio.CancelledError:
             pass  # the server is closing
         except MemoryError as error:
-            # A child process ends itself then (companion.links.system.process).
+            # A child process ends itself on this error (companion.links.system.process).
             asyncio.get_running_loop().call_exception_handler({"message": "out of memory", "exception": error})
 
     return guarded

@@ -1,4 +1,4 @@
-"""The page at its address: its routes, the streams of those who look on, and its status."""
+"""Server of the web page: its routes, the event streams of its viewers, and its status."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ logger = logging.getLogger(__name__)
 
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
 
-WORTH_S: Final = 10.0  # A page that was open for this long is opened again at once
+WORTH_S: Final = 10.0  # Least duration of an open page that resets the backoff
 WRONG_TOKEN_S: Final = 2.0
 MAX_WAITING: Final = 16
-"""The most answers to wrong tokens that are delayed at a time: each holds a connection."""
+"""Most answers to wrong tokens that are delayed at one time: each holds a connection."""
 ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 MAX_VIEWERS: Final = 16
 MAX_STRANGERS: Final = 4
-"""The most viewers of one address without the token; on the board itself all have the same address."""
+"""Most viewers without the token from one address; no limit if only the board itself can connect."""
 MAX_BEHIND: Final = 20
-"""Ten seconds of events: a viewer that has so many to read yet is dropped, and begins anew."""
-AGAIN_S: Final = 0.5  # Pause after which a companion that gave no status is asked again
+"""Most unread events of a viewer, ten seconds of them; a viewer further behind is disconnected, and reconnects."""
+AGAIN_S: Final = 0.5  # Pause before the next request after a failed one for the status
 ACTIONS: Final = asked_by(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
 _STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
@@ -54,9 +54,9 @@ _SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
 
 
 class Page:
-    """Serves the page at HOST:PORT; `run` it as a task of its own.
+    """Server of the page at HOST:PORT; `run` it as a task.
 
-    The token is kept in the storage when others than this board can reach it.
+    If other computers can reach the address, the token is that of the storage folder.
     """
 
     def __init__(self, bind: str, directory: Path, ask: Ask) -> None:
@@ -64,7 +64,7 @@ class Page:
         self._directory, self._ask = directory, ask
         self.local = is_loopback(self._host)
         self.access = Access(new_token(), handed_out=self.local)
-        self.problem: str | None = "not open yet"  # Why nobody can look, in one line; None while the page is there
+        self.problem: str | None = "not open yet"  # Reason why the page is not open, in one line; None: open
         self._html = _assembled()
         self._tag = hashlib.sha256(self._html).hexdigest()[:16]
         self._viewers: dict[Viewer, None] = {}  # The oldest first
@@ -124,13 +124,13 @@ class Page:
     async def _events(self, request: Request) -> Response:
         self._refuse_stranger(request)
         peer, token = _peer(request), request.query_params.get("token", "")
-        # A browser's EventSource sends no header of ours.
+        # A browser's EventSource cannot send our header.
         has_token = self.access.refuses_token({TOKEN_HEADER: token}) is None
         viewer = Viewer(request.state.connection, peer, has_token=has_token)
         if (why := self._no_room_for(viewer)) is not None:
             if token:
                 await self._delay_guess(peer)
-            # As an event: a browser does not show its page the body of an error.
+            # As an event: a browser does not give the body of an error to the page.
             return Response(event({"reason": why}, "refused"), media_type="text/event-stream")
         token_for_page = self.access.token if self.access.handed_out else None
         viewer.send(event({"version": __version__, "page": self._tag, "token": token_for_page}, "hello"))
@@ -177,7 +177,7 @@ class Page:
             reply = await self._result(asked)
         finally:
             with contextlib.suppress(CompanionError):
-                await self._show({"command": "status"})  # which the action has changed
+                await self._show({"command": "status"})  # changed by the action
         return _json({key: value for key, value in reply.items() if key != "kind"})
 
     async def _result(self, asked: Object) -> Object:
@@ -202,9 +202,9 @@ class Page:
             raise HTTPException(403, why)
 
     async def _delay_guess(self, peer: str) -> None:
-        """Delay the answer to a wrong token; beyond some that wait, the others are not to suffer for it."""
+        """Delay the answer to a wrong token, against guessing; beyond `MAX_WAITING` delayed answers, do not delay."""
         if self.access.handed_out:
-            return  # the token of the page before a restart is no guess
+            return  # probably the token of the process before a restart, not a guess
         self._wrong_tokens += 1
         logger.warning("page: wrong token from %s", peer)
         if self._delayed < MAX_WAITING:
@@ -217,7 +217,7 @@ class Page:
     # --- viewers
 
     def _no_room_for(self, viewer: Viewer) -> str | None:
-        """Return why a viewer is refused, in one line; None: there is room. The token makes room."""
+        """Return the reason to refuse a viewer, in one line; None: there is room. For the token, disconnect another."""
         if not viewer.has_token:
             if len(self._viewers) >= MAX_VIEWERS:
                 return f"{MAX_VIEWERS} are looking already; the token makes room: companion web-token, on the board"
@@ -250,14 +250,14 @@ class Page:
                     return
                 if "status" in reply:
                     status = reply["status"]
-                    # The first-run set-up has no vehicle, and no rows.
+                    # The status of the first-run set-up has no vehicle, and so no rows.
                     data = event({**status, "rows": rows(status)} if "vehicle" in status else status)
                     for viewer in tuple(self._viewers):
                         viewer.send(data)
 
 
 class Viewer:
-    """One stream of events."""
+    """One viewer of the page: its connection, and its queue of events."""
 
     def __init__(self, connection: Connection, peer: str, *, has_token: bool) -> None:
         self.connection, self.peer, self.has_token = connection, peer, has_token
@@ -275,7 +275,7 @@ class Viewer:
 
 
 class _OwnNames:
-    """Refuses requests for another name than the board's: what DNS rebinding needs."""
+    """Middleware that refuses requests for other host names than the board's, against DNS rebinding."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
@@ -320,7 +320,7 @@ def event(value: object, name: str | None = None) -> bytes:
 
 
 def _assembled() -> bytes:
-    """Return the page as one document: a phone at the edge of the hotspot has all of it or nothing."""
+    """Return the page as one document, so that a phone at the edge of the hotspot gets all of it or nothing."""
     html = (_PARTS / "page.html").read_bytes()
     html = _STYLE.sub(lambda found: b"<style>\n" + (_PARTS / found[1].decode("ascii")).read_bytes() + b"</style>", html)
     return _SCRIPT.sub(
@@ -329,7 +329,7 @@ def _assembled() -> bytes:
 
 
 def _security_headers(html: bytes) -> tuple[tuple[str, str], ...]:
-    """Return headers that let nothing but the page's own style and script run, and speak to nobody but us."""
+    """Return headers that allow only the page's own style and script, and connections only to this server."""
 
     def hashes(tag: bytes) -> str:
         found = re.findall(b"<" + tag + b">(.*?)</" + tag + b">", html, re.DOTALL)

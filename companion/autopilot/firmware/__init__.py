@@ -1,1 +1,1 @@
-"""Firmwares: one object each for all that is particular to ArduPilot or PX4."""
+"""Firmwares: ArduPilot and PX4, each an object with everything that is specific to it."""

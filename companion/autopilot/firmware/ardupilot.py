@@ -1,15 +1,15 @@
-"""ArduPilot: parameters of IMUs, temperature, level, heading, gate and ports, and what is odd about them.
+"""ArduPilot: parameters of IMUs, temperature, level, heading, gate and ports, and their peculiarities.
 
-R is the board orientation, AHRS_ORIENTATION (autopilots 1.2); AHRS_TRIM turns the reported attitude only, never IMU
-data. A calibration leaves `CALTEMP` alone, for then new = old + residual holds (recipe (a) of autopilots 1.6).
+R is the board orientation, AHRS_ORIENTATION (autopilots 1.2). AHRS_TRIM rotates the reported attitude only, not IMU
+data. A calibration does not change `CALTEMP`, so that new = old + residual holds (recipe (a) of autopilots 1.6).
 
-INS_TCALn_* (AP_InertialSensor_tempcal.cpp, autopilots 10.1) takes this off a reading, in the IMU's axes, with d the
-temperature less 35 degC, both held between TMIN and TMAX:
+INS_TCALn_* (AP_InertialSensor_tempcal.cpp, autopilots 10.1) corrects a reading in the IMU's axes. Here d is the
+temperature minus 35 degC, and both temperatures are limited to TMIN and TMAX:
 
     raw - (P(d) - P(d at CALTEMP)) - offset,    P(d) = (c1 d + c2 d^2 + c3 d^3) 1e-6
 
-so a curve, CALTEMP and the offset belong together. Gyros and accelerometers have coefficients and a CALTEMP each, but
-one ENABLE, TMIN and TMAX.
+So a curve, CALTEMP and the offset belong together. Gyros and accelerometers have their own coefficients and CALTEMP,
+but share ENABLE, TMIN and TMAX.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from companion.rotations import ROTATION_NAMES
 from companion.samples import Vector
 
 INSTANCES: Final = (1, 2, 3, 4, 5)
-"""4 and 5 exist from 4.4 on boards with auxiliary instances; no message carries them, so none can be measured."""
+"""IMU instances; 4 and 5 exist from 4.4 on boards with auxiliary IMUs, and no message carries their samples."""
 
-AT_START: Final = "INS_GYR_CAL"  # 1: every start measures the gyros anew
+AT_START: Final = "INS_GYR_CAL"  # 1: the gyros are calibrated at every start
 
 REFERENCE_DEGC: Final = 35.0
 _TCAL_UNIT: Final = 1e-6
@@ -55,13 +55,13 @@ _TCAL_ON: Final = 1
 _TCAL_LEARNING: Final = 2
 
 TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
-"""Roll and pitch of the board against the aircraft, rad; taken off the attitude, never off IMU data."""
-_TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")  # ArduPilot cuts it off there
-_TCAL_RANGE: Final = Range(-1e6, 1e6)  # millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin
+"""Roll and pitch of the board relative to the aircraft, rad; they correct the attitude, not IMU data."""
+_TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")  # ArduPilot's own limits
+_TCAL_RANGE: Final = Range(-1e6, 1e6)  # millionths of rad/s or m/s^2 per K, K^2 or K^3
 
-_EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0  # EK3_SRCn_YAW; gyros: none, GNSS holds it
+_EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0  # EK3_SRCn_YAW; gyros: no yaw source, GNSS corrects the yaw
 _HEADING_SCRIPT: Final = "CMPG_HEADING"
-_GATE_SCRIPT: Final = "CMPG_ENABLE"  # parameters of the script (companion/lua): they exist while it runs
+_GATE_SCRIPT: Final = "CMPG_ENABLE"  # parameter of the script (companion/lua), which exists while the script runs
 
 _ARDUPILOT_ONLY_DEG: Final = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}  # rotations.h
 _CUSTOM_NAMES: Final = {
@@ -72,10 +72,10 @@ _CUSTOM_NAMES: Final = {
 
 
 class ArduPilotParameters(ImuParameters):
-    """Parameter names of one IMU, counting from 1; the first is irregular, 4 and 5 are again (autopilots 1.1)."""
+    """Parameter names of one IMU, numbered from 1; the patterns of 1, and of 4 and 5, differ (autopilots 1.1)."""
 
     def __init__(self, instance: int) -> None:
-        """Raise AutopilotError where there is no such instance."""
+        """Make the names; raise AutopilotError if there is no such instance."""
         if instance not in INSTANCES:
             reason = f"allowed are {', '.join(map(str, INSTANCES))}"
             raise AutopilotError(message("autopilot_has_no_imu", imu=instance, reason=reason))
@@ -92,14 +92,14 @@ class ArduPilotParameters(ImuParameters):
         )
         self.use = f"{ins}USE{n}"
         self.gyro_caltemp, self.accel_caltemp = caltemp.format("GYR"), caltemp.format("ACC")
-        """Temperature at which nothing is taken off, deg C; -300: unknown, which is held at TMIN."""
+        """Temperature at which the correction is zero, deg C; -300: unknown, which ArduPilot limits to TMIN."""
         self.tcal_enable, self.tcal_low, self.tcal_high = f"{tcal}ENABLE", f"{tcal}TMIN", f"{tcal}TMAX"
-        """ENABLE: 0 off, 1 on, 2 learning until the next boot."""
+        """Names of ENABLE (0 off, 1 on, 2 learning until the next boot), TMIN and TMAX."""
         self.tcal_gyro = [_xyz(f"{tcal}GYR{power}_") for power in (1, 2, 3)]  # Coefficients by power of the temperature
         self.tcal_accel = [_xyz(f"{tcal}ACC{power}_") for power in (1, 2, 3)]
         coefficients = (name for names in (*self.tcal_accel, *self.tcal_gyro) for name in names)
         self.tcal = (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
-        """All names but the CALTEMPs, which the firmware's own calibrations set; the switch comes last."""
+        """All names except the CALTEMPs, which the firmware's own calibrations set; the switch is the last."""
 
 
 def _xyz(stem: str) -> Names:
@@ -109,7 +109,7 @@ def _xyz(stem: str) -> Names:
 def _ranges() -> dict[str, Range]:
     found: dict[str, Range] = {AT_START: SWITCH_RANGE}
     for names in map(ArduPilotParameters, INSTANCES):
-        # The firmware's own gyro calibration, which we start, sets CALTEMP and id: both are restored.
+        # The firmware's own gyro calibration, which we start, sets CALTEMP and id, and an undo restores both.
         found |= {**offset_ranges(names), **dict.fromkeys(names.tcal, _TCAL_RANGE)}
         found |= dict.fromkeys((names.gyro_caltemp, names.accel_caltemp, names.tcal_low, names.tcal_high), DEGC_RANGE)
         found |= {names.tcal_enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE}
@@ -122,10 +122,10 @@ class ArduPilot(Firmware):
     name: FirmwareName = "ardupilot"
     words = "ArduPilot"
     mav_autopilot = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-    heartbeat_rate_hz = 5.0  # a second is a long time not to know of an arming (autopilots 5.1)
+    heartbeat_rate_hz = 5.0  # at 1 Hz an arming would show too late (autopilots 5.1)
     integers_bytewise = False
     settle_s = 1.0  # new offsets show within 60 ms (20 Hz filter); the rest is for slower links
-    write_s = 5.0  # 4 s with its own gyro calibration in between
+    write_s = 5.0  # 4 s, including its own gyro calibration
     ekf_reset_s = 3.0
     imu_messages = {1: (HIGHRES, SCRIPT[1], SCALED), 2: (SCRIPT[2], SCALED2), 3: (SCRIPT[3], SCALED3)}
     gyro_calibration_resets_ekf = True
@@ -137,11 +137,11 @@ class ArduPilot(Firmware):
     )
     parts = {
         (0x2B, 0x2B): "bmi088",
-        # ADIS16470, or the better ADIS16477 with the same driver.
+        # ADIS16470, or the better ADIS16477, which has the same driver.
         (0x31, 0x31): "adis16470",
         (0x34, 0x34): "icm42688p",
     }
-    """AP_InertialSensor_Backend.h, DevTypes."""
+    """Parts by device types, from AP_InertialSensor_Backend.h, DevTypes."""
 
     def compass_ratio(self, message: Any) -> float:
         fit = message.flags & mavlink.EKF_ATTITUDE and not message.flags & mavlink.EKF_UNINITIALIZED
@@ -189,10 +189,10 @@ class ArduPilot(Firmware):
         accel: Polynomial | None,
         degc: float,
     ) -> list[Change]:
-        """Plan curves about 35 degC; the offsets belong to `degc` from then on.
+        """Plan curves with reference 35 degC; from then on the offsets apply at `degc`.
 
-        Without a curve of the accelerometers, one that is in force stays, held at the ends of the new span; one that is
-        not is cleared, for it would come into force with the gyros'.
+        Without a new curve for the accelerometers, an active one stays, limited to the new span. An inactive one is
+        cleared, as ENABLE would activate it together with the gyros'.
         """
         assert gyro.reference_degc == REFERENCE_DEGC
         names, thermal = ArduPilotParameters(calibration.instance), calibration.thermal
@@ -216,7 +216,7 @@ class ArduPilot(Firmware):
         changes = [
             *moved(names.accel_offset, calibration.accel_offset_m_s2, vector(taken_accel)),
             *moved(names.gyro_offset, calibration.gyro_offset_rad_s, vector(taken_gyro)),
-            # The switch comes last, and is restored first.
+            # The switch is written last, and restored first.
             *(Change(name, before[name], wanted[name]) for name in (*caltemps, *names.tcal)),
         ]
         return [change for change in changes if change.before != change.after]
@@ -224,7 +224,7 @@ class ArduPilot(Firmware):
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
     ) -> tuple[list[Change], Matrix]:
-        # The IMUs know nothing of the trim, so the board's whole tilt is the trim.
+        # The trim does not affect IMU data, so the board's whole measured tilt is the new trim.
         old, new = [await parameters.read(name) for name in TRIM], [roll_rad, pitch_rad]
         before, after = (rotation_matrix((x, y, 0.0)) for x, y in np.degrees([old, new]).tolist())
         return list(map(Change, TRIM, old, new)), after @ before.T
@@ -255,7 +255,7 @@ class ArduPilot(Firmware):
         return found.get("EK3_SRC1_YAW") == _EXTNAV
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
-        """Check that EKF3 takes its yaw from its compass: one that waits for ours holds 0 deg and calls that good."""
+        """Check that EKF3's yaw comes from its compass: while it waits for our heading it reports 0 deg as good."""
         return await parameters.read_optional("EK3_SRC1_YAW") in (None, _COMPASS)
 
     # --- arming
@@ -285,7 +285,7 @@ class ArduPilot(Firmware):
 
 
 async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
-    """Read the temperature calibration of one IMU; one that is switched off, or not built in, takes nothing off."""
+    """Read the temperature calibration of one IMU; if switched off, or not built in, its correction is zero."""
     names = ArduPilotParameters(instance)
     enable = await parameters.read_integer(names.tcal_enable)
     if enable is None:
@@ -318,7 +318,7 @@ async def _read_board_rotation(parameters: Parameters) -> Matrix:
     """Read the matrix from the board's axes to the vehicle's FRD.
 
     Raises:
-        AutopilotError: an unknown orientation, or a custom one that is not in force; or as `Parameters.read`.
+        AutopilotError: an unknown orientation, a custom one that is not active, or an error of `Parameters.read`.
     """
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1
@@ -328,7 +328,7 @@ async def _read_board_rotation(parameters: Parameters) -> Matrix:
         return rotation_matrix(_ARDUPILOT_ONLY_DEG[number])
     if number not in _CUSTOM_NAMES:
         raise implausible("AHRS_ORIENTATION", f"{value:g}", "a known orientation")
-    # A custom rotation that is set but switched off is an internal error to ArduPilot: nobody knows what it does.
+    # A custom rotation that is selected but switched off is an internal error of ArduPilot: its effect is unknown.
     if number > 100 and not await parameters.read_optional("CUST_ROT_ENABLE"):
         raise implausible("AHRS_ORIENTATION", f"{number}", "CUST_ROT_ENABLE = 1 with it")
     return rotation_matrix(await parameters.read_vector(_CUSTOM_NAMES[number]))

@@ -1,9 +1,9 @@
-"""Questions that a firmware answers.
+"""Interface of a firmware: everything in which ArduPilot and PX4 differ.
 
 A new firmware is a subclass of `Firmware` in a file of its own, and an entry in `firmwares.FIRMWARES`.
 
-A plain `Firmware` is an autopilot that nobody has heard yet, `OtherFirmware` one that is not known here. Both answer
-every question, with "no" or a reason in words; nothing is measured or written there.
+A plain `Firmware` stands for an autopilot not heard yet, `OtherFirmware` for an unsupported one. Their answers are "no"
+or a reason as text; nothing is measured or written there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from companion.samples import Triad, Vector
 
 
 class Firmware:
-    """One firmware. Whatever reads parameters raises AutopilotError where one cannot be read."""
+    """One firmware. Methods that read parameters raise AutopilotError if one cannot be read."""
 
     name: FirmwareName | None = None
     words = "autopilot"
@@ -33,38 +33,38 @@ class Firmware:
 
     # --- link and telemetry
 
-    heartbeat_rate_hz: float | None = None  # to ask for on our own link; None: the firmware has a fixed one
+    heartbeat_rate_hz: float | None = None  # rate to request on our own link; None: the firmware's is fixed
     late_heartbeat_on_request = False
-    integers_bytewise: bool | None = None  # integers travel as bytes in the float field; None: by AUTOPILOT_VERSION
+    integers_bytewise: bool | None = None  # integers are bytes in the float field; None: see AUTOPILOT_VERSION
     takes_nan_position = False
     imu_messages: Mapping[int, tuple[ImuMessage, ...]] = {}  # by IMU, the best first; new offsets show in the last
-    tells_ekf_bias = False  # HIGHRES_IMU lacks the EKF's bias, and the console prints it
-    estimator_message: type[Message] | None = None  # tells whether the yaw agrees with the magnetometer
+    tells_ekf_bias = False  # HIGHRES_IMU has the EKF's bias subtracted, and the console prints the bias
+    estimator_message: type[Message] | None = None  # shows whether the yaw agrees with the magnetometer
     faster_log = ""
 
     def compass_ratio(self, message: Any) -> float:
-        """Return innovation over gate of the compass, of an `estimator_message`; 0 where nothing is compared."""
+        """Return the compass innovation divided by its gate, from an `estimator_message`; 0: not compared."""
         return 0.0
 
     # --- calibration of an IMU, and its write
 
-    ranges: Mapping[str, Range] = {}  # of every parameter that a calibration or its undo ever writes
+    ranges: Mapping[str, Range] = {}  # allowed values of every parameter that a calibration or its undo writes
     rivals: tuple[Rival, ...] = ()
     parts: Mapping[tuple[int, int], Profile] = {}
-    """Catalogue's names by the device types of gyro and accelerometer; the numbers are each firmware's own."""
+    """Catalogue names by the device types of gyro and accelerometer, which each firmware numbers differently."""
     settle_s = 2.0  # time after a write in which the telemetry may still show the old offsets
     write_s = 5.0
-    gyro_calibration_resets_ekf = False  # its own one; AHRS shows that bias
+    gyro_calibration_resets_ekf = False  # its own gyro calibration resets the EKF's gyro bias, which AHRS shows
     ekf_reset_s = 0.0  # time for the EKF to show that it has settled after that calibration
-    why_no_thermal_write: str | None = None  # None: curves are written into its temperature calibration
-    level_turns_imus = False  # the level turns the IMUs' data, not only the attitude that is reported
+    why_no_thermal_write: str | None = None  # None: curves can be written as its temperature calibration
+    level_turns_imus = False  # the level rotates the IMUs' data, not only the reported attitude
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
-        """Read what the autopilot corrects one of its IMUs (1 to 3) with; see `firmwares.read_calibration`."""
+        """Read the autopilot's corrections of one of its IMUs (1 to 3); see `firmwares.read_calibration`."""
         raise AutopilotError(message("firmware_not_supported", what="calibration"))
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
-        """Return the tilt that the EKF may keep from before these changes until a restart; 0: none owes one."""
+        """Return the tilt that the EKF may keep from before these changes until a restart; 0: no restart needed."""
         return 0.0
 
     async def thermal_changes(
@@ -75,19 +75,19 @@ class Firmware:
         accel: Polynomial | None,
         degc: float,
     ) -> list[Change]:
-        """Plan curves over temperature so that the output at this temperature stays as it is."""
+        """Plan curves over temperature that do not change the output at the temperature `degc`."""
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
     ) -> tuple[list[Change], Matrix]:
-        """Plan the level of a board that sits so; also the turn of up in the vehicle's axes that it makes, (3, 3)."""
+        """Plan the level for a board's tilt; also return the resulting rotation of up, (3, 3), vehicle axes."""
         raise AutopilotError(message("firmware_not_supported", what="level"))
 
     # --- heading from outside; `found`: values of `heading_names`
 
     heading_settings: tuple[HeadingSetting, ...] = ()
-    heading_watched: tuple[str, ...] = ()  # further ones that decide what happens to our heading
+    heading_watched: tuple[str, ...] = ()  # further parameters that affect the use of our heading
     heading_risks: tuple[str, ...] = ()
 
     def heading_net(self, found: Mapping[str, float]) -> Net:
@@ -97,7 +97,7 @@ class Firmware:
         return False
 
     def missing_compass(self, found: Mapping[str, float]) -> str | None:
-        """Return the parameter that leaves it without a compass it needs, or None."""
+        """Return the parameter that disables a compass which the firmware needs, or None."""
         return None
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
@@ -106,12 +106,12 @@ class Firmware:
     # --- arming
 
     gate_parameters: tuple[str, ...] = ()
-    gate_is_script = False  # a script on the flight controller gates; it gets the verdict
+    gate_is_script = False  # the gate is a script on the flight controller, which gets the verdict
 
     async def find_gate_problem(
         self, parameters: Parameters, system_id: int | None, script_starts_s: float
     ) -> str | None:
-        """Return what has to be set so that the autopilot asks before it arms, for people; None: nothing.
+        """Return the settings missing for the gate (the autopilot asks before it arms), as text; None: none.
 
         `script_starts_s`: time to wait for a script that does not run yet.
         """
@@ -120,22 +120,22 @@ class Firmware:
     # --- the port, and ground stations behind it
 
     def port_needs(self, baud: int) -> str | None:
-        """Return the settings that the autopilot's end of a serial line needs; None: not known."""
+        """Return the settings that the autopilot's end of a serial line needs; None: unknown."""
         return None
 
     async def read_closed_links(self, parameters: Parameters) -> list[str]:
         return []
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
-        """Tell whether all is well while no ground station is heard, and the facts with the fix."""
+        """Return whether it is no fault that no ground station is heard, and a text with cause and remedy."""
         return True, message("no_ground_station_heard", why="none connected?")
 
-    # --- follows from the answers above
+    # --- derived from the values above
 
     async def read_rivals(self, parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
-        """Read the rivals that are switched on, and those that were and act until the next boot.
+        """Read the rivals that are switched on, and those switched off that act until the next boot.
 
-        `seen` is kept from one call to the next: the boot, as counted, in which each parameter was last seen on.
+        `seen` is kept between calls: the number of the boot in which each parameter was last seen switched on.
         """
         found: list[Rival] = []
         seen = {} if seen is None else seen
@@ -150,10 +150,10 @@ class Firmware:
         return tuple(found)
 
     def heading_names(self) -> list[str]:
-        """List the parameters that the questions about the heading need.
+        """List the parameters that the checks and plans for the heading need.
 
         Raises:
-            AutopilotError: no autopilot yet, or a firmware that is not known.
+            AutopilotError: no autopilot heard yet, or an unsupported firmware.
         """
         if self.name is None:
             raise AutopilotError(message("no_heartbeat_of_the_autopilot"))
@@ -163,7 +163,7 @@ class Firmware:
         return [*wanted, *self.heading_watched]
 
     def heading_changes(self, found: Mapping[str, float]) -> list[Change]:
-        """Plan the changes that make the firmware use our heading; empty where all is set.
+        """Plan the changes that make the firmware use our heading; empty: everything is set.
 
         Raises:
             AutopilotError: this autopilot lacks a parameter, so it cannot use a heading.
@@ -182,7 +182,7 @@ class Firmware:
 
 
 class OtherFirmware(Firmware):
-    """An autopilot that is neither of those that are known."""
+    """An autopilot with an unsupported firmware."""
 
     name = "other"
 
@@ -191,8 +191,8 @@ class OtherFirmware(Firmware):
 class HeadingSetting:
     """One parameter that the firmware needs to use our heading, and the reason.
 
-    `bits`: those of `value` are to be set, others stay. `like`: another parameter whose value is wanted; `value` where
-    that does not exist.
+    `bits`: set the bits of `value` and leave the others. `like`: another parameter, whose value is wanted; if that does
+    not exist, `value` is wanted.
     """
 
     parameter: str
@@ -208,7 +208,7 @@ class HeadingSetting:
 
 
 Net = Literal["script", "command", "autopilot", "none"]
-"""Switch to another heading when ours ends, by whom; "autopilot": it does so by itself."""
+"""Party that switches to another heading when ours ends; "command": the companion, by a command."""
 
 NETS: Final[dict[Net, str]] = {
     "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
@@ -221,34 +221,34 @@ NO_IMU: Final = 0
 
 
 class SlotMemory:
-    """Facts that writes have shown: the IMU of each device; since a restart, offsets in use and rivals that act."""
+    """Facts learned from writes: the IMU of each device and, since the last restart, offsets in use and rivals."""
 
     def __init__(self) -> None:
         self._instance_of: dict[tuple[Triad, int], int] = {}
-        self.enabled: dict[Triad, int] = {}  # slots in use when a calibration was read last
+        self.enabled: dict[Triad, int] = {}  # number of slots in use at the last reading of a calibration
         self._in_use: dict[Names, tuple[int, Vector]] = {}
         self.rivals: dict[str, int] = {}
 
     def learn(self, sensor: Triad, device_id: int, instance: int) -> None:
-        """Note that the offsets in the slot of this device act on this IMU's telemetry (NO_IMU: on none)."""
+        """Note that the offsets in this device's slot act on this IMU's telemetry (NO_IMU: on none)."""
         for other in [key for key, known in self._instance_of.items() if key[0] == sensor and known == instance]:
             if instance != NO_IMU:
                 del self._instance_of[other]
         self._instance_of[sensor, device_id] = instance
 
     def known(self, sensor: Triad, device_id: int) -> int | None:
-        """Return the IMU that a device was seen to be; NO_IMU: none in the telemetry."""
+        """Return the IMU learned for a device; NO_IMU: none in the telemetry; None: not learned."""
         return self._instance_of.get((sensor, device_id))
 
     def holds_strangers(self, sensor: Triad, imus: int) -> bool:
-        """Check for more slots in use than IMUs: one of them may be of a sensor that is not there."""
+        """Return whether there are more slots in use than IMUs: one may belong to an absent sensor."""
         return self.enabled.get(sensor, 0) > imus
 
     def forget(self) -> None:
         self._instance_of.clear()
 
     def brought_into_use(self, names: Names, vector: Vector, boots: int) -> None:
-        """Note that a vector of offsets was written by a far step, so that the firmware uses it until a restart."""
+        """Note that a vector of offsets was written with a far step, so the firmware uses it until a restart."""
         self._in_use[names] = (boots, vector)
 
     def in_use(self, names: Names, vector: Vector, boots: int) -> bool:

@@ -1,4 +1,4 @@
-"""All firmwares that are known, and questions to them by name."""
+"""All supported firmwares, and functions that select one by name."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ UNHEARD: Final = Firmware()
 OTHER: Final = OtherFirmware()
 
 CALIBRATION: Final[Mapping[str, Mapping[str, Range]]] = {str(one.name): one.ranges for one in FIRMWARES}
-"""Every parameter that the companion ever writes by a calibration or its undo, by firmware; nothing else is kept, or
-believed of a file."""
+"""Every parameter that a calibration or its undo may write, by firmware; no other is saved, or accepted from a
+file."""
 
 
 def firmware_named(name: FirmwareName | None) -> Firmware:
@@ -41,10 +41,10 @@ def firmware_with(mav_autopilot: int) -> Firmware:
 
 
 async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory | None = None) -> ImuCalibration:
-    """Read what the autopilot corrects one of its IMUs (1 to 3) with.
+    """Read the autopilot's corrections of one of its IMUs (1 to 3).
 
     Raises:
-        AutopilotError: no such IMU, a value that cannot be worked with, no answer, or a restart meanwhile.
+        AutopilotError: no such IMU, an implausible value, no answer, or a restart meanwhile.
     """
     boots, firmware, memory = parameters.boots, firmware_named(parameters.firmware), memory or SlotMemory()
     found = await firmware.read_calibration(parameters, instance, memory)
@@ -72,14 +72,14 @@ def outcomes_of(triad: Triad, written: Mapping[str, WrittenParameter]) -> set[Ou
 
 
 def part_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int | None) -> Profile | None:
-    """Return the catalogue's name of the part whose two halves have these device ids; None: it is not known."""
+    """Return the catalogue name of the part with these device ids of gyro and accelerometer; None: unknown."""
     if gyro_id is None or accel_id is None:
         return None
     return firmware_named(firmware).parts.get((_type_in(gyro_id), _type_in(accel_id)))
 
 
 def model_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int | None) -> str | None:
-    """Return the model of an IMU: the catalogue's name, else firmware and types in hex; None: it is not known."""
+    """Return the model of an IMU: the catalogue name, otherwise firmware and types in hex; None: unknown."""
     if not gyro_id or not accel_id or firmware is None:
         return None
     types = f"{_type_in(gyro_id):#04x}-{_type_in(accel_id):#04x}"
@@ -87,4 +87,4 @@ def model_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int |
 
 
 def _type_in(device_id: int) -> int:
-    return device_id >> 16 & 0xFF  # both firmwares: bus and address below, the type in the third byte
+    return device_id >> 16 & 0xFF  # in both firmwares the third byte is the type; bus and address are below

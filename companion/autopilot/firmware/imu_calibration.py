@@ -5,8 +5,8 @@ Per sample a firmware computes, with R its rotation from the IMU's axes to the v
     gyro  = R (raw - gyro_offset)
     accel = R diag(accel_scale) (raw - accel_offset)
 
-so offsets live in the IMU's own axes, before scale and before rotation. A temperature calibration, where one is
-active (`Thermal`), takes its part off `raw` first. Names, R and the use of a value are each firmware's own.
+so offsets are in the IMU's own axes, before scale and rotation. A temperature calibration, if active (`Thermal`),
+corrects `raw` first. Names, R and the use of a value are specific to each firmware.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from companion.samples import Triad, Vector
 class Rival:
     """A parameter that makes the autopilot overwrite our gyro offsets, at any value but 0.
 
-    `at_start`: it acts at a start of the autopilot only. `from_boot`: only a boot reads it, so switching it off stops
-    nothing before the next one. `value`: as read; 0: it is off, and acts until the next boot. `accelerometers`: their
-    offsets as well.
+    `at_start`: acts only at a start of the autopilot. `from_boot`: read only at a boot, so switching it off has no
+    effect before the next one. `value`: as read; 0: switched off, but acts until the next boot. `accelerometers`: also
+    overwrites their offsets.
     """
 
     parameter: str
@@ -62,31 +62,31 @@ def stop(rivals: Sequence[Rival]) -> list[Change]:
 
 
 MAX_GYRO_RESIDUAL_RAD_S: Final = 5.0 * DEG
-"""More than this left in the output is a moving aircraft or a broken sensor, not a bias: ArduPilot itself takes 5
-deg/s between two gyros for a fault ("Gyros inconsistent"), and current MEMS gyros start within 1 deg/s."""
+"""Largest gyro residual that can be a bias; more means a moving aircraft or a broken sensor. ArduPilot regards 5 deg/s
+between two gyros as a fault ("Gyros inconsistent"), and current MEMS gyros start within 1 deg/s."""
 
 MAX_ACCEL_RESIDUAL_M_S2: Final = 1.0
-"""The worst accelerometers still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis). ArduPilot refuses
-to arm at 0.75 m/s^2 between two accelerometers. A wrong mounting or gradienter law soon exceeds the limit."""
+"""Largest accelerometer residual. The worst accelerometers in use are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical
+axis); ArduPilot refuses to arm at 0.75 m/s^2 between two. A wrong mounting or gradienter law soon exceeds the limit."""
 
-MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG  # the loosest zero-rate specification still flown (MPU-6000)
+MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG  # the loosest zero-rate specification of gyros in use (MPU-6000)
 
-MAX_ACCEL_OFFSET_M_S2: Final = 3.5  # ArduPilot's documented range of INS_ACCOFFS, which nothing enforces
+MAX_ACCEL_OFFSET_M_S2: Final = 3.5  # documented range of ArduPilot's INS_ACCOFFS, which ArduPilot does not enforce
 
-ACCEL_SCALE_RANGE: Final = (0.8, 1.2)  # ArduPilot's documented range of INS_ACCSCAL, which nothing enforces
+ACCEL_SCALE_RANGE: Final = (0.8, 1.2)  # documented range of ArduPilot's INS_ACCSCAL, which ArduPilot does not enforce
 
 FAR_GYRO_RAD_S: Final = 0.022
-"""Step of a far value, 1.3 deg/s: more than twice what PX4 ignores, and 22 digits of SCALED_IMU.
+"""Step of a far value, 1.3 deg/s: more than twice the step that PX4 ignores, and 22 digits of SCALED_IMU.
 
 PX4 ignores a vector that differs by no more than 0.01 (rad/s, m/s^2) from the one in use (autopilots 4.2), and may read
-the parameters between any two writes. So the value in use may differ by 0.01 from the stored one, and one axis that
-steps by twice that brings the whole vector into use. It is the axis nearest to the vehicle's vertical: a wrong value
-there turns the heading, but tilts nothing.
+the parameters between any two writes. So the value in use may differ by 0.01 from the stored one, and a step of twice
+that on one axis makes PX4 use the whole vector. The axis is the one nearest to the vehicle's vertical: a wrong value
+there turns the heading, but does not tilt.
 """
-FAR_ACCEL_M_S2: Final = 0.09  # 9 digits of SCALED_IMU: the least that `parameters.verify` can tell from no step
+FAR_ACCEL_M_S2: Final = 0.09  # 9 digits of SCALED_IMU: the least step that `parameters.verify` can detect
 FAR_SCALE: Final = 0.022
 
-NOT_ZERO_M_S2: Final = 1e-6  # in place of three zeros, which mean "not calibrated": ArduPilot would refuse to arm
+NOT_ZERO_M_S2: Final = 1e-6  # replaces one of three zeros, which mean "not calibrated": ArduPilot would not arm
 
 _AXES: Final = "XYZ"
 
@@ -108,21 +108,21 @@ class Range:
         return f"{kind}{self.low:.3g} to {self.high:.3g}{self.unit and f' {self.unit}'}"
 
 
-# Wide enough for whatever an autopilot may have had before, which an undo restores; far too narrow for nonsense.
+# The ranges include any value that an autopilot may have had before, as an undo restores it, but no nonsense.
 _GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
-"""An offset from which a calibration still comes to a plausible one, and a far step beyond it."""
+"""Largest offset that a calibration can still turn into a plausible one, and a far step beyond it."""
 _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
 ACCEL_SCALE: Final = Range(*SCALES)
-DEGC_RANGE: Final = Range(-300.0, 400.0, unit="deg C")  # -300: not known; up to a thermometer in kelvin
+DEGC_RANGE: Final = Range(-300.0, 400.0, unit="deg C")  # -300: unknown; 400 admits a thermometer in kelvin
 DEVICE_ID_RANGE: Final = Range(0.0, 2.0**24, whole=True)
 SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
 
 
 @dataclasses.dataclass(kw_only=True)
 class ImuParameters:
-    """The names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2, an id of 0 is none."""
+    """Names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2; id 0: no device."""
 
     gyro_offset: Names
     accel_offset: Names
@@ -141,15 +141,15 @@ def offset_ranges(names: ImuParameters) -> dict[str, Range]:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Thermal:
-    """Temperature calibration of one IMU: what the firmware takes off its readings, in the IMU's axes."""
+    """Temperature calibration of one IMU: the correction subtracted from its readings, in the IMU's axes."""
 
-    enabled_by: str = ""  # parameter that has switched it on; empty where it takes nothing off
+    enabled_by: str = ""  # parameter that has switched it on; empty: not active
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
     gyro: Polynomial = NOTHING
     accel: Polynomial = NOTHING
 
     def taken_off(self, degc: float | None) -> tuple[Array, Array]:
-        """Return rad/s and m/s^2 at a temperature, (3,) each; zero where none is known."""
+        """Return the corrections of gyro and accelerometer, rad/s and m/s^2, (3,); zero if `degc` is unknown."""
         return (np.zeros(3), np.zeros(3)) if degc is None else (self.gyro.at(degc), self.accel.at(degc))
 
 
@@ -157,7 +157,7 @@ class Thermal:
 class ImuCalibration:
     """Corrections of one IMU in the autopilot, as read."""
 
-    instance: int  # 1 to 3: the IMU on whose telemetry they act
+    instance: int  # 1 to 3: the IMU whose telemetry they affect
     parameters: ImuParameters
     gyro_offset_rad_s: Vector
     accel_offset_m_s2: Vector
@@ -167,9 +167,9 @@ class ImuCalibration:
     orientation: Matrix  # 3x3, the IMU's axes to the vehicle's FRD: R
     thermal: Thermal = Thermal()
     zero_is_uncalibrated: bool = False  # three accelerometer offsets of exactly zero mean "not calibrated"
-    far_axis: int | None = None  # of the far value by which small changes come into use; None: not needed
-    scale_unused_within: float = 0.0  # scales no farther than this from 1 are not in use after a start
-    accel_offset_may_be_unused: bool = False  # the firmware may use others than its parameters hold
+    far_axis: int | None = None  # axis of the far value that makes the firmware use small changes; None: not needed
+    scale_unused_within: float = 0.0  # after a start, the firmware does not use scales within this distance of 1
+    accel_offset_may_be_unused: bool = False  # the firmware may use other offsets than its parameters hold
     rivals: tuple[Rival, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -186,28 +186,28 @@ class ImuCalibration:
         return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
 
     def in_use(self, accel_scale: Vector | None = None) -> Array:
-        """Return the scales that the firmware works with, (3,), given these or those that were read."""
+        """Return the scales that the firmware uses, (3,), if its parameters hold these (default: those read)."""
         scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)
         return np.ones(3) if np.linalg.norm(scale - 1.0) <= self.scale_unused_within else scale
 
     def output(self, gyro_rad_s: Vector, accel_m_s2: Vector, degc: float | None) -> Array:
-        """Return what the firmware makes of a raw reading in vehicle FRD: (6,), rad/s and m/s^2."""
+        """Return the firmware's output for a raw reading, both in vehicle FRD: (6,), rad/s and m/s^2."""
         rotation, (thermal_gyro, thermal_accel) = self.orientation, self.thermal.taken_off(degc)
         gyro = np.asarray(gyro_rad_s) - rotation @ (thermal_gyro + self.gyro_offset_rad_s)
         board = rotation.T @ np.asarray(accel_m_s2) - thermal_accel - self.accel_offset_m_s2
         return np.concatenate((gyro, rotation @ (self.in_use() * board)))
 
     def subtracted(self, degc: float | None) -> Array:
-        """Return the bias that offsets and temperature calibration take off the output, (6,), vehicle FRD.
+        """Return the bias that offsets and temperature calibration remove from the output, (6,), vehicle FRD.
 
-        R (gyro_offset + gyro_thermal), and R diag(accel_scale) (accel_offset + accel_thermal), at this temperature.
+        It is R (gyro_offset + gyro_thermal) and R diag(accel_scale) (accel_offset + accel_thermal) at `degc`.
         """
         rotation, (gyro, accel) = self.orientation, self.thermal.taken_off(degc)
         force = np.asarray(self.accel_scale) * (accel + self.accel_offset_m_s2)
         return np.concatenate((rotation @ (gyro + self.gyro_offset_rad_s), rotation @ force))
 
     def thermal_change(self, triad: Triad, degc: float, then_degc: float) -> Array:
-        """Return how much less one triad's output is at another temperature, (3,), vehicle FRD."""
+        """Return the change of one triad's temperature correction between two temperatures, (3,), vehicle FRD."""
         half = 0 if triad == "gyro" else 1
         change = self.thermal.taken_off(then_degc)[half] - self.thermal.taken_off(degc)[half]
         return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
@@ -226,7 +226,7 @@ class ImuCalibration:
 
 
 def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Vector:
-    """Return the offset that takes a residual (output minus truth, FRD) out: gyro_offset + R^-1 residual, float32."""
+    """Return the offset that removes a residual (output minus truth, FRD): gyro_offset + R^-1 residual, float32."""
     _require_plausible(calibration, "gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S)
     step = calibration.orientation.T @ np.asarray(residual_rad_s)
     after = _vector(np.asarray(calibration.gyro_offset_rad_s) + step)
@@ -248,10 +248,10 @@ def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Ve
 def changes_for(
     calibration: ImuCalibration, gyro_residual_rad_s: Vector | None, accel_residual_m_s2: Vector | None
 ) -> list[Change]:
-    """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None: that triad stays.
+    """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None: keep that triad's.
 
     Raises:
-        CalibrationRefusedError: a value beyond the limits at the top.
+        CalibrationRefusedError: a value beyond the limits at the top of this file.
     """
     names, axis = calibration.parameters, calibration.far_axis
     changes: list[Change] = []
@@ -267,7 +267,7 @@ def changes_for(
 def vector_changes(
     names: Names, before: Vector, after: Vector, far_axis: int | None = None, step: float = 0.0
 ) -> list[Change]:
-    """Plan the changes of one vector; its `far_axis` goes by a value that is `step` above old and new."""
+    """Plan the changes of one vector; `far_axis` gets a far value, `step` above the larger of old and new."""
     vias = [
         max(b, a) + step if axis == far_axis else None for axis, (b, a) in enumerate(zip(before, after, strict=True))
     ]
@@ -275,13 +275,13 @@ def vector_changes(
 
 
 def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: Vector) -> list[Change]:
-    """Plan offsets and scales that take a bias and a scale error out of the output, in the IMU's axes.
+    """Plan offsets and scales that remove a bias and a scale error from the output, in the IMU's axes.
 
-    With output = (1 + scale) truth + bias: offset + bias / accel_scale, and accel_scale / (1 + scale). Where the
-    firmware would start without such scales, they become 1, and the offsets right for a level aircraft.
+    With output = (1 + scale) truth + bias, they are offset + bias / accel_scale, and accel_scale / (1 + scale). If the
+    firmware would not use such scales after a start, they become 1, and the offsets are right for a level aircraft.
 
     Raises:
-        CalibrationRefusedError: a value that is not plausible, see the limits at the top.
+        CalibrationRefusedError: a value beyond the limits at the top of this file.
     """
     names, before = calibration.parameters, calibration.in_use()
     right = before / (1.0 + np.asarray(scale))
@@ -304,9 +304,9 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
 def output_step(
     calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
 ) -> tuple[Vector, Vector]:
-    """Return how far the output must move when the changes are in force: rad/s and m/s^2, vehicle FRD.
+    """Return the step of the output that the changes must cause: rad/s and m/s^2, vehicle FRD.
 
-    `accel_m_s2`: the accelerometers' output before them, which a change of scale stretches.
+    `accel_m_s2`: accelerometer output before the changes, which a change of scale multiplies.
     """
     names = calibration.parameters
     by_name = {change.parameter: change.after - change.before for change in changes}
@@ -323,7 +323,7 @@ def output_step(
 def _require_plausible(calibration: ImuCalibration, what: str, vector: Vector, limit: float) -> None:
     unit, words = (DEG, "deg/s") if "gyro" in what else (1.0, "m/s^2")
     for axis, value in zip(_AXES, vector, strict=True):
-        if not abs(value) <= limit:  # NaN is outside too
+        if not abs(value) <= limit:  # this form also rejects NaN
             raise _implausible(calibration, f"{what} {axis}", f"{value / unit:.3g} {words}", f"{limit / unit:.3g}")
 
 

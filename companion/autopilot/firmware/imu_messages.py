@@ -1,4 +1,4 @@
-"""IMU messages of both autopilots (units, resolution, which IMU: autopilots 2, 4.5), and samples made of them."""
+"""IMU messages of both autopilots, and samples made from them (units, resolution, IMU: autopilots 2, 4.5)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MRAD: Final = 1e-3
 
 
 def all_zero(sample: ImuSample) -> bool:
-    """No accelerometer at rest or in flight reads exactly nothing: it is not there."""
+    """Return whether every reading is zero, as of an absent IMU: no real accelerometer reads exactly zero."""
     return not any(sample.gyro_rad_s) and not any(sample.accel_m_s2)
 
 
@@ -31,10 +31,10 @@ class ImuMessage:
 
     name: str
     message: type[Message]
-    decode: Callable[[Message, float], ImuSample | str]  # the sample in a message, or why there is none
-    integers: bool = False  # values are cut toward zero to thousandths of rad/s and g
-    from_script: bool = False  # ArduPilot's script sends it, while disarmed and asked (`SCRIPT_ASK`)
-    lacks_bias: bool = False  # the bias of the EKF is to be added to it
+    decode: Callable[[Message, float], ImuSample | str]  # returns the sample in a message, or why there is none
+    integers: bool = False  # values are truncated toward zero to thousandths of rad/s and g
+    from_script: bool = False  # ArduPilot's script sends it, while disarmed and requested (`SCRIPT_ASK`)
+    lacks_bias: bool = False  # the EKF's bias is subtracted in it and must be added again
 
     @property
     def gyro_step_rad_s(self) -> float:
@@ -49,7 +49,7 @@ _ACCEL_AND_GYRO: Final = 0b111111  # HIGHRES_IMU.fields_updated: all three axes 
 
 
 def _highres(message: Any, t_s: float) -> ImuSample | str:
-    if message.id != 0:  # the first usable one: not ours when the autopilot does not use its first IMU
+    if message.id != 0:  # the message shows the first IMU in use, which may not be IMU 1
         return f"shows IMU {message.id + 1}"
     if message.fields_updated & _ACCEL_AND_GYRO != _ACCEL_AND_GYRO:
         return "lacks accelerometer or gyro"
@@ -57,7 +57,7 @@ def _highres(message: Any, t_s: float) -> ImuSample | str:
     accel = (message.xacc, message.yacc, message.zacc)
     if not all(map(math.isfinite, (*gyro, *accel))):
         return "carries a value that is not a number"
-    # Its temperature is the barometer's (ArduPilot) or the air's (PX4).
+    # The message's temperature is the barometer's (ArduPilot) or the air's (PX4), so it is not used.
     return ImuSample(t_s, gyro, accel, t_device_s=message.time_usec * 1e-6)
 
 
@@ -66,7 +66,7 @@ def _scaled(message: Any, t_s: float) -> ImuSample:
         t_s,
         (message.xgyro * MRAD, message.ygyro * MRAD, message.zgyro * MRAD),
         (message.xacc * MG, message.yacc * MG, message.zacc * MG),
-        # Zero means that there is none: a sensor at 0 deg C says 0.01 (MAVLink common.xml).
+        # Zero means no temperature: a sensor at 0 deg C reports 0.01 (MAVLink common.xml).
         message.temperature * 0.01 if message.temperature else None,
         t_device_s=message.time_boot_ms * 1e-3,
     )
@@ -77,7 +77,7 @@ SCALED: Final = ImuMessage("SCALED_IMU", mavlink.MAVLink_scaled_imu_message, _sc
 SCALED2: Final = ImuMessage("SCALED_IMU2", mavlink.MAVLink_scaled_imu2_message, _scaled, integers=True)
 SCALED3: Final = ImuMessage("SCALED_IMU3", mavlink.MAVLink_scaled_imu3_message, _scaled, integers=True)
 
-SCRIPT_ASK: Final = b"CMPF\x01"  # payload that asks the script for floats; it sends them for 3 s
+SCRIPT_ASK: Final = b"CMPF\x01"  # payload that requests floats from the script, which sends them for 3 s
 _SCRIPT_NAME: Final = "CMP_IMU"
 _SCRIPT_FLOATS: Final = 7
 
@@ -101,14 +101,14 @@ SCRIPT: Final = {
     )
     for instance in (1, 2, 3)
 }
-"""Means of four readings, calibrated and filtered, about eleven a second."""
+"""Messages of ArduPilot's script: means of four readings, calibrated and filtered, about eleven a second."""
 
 PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias", lacks_bias=True)
-"""HIGHRES_IMU of the IMU that PX4 flies by. PX4 takes EKF2's own estimate of the bias off it, so at rest it tells
-nothing until that is known and added again (`telemetry.px4_console`)."""
+"""HIGHRES_IMU of the IMU that PX4 uses for flight. PX4 subtracts EKF2's estimate of the bias, so at rest the message
+shows no bias until that estimate is read and added again (`telemetry.px4_console`)."""
 
-TEMPERATURE_AGE_S: Final = 5.0  # HIGHRES_IMU has none of the IMU: it comes with the integer messages
-_LATE_S: Final = 0.5  # a device time that goes back by less is a late message; by more, a restart
+TEMPERATURE_AGE_S: Final = 5.0  # HIGHRES_IMU lacks the IMU's temperature, which the integer messages carry
+_LATE_S: Final = 0.5  # a device time that goes back by less means a late message; by more, a restart
 _WALK: Final = np.repeat([2.4e-6, 3e-5], 3)
 """Random walk of the EKF's bias estimate in one second at rest, rad/s and m/s^2: 0.5 deg/h and 3 micro-g (real PX4: 0.2
 to 0.5 deg/h)."""
@@ -117,7 +117,7 @@ Six = tuple[float, float, float, float, float, float]
 
 
 class EkfBiasReading(msgspec.Struct, frozen=True):
-    """Bias that PX4's EKF takes off HIGHRES_IMU, as read at its console."""
+    """Bias that PX4's EKF subtracts in HIGHRES_IMU, as read at its console."""
 
     bias: Six  # gyro in rad/s, accelerometer in m/s^2
     variance: Six
@@ -132,14 +132,14 @@ class EkfBiasReading(msgspec.Struct, frozen=True):
 
 
 class ImuSamples:
-    """Completes the samples of one IMU's messages. Knows no clock: time comes in with the messages."""
+    """Completes the samples of one IMU's messages. It reads no clock: messages carry the time."""
 
     def __init__(self) -> None:
-        self.temperature: tuple[float, float] | None = None  # deg C, and its time; None: none since the restart
+        self.temperature: tuple[float, float] | None = None  # deg C and its time; None: no value since the restart
         self._device_s: dict[str, float] = {}
 
     def accept(self, message: str, sample: ImuSample) -> bool:
-        """Note the sample's temperature; False: the message is repeated or late."""
+        """Note the sample's temperature; return False if the message is repeated or late."""
         device_s = sample.t_device_s or 0.0
         if -_LATE_S < device_s - self._device_s.get(message, -math.inf) <= 0.0:
             return False

@@ -1,15 +1,15 @@
-"""PX4: parameters of IMUs, level, heading, gate and ports, and what PX4 does with a value (autopilots 4).
+"""PX4: parameters of IMUs, level, heading, gate and ports, and PX4's use of their values (autopilots 4).
 
     R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT)    of an internal sensor
     R = R(SENS_BOARD_X/Y/Z_OFF) R(CAL_*_ROT)         of an external one
 
-so the level adjustment, unlike ArduPilot's trim, turns IMU data. Thermal compensation, TC_* (autopilots 10.2), is
-neither read nor written: common boards are built without it. Where it acts, it counts as a part of the sensor.
+so the level adjustment, unlike ArduPilot's trim, rotates IMU data. Thermal compensation, TC_* (autopilots 10.2), is
+neither read nor written: common boards are built without it. If active, it counts as a part of the sensor.
 
-A sensor's offsets stand in the slot that holds its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3 show
-the pairs of gyro and accelerometer in the order in which their drivers started, and no message tells a device id
-(autopilots 4.1, 4.5). PX4 prefers the slot of the same number, so the order of the slots is a good guess; whether it
-was right shows only in the telemetry after a write, and `SlotMemory` keeps that by device id.
+A sensor's offsets are in the slot with its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3 show the pairs
+of gyro and accelerometer in the order in which their drivers started, and no message has a device id (autopilots 4.1,
+4.5). PX4 prefers the slot of the same number, so the order of the slots is a good guess. The telemetry after a write
+shows whether it was right, and `SlotMemory` keeps that by device id.
 """
 
 from __future__ import annotations
@@ -48,25 +48,25 @@ WORDS: Final[dict[Triad, str]] = {"gyro": "gyro", "accel": "accelerometer"}
 
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 _LEVEL_RANGE: Final = Range(-45.0, 45.0, unit="deg")
-_TC_RANGE: Final = Range(-10.0, 10.0)  # rad/s, and per kelvin, square kelvin, cubic kelvin
+_TC_RANGE: Final = Range(-10.0, 10.0)  # rad/s, and rad/s per K, K^2 or K^3
 
 IGNORED_STEP: Final = 0.01
-"""A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2), and so is a
-vector of scales: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. After a start scales of 1 are in use."""
-MARGIN: Final = 1.05  # both sides round to 32 bits
+"""Largest change of a vector of offsets (rad/s, m/s^2) that PX4 ignores (autopilots 4.2), also of a vector of scales:
+`set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. At a start PX4 begins with scales of 1."""
+MARGIN: Final = 1.05  # factor on `IGNORED_STEP`, as both sides round to 32 bits
 GATED_TILT_DEG: Final = 0.3
-"""Tilt kept from before a write above which a restart is owed; a smaller one is what EKF2 shows of the biases of an
-uncalibrated sensor (autopilots 9.3)."""
+"""Least tilt kept by EKF2 from before a write that requires a restart; the biases of an uncalibrated sensor cause
+smaller ones (autopilots 9.3)."""
 
 _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
-_MAYBE_INTERNAL_BUSES: Final = (1, 2)  # I2C and SPI: a fact of the board, which PX4 keeps in CAL_*_ROT
+_MAYBE_INTERNAL_BUSES: Final = (1, 2)  # I2C and SPI: CAL_*_ROT shows whether the sensor is internal
 _PX4_ONLY_DEG: Final = {38: (90.0, 68.0, 293.0)}
-"""Rotation 38: roll, pitch, yaw in degrees that PX4 applies to calibrated data. Drivers use more exact angles."""
+"""Roll, pitch and yaw of rotation 38 as PX4 applies it to calibrated data, deg; its drivers use more exact angles."""
 
-_EV_YAW: Final = 1 << 3  # of EKF2_EV_CTRL
-_MAGNETOMETER: Final = 1 << 10  # of EKF2_SENS_EN
-SHORTEST_TIMEOUT_S: Final = 0.5  # COM_ARM_AUTH_TO that leaves time for our answer
+_EV_YAW: Final = 1 << 3  # bit of EKF2_EV_CTRL
+_MAGNETOMETER: Final = 1 << 10  # bit of EKF2_SENS_EN
+SHORTEST_TIMEOUT_S: Final = 0.5  # least COM_ARM_AUTH_TO that leaves time for our answer
 _LINKS: Final = 3
 
 
@@ -101,7 +101,7 @@ def _ranges() -> dict[str, Range]:
         LEVEL[:2], _LEVEL_RANGE
     )
     for slot in range(SLOTS):
-        # Former versions wrote TC_G*: their undo still restores the old values.
+        # Former versions wrote TC_G*, and their undo must still be able to restore the old values.
         own = f"TC_G{slot}_"
         found |= {**offset_ranges(parameters_of(slot, slot)), f"{own}ID": DEVICE_ID_RANGE}
         found |= {f"{own}{name}": DEGC_RANGE for name in ("TREF", "TMIN", "TMAX")}
@@ -115,11 +115,11 @@ class PX4(Firmware):
     name: FirmwareName = "px4"
     words = "PX4"
     mav_autopilot = mavlink.MAV_AUTOPILOT_PX4
-    late_heartbeat_on_request = True  # once a second at most: one lost leaves the arm state unknown
+    late_heartbeat_on_request = True  # heartbeats come once a second: a lost one leaves the arm state unknown
     integers_bytewise = True
     takes_nan_position = True
-    settle_s = 2.0  # it reads its parameters at most once a second (autopilots 9.2)
-    write_s = 8.0  # one vector after another: 7 s for one IMU
+    settle_s = 2.0  # PX4 reads its parameters at most once a second (autopilots 9.2)
+    write_s = 8.0  # vectors are written one after another: 7 s for one IMU
     imu_messages = {1: (PX4_FLOATS, SCALED), 2: (PX4_FLOATS, SCALED2), 3: (PX4_FLOATS, SCALED3)}
     tells_ekf_bias = True
     estimator_message = mavlink.MAVLink_estimator_status_message
@@ -156,7 +156,7 @@ class PX4(Firmware):
         )
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
-        """Return the tilt that EKF2 keeps: it learns a step of level or accelerometers very slowly."""
+        """Return the tilt that EKF2 keeps, as it learns a step of level or accelerometers very slowly."""
         turned_deg = math.hypot(*(change.after - change.before for change in changes if change.parameter in LEVEL))
         step: dict[str, float] = {}
         for change in changes:
@@ -183,7 +183,7 @@ class PX4(Firmware):
     heading_settings = (
         HeadingSetting("EKF2_EV_CTRL", float(_EV_YAW), "EKF2 takes its heading from external vision", bits=True),
         HeadingSetting("EKF2_EV_NOISE_MD", 0.0, "with the sigma that we send"),
-        # ev_yaw_control.cpp takes the value, unsquared, for the least variance: sqrt(0.05) rad = 12.8 deg.
+        # ev_yaw_control.cpp uses the value, unsquared, as the least variance: sqrt(0.05) rad = 12.8 deg.
         HeadingSetting("EKF2_EVA_NOISE", 0.05, "as long as that is above 12.8 deg"),
         HeadingSetting("EKF2_EV_DELAY", 0.0, "our stamps are those of the samples", optional=True),
     )
@@ -257,7 +257,7 @@ def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tu
 
 
 def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
-    """Check whether PX4 will start without this vector: it compares with zero then, and ignores small differences."""
+    """Return whether PX4 will not use this vector after a start: it ignores small differences from zero then."""
     return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
 
 
@@ -275,7 +275,7 @@ class Slot:
 
 
 async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
-    """Read all slots that hold a device id, in order. Raises as `Parameters.read_optional`."""
+    """Read all slots with a device id, in order. Raises the errors of `Parameters.read_optional`."""
     found: list[Slot] = []
     for number in range(SLOTS):
         device_id = await parameters.read_integer(f"{PREFIX[sensor]}{number}_ID")
@@ -288,9 +288,9 @@ async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
 def choose_slot(
     memory: SlotMemory, sensor: Triad, instance: int, slots: Sequence[Slot], like: int | None = None
 ) -> Slot:
-    """Choose the slot of an IMU (1 to 3) of all that hold a device id: the known one, else the best guess.
+    """Choose the slot of an IMU (1 to 3) among the slots with a device id: the known one, otherwise the best guess.
 
-    `like`: the device id of the IMU's other half, the same where one chip is both. Raise AutopilotError without a slot.
+    `like`: device id of the IMU's other sensor, equal if one chip has both. Raises AutopilotError if there is no slot.
     """
     prefix = PREFIX[sensor]
     memory.enabled[sensor] = sum(slot.enabled for slot in slots)
@@ -325,11 +325,11 @@ async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Mat
 
 
 async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:
-    """Read the rotation of a sensor against the vehicle, without the level adjustment."""
+    """Read the rotation from a sensor's axes to the vehicle's, without the level adjustment."""
     own = await parameters.read_integer(f"{PREFIX[sensor]}{slot.number}_ROT")
     internal = slot.bus == _SIMULATION_BUS or (slot.bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
     number = await parameters.read_integer("SENS_BOARD_ROT") if internal else own
-    # PX4 takes a number that it does not know for no rotation.
+    # PX4 applies no rotation for a number that it does not know.
     if number is None or not 0 <= number < len(ROTATION_NAMES):
         number = 0
     return rotation_matrix(_PX4_ONLY_DEG.get(number) or ROTATION_NAMES[number])

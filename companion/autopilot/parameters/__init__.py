@@ -1,1 +1,1 @@
-"""The autopilot's parameters: read, written one by one while disarmed, read back."""
+"""The autopilot's parameters: reads, writes one by one while disarmed, and the check of a write's effect."""

@@ -1,6 +1,6 @@
-"""Parameters as firmwares ask for them, their values as 32 bit floats, and changes of them.
+"""Parameters as firmwares read them, their values as 32 bit floats, and changes of them.
 
-PX4 ignores a small change of a vector of offsets, unless the vector makes a far step first (`Change.via`).
+PX4 ignores a small change of a vector of offsets, unless one of them makes a far step first (`Change.via`).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ FirmwareName = Literal["ardupilot", "px4", "other"]
 
 Names = tuple[str, str, str]  # parameters of a vector: X, Y, Z
 
-SCALES: Final = (0.5, 2.0)  # accelerometer scales with which a calibration works: it divides by them
+SCALES: Final = (0.5, 2.0)  # allowed accelerometer scales; a calibration divides by them
 
 
 def float32(value: float) -> float:
-    """Round to the nearest 32 bit float; infinite beyond their range."""
+    """Round to the nearest 32 bit float; infinite beyond the range of such floats."""
     return ctypes.c_float(value).value
 
 
@@ -39,7 +39,7 @@ def same_float32(one: float, other: float) -> bool:
 
 
 def _rank(value: float) -> int:
-    """The position of a float among all 32 bit floats in order; both zeros are 0."""
+    """Return the position of a float among all 32 bit floats in order; both zeros are 0."""
     bits: int = struct.unpack("<i", struct.pack("<f", value))[0]
     return bits if bits >= 0 else -(bits & 0x7FFFFFFF)
 
@@ -49,9 +49,9 @@ def implausible(name: str, value: str, wanted: str) -> AutopilotError:
 
 
 class Parameters(abc.ABC):
-    """Parameters read by name, of an autopilot that answers or of a log; `ParameterClient` says what they raise.
+    """Parameters read by name, from an autopilot or from a log; `ParameterClient` documents the errors.
 
-    `boots` counts the starts of the autopilot that have been seen; `firmware` is None before the first heartbeat.
+    `boots` counts the restarts of the autopilot seen so far; `firmware` is None before the first heartbeat.
     """
 
     @property
@@ -74,10 +74,10 @@ class Parameters(abc.ABC):
 
     @abc.abstractmethod
     async def ensure_same_boot(self, boots: int, doing: str) -> None:
-        """Ask for the time since boot; raise AutopilotRebootedError if `boots` has changed while `doing` went on."""
+        """Request the time since boot; raise AutopilotRebootedError if the autopilot restarted during `doing`."""
 
     async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
-        """Read three numbers within limits, such as `SCALES`; raise AutopilotError where one is outside."""
+        """Read three numbers within limits, such as `SCALES`; raise AutopilotError if one is outside."""
         x, y, z = [await self.read(name) for name in names]
         for name, value in zip(names, (x, y, z), strict=True):
             if not math.isfinite(value) or not low <= value <= high:
@@ -85,7 +85,7 @@ class Parameters(abc.ABC):
         return x, y, z
 
     async def read_integer(self, name: str) -> int | None:
-        """Read a whole number; None where the firmware has none. Raise AutopilotError where it is not a number."""
+        """Read a whole number; None: the firmware lacks the parameter. Raises AutopilotError if it is no number."""
         value = await self.read_optional(name)
         if value is not None and not math.isfinite(value):
             raise implausible(name, f"{value}", "a number")
@@ -107,8 +107,8 @@ FailureKind = Literal[
 
 
 POLL_S: Final = 1.1
-"""PX4's readers of parameters let 1 s pass between two looks (autopilots 9.2): after this long each has seen a value.
-After twice that without a write each looks at the next value at once."""
+"""Time after which every module of PX4 has read a new value: they read at most once a second (autopilots 9.2). After
+twice that without a write, each reads the next value at once."""
 
 _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
 
@@ -117,8 +117,8 @@ _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
 class Change:
     """Old and new value of one parameter, rounded to float32.
 
-    Where `via` is set the firmware would ignore a small change of the vector: this far value is written first, and when
-    the firmware uses it, the new values of the vector; a restore goes the same way.
+    `via` is a far value for firmware that would ignore a small change of the vector: it is written first, and once the
+    firmware uses it, the new values of the vector. A restore uses the far value too.
     """
 
     parameter: str
@@ -138,7 +138,7 @@ class Change:
 
     @property
     def ours(self) -> tuple[float, ...]:
-        """Values besides the old one that our writes may have left in the autopilot."""
+        """Values, other than the old one, that our writes may have left in the autopilot."""
         return (self.after,) if self.via is None else (self.after, self.via)
 
 
@@ -151,23 +151,23 @@ def reads_otherwise(name: str, found: float | None, wanted: float) -> str:
 
 
 def with_restore(reason: str, left_changed: Sequence[str], *, restored: bool) -> str:
-    """Append to the reason of an ended write what has become of the old values."""
+    """Append the outcome of the restore to the reason why a write ended."""
     if left_changed:
         return message("old_values_not_back", reason=reason, parameters=", ".join(left_changed))
     return message("old_values_back", reason=reason) if restored else reason
 
 
 class NothingWrittenError(NotDisarmedError):
-    """Refused before anything was sent: armed, unknown whether armed, or the autopilot calibrates itself."""
+    """Write refused before anything was sent: armed, arm state unknown, or the autopilot is calibrating itself."""
 
     left_changed: ClassVar[tuple[str, ...]] = ()
 
 
 class WriteFailedError(AutopilotError):
-    """A set of parameters is not in force as a whole.
+    """Write of a set of parameters that did not succeed as a whole.
 
     `written` has every parameter of the set: "rolled_back" (restored) or "failed" (never written, or not restored; then
-    `read_back` is the value in force, if known). `left_changed` names those whose old value may not be in force.
+    `read_back` is the present value, if known). `left_changed` names those whose old value may not be restored.
     """
 
     def __init__(
@@ -182,31 +182,31 @@ class WriteFailedError(AutopilotError):
 
 
 FarProbe = Callable[[str], Callable[[], Awaitable[str | None]]]
-"""Called with a parameter just before its far value (`Change.via`) is written; returns the verification.
+"""Callback with the name of a parameter, just before its far value (`Change.via`) is written; returns a verification.
 
-The verification compares the telemetry since with that before, and returns the reason to restore the old values, if
-there is one.
+The verification compares the telemetry after the far value with that before. It returns the reason to restore the old
+values, or None.
 """
 
 
 @dataclasses.dataclass(slots=True)
 class PendingChange:
-    """One parameter of a write, and its state."""
+    """State of one parameter during a write."""
 
     change: Change
-    sent: bool = False  # a PARAM_SET left: the autopilot may have the new value
-    confirmed: bool = False  # it answered with a value of ours: another one found later is somebody else's
+    sent: bool = False  # a PARAM_SET was sent: the autopilot may have the new value
+    confirmed: bool = False  # the autopilot confirmed a value of ours: a different one found later is somebody else's
     is_far: bool = False
     read_back: float | None = None
     outcome: Outcome = "failed"
-    left: bool = False  # the old value is not known to be restored
+    left: bool = False  # True: the old value may not be restored
 
 
 PendingVector = tuple[PendingChange, list[PendingChange]]  # the axis with a far value, and the others
 
 
 def by_vector(items: Sequence[PendingChange]) -> tuple[list[PendingChange], list[PendingVector]]:
-    """Split into parameters that need no far value, and vectors that do, in order."""
+    """Split into parameters that need no far value, and vectors that need one; keep the order."""
     vectors: dict[str, PendingVector] = {
         _AXIS.sub("", item.change.parameter): (item, []) for item in items if item.change.via is not None
     }

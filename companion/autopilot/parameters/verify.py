@@ -1,13 +1,13 @@
 """Effect of written offsets, judged from the telemetry before and after.
 
-A parameter that reads back right proves nothing about the value in use: PX4 stores a small change and goes on with
-the old one, and a wrong orientation or sign moves the wrong axis (autopilots 4.2, 8.6). So the step that the output
-made is compared with the expected one, in the axes of the parameters (the board's), so that a verdict names a
-parameter; the residual that remains is judged in the vehicle's.
+A correct read-back proves nothing about the value in use: PX4 stores a small change and still uses the old value, and a
+wrong orientation or sign moves the wrong axis (autopilots 4.2, 8.6). So the step of the output is compared with the
+expected one in the axes of the parameters (the board's), so that a verdict names a parameter. The remaining residual is
+judged in the vehicle's axes.
 
-An axis can tell "the whole step" from "no step" when the expected step is at least 8 sigma, since each then keeps 4
-for itself; a true axis is called wrong once in 16000. Over the three axes together a matched filter estimates the
-fraction of the step that was made, which can see what no axis can see alone.
+An axis can distinguish "the whole step" from "no step" if the expected step is at least 8 sigma, 4 for each hypothesis;
+a correct axis is called wrong once in 16000. A matched filter over the three axes estimates the fraction of the step
+that was made; it can detect a step that is too small on each axis alone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SIGMAS: Final = 4.0  # largest distance of a figure from its hypothesis, in stan
 
 VISIBLE_SIGMAS: Final = 2 * SIGMAS
 
-SCALE_TOLERANCE: Final = 0.05  # besides noise: scale error and cross-axis sensitivity, a few percent at most
+SCALE_TOLERANCE: Final = 0.05  # tolerance besides noise, for scale error and cross-axis sensitivity of a few percent
 
 AxisWord = Literal["seen", "too small to see", "not seen", "wrong"]
 _REFUTED: Final = ("not seen", "wrong")
@@ -36,10 +36,10 @@ _REFUTED: Final = ("not seen", "wrong")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Observation:
-    """One vector, the rate or the specific force of one IMU, before and after a write.
+    """One vector (rate or specific force) of one IMU before and after a write.
 
-    Means and sigmas are in the vehicle's FRD; a sigma is that of the mean and covers what the sensor drifts between the
-    two windows. `expected_step`: as by `imu_calibration.output_step`.
+    Means and sigmas are in the vehicle's FRD. Each sigma is that of the mean and includes the drift of the sensor
+    between the two windows. `expected_step`: from `imu_calibration.output_step`.
     """
 
     parameters: Names
@@ -51,26 +51,26 @@ class Observation:
     expected_step: Vector
     truth: Vector
     tolerance: float
-    orientation: Matrix | None = None  # 3x3, the parameters' axes to the vehicle's; None: they are the same
-    resolution: float = 0.0  # last digit of integer messages, by which truncation may misstate a mean; 0: floats
+    orientation: Matrix | None = None  # 3x3, parameters' axes to the vehicle's; None: identity
+    resolution: float = 0.0  # last digit of integer messages, the largest truncation error of a mean; 0: floats
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class EffectVerdict:
-    """One vector."""
+    """Verdict on one vector."""
 
     axes: Mapping[str, AxisWord]
-    fraction_sigma: float | None  # of the share of the expected step that was made; None: nothing had to move
+    fraction_sigma: float | None  # sigma of the fraction of the expected step; None: no step expected
     problems: tuple[str, ...]
-    hidden: tuple[str, ...]  # The parameters whose step could not be judged
+    hidden: tuple[str, ...]  # Parameters whose step was too small to judge
 
     @property
     def ok(self) -> bool:
-        """Nothing contradicts the write; what is too small to see does not."""
+        """Return True unless something contradicts the write; a step too small to see is no contradiction."""
         return not self.problems
 
     def outcome(self, parameter: str) -> Literal["verified", "stored", "failed"]:
-        """Return the outcome of a parameter that read back right."""
+        """Return the outcome of a parameter whose read-back was correct."""
         word = self.axes[parameter]
         return "failed" if word in _REFUTED else "verified" if word == "seen" else "stored"
 
@@ -80,7 +80,7 @@ def judge(seen: Observation) -> EffectVerdict:
     made = rotation.T @ np.subtract(seen.after, seen.before)
     expected = rotation.T @ np.asarray(seen.expected_step)
     sigma = np.sqrt((rotation.T**2) @ (np.square(seen.before_sigma) + np.square(seen.after_sigma)))
-    # Both means may be misstated, each by up to a digit.
+    # Truncation may change each of the two means by up to one digit.
     slack = 2.0 * seen.resolution
     floor = np.maximum(sigma, max(seen.resolution, 1e-12))
     weight = float(np.sum((expected / floor) ** 2))
@@ -103,7 +103,7 @@ def judge(seen: Observation) -> EffectVerdict:
     residual = np.subtract(seen.after, seen.truth)
     allowed = seen.tolerance + SIGMAS * np.asarray(seen.after_sigma) + seen.resolution
     for axis, value, limit in zip("xyz", residual, allowed, strict=True):
-        if not abs(value) <= limit:  # NaN is outside too
+        if not abs(value) <= limit:  # this form also rejects NaN
             off, most = f"{value:.3g} {seen.unit}", f"{limit:.2g}"
             problems.append(message("still_off_after_write", axis=axis, value=off, limit=most, parameters=family))
     hidden = [name for name, step in zip(axes, expected, strict=True) if axes[name] == "too small to see" and step]

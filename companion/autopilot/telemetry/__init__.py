@@ -1,1 +1,1 @@
-"""The autopilot's IMUs in its messages, and the attitude that is sent to it."""
+"""Telemetry: samples of the autopilot's IMUs, and the attitude that we send to it."""

@@ -1,11 +1,11 @@
-"""Our attitude in MAVLink's words, for each firmware as it consumes them (autopilots 6).
+"""Our attitude as MAVLink messages, in the form that each firmware uses (autopilots 6).
 
-VISION_POSITION_ESTIMATE and not ODOMETRY: of an attitude without a position PX4 takes ODOMETRY for one in a frame of
-its own, not north's, and ArduPilot demands such a frame in so many words; and Euler angles have no norm that could be
-off by more than the 1e-5 that PX4 allows. Neither firmware fuses roll and pitch.
+The message is VISION_POSITION_ESTIMATE rather than ODOMETRY. For an attitude without a position, PX4 treats ODOMETRY as
+relative to a frame of its own instead of north, and ArduPilot requires such a frame. Also, Euler angles have no norm
+that could deviate by more than the 1e-5 that PX4 allows. Neither firmware fuses roll and pitch.
 
 PX4 uses our time stamps only after 500 exchanges of TIMESYNC (50 s at its 10 Hz) of less than 10 ms each; until then it
-takes what arrives for new (autopilots 4.5). ArduPilot asks every 10 s, for its log.
+treats a message as measured on arrival (autopilots 4.5). ArduPilot sends a request every 10 s, for its log.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from companion.autopilot.firmware.base import Firmware
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 
-NOWHERE_VARIANCE_M2: Final = 1e4  # variance of a position that is none: ArduPilot bounds its sigma to 100 m
-_X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20  # on the diagonal of the upper right triangle, row by row
+NOWHERE_VARIANCE_M2: Final = 1e4  # variance sent for the missing position: ArduPilot limits its sigma to 100 m
+_X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20  # diagonal's indices in the upper triangle, row by row
 _U32: Final = 2**32
 
 
 def microseconds(t_s: float) -> int:
-    """A time of our own clock as it goes over the wire, in everything that we send: one clock for one link."""
+    """Return a time of our clock as sent in all our messages: one clock for one link."""
     return round(t_s * 1e6)
 
 
 def vision_position_estimate(
     firmware: Firmware, attitude: Attitude, reset_counter: int
 ) -> mavlink.MAVLink_vision_position_estimate_message:
-    """Attitude in NED against true north, and no position.
+    """Make the message with the attitude in NED (true north) and without a position.
 
-    ArduPilot discards the whole message where the position is not a number. Its sigma of yaw is the root of the sum of
-    all three angles' variances, so those of roll and pitch are left out. PX4 must not be given a position.
+    ArduPilot discards the whole message if the position is not a number. It computes the sigma of yaw as the root of
+    the sum of all three angles' variances, so those of roll and pitch are left out. PX4 must not get a position.
     """
     sigma_roll, sigma_pitch, sigma_yaw = attitude.sigma_rad
     covariance = [0.0] * 21
@@ -64,7 +64,7 @@ def vision_position_estimate(
 def attitude_messages(
     attitude: Attitude,
 ) -> tuple[mavlink.MAVLink_attitude_message, mavlink.MAVLink_attitude_quaternion_message]:
-    """ATTITUDE and ATTITUDE_QUATERNION for ground stations and logs; both autopilots ignore them."""
+    """Make ATTITUDE and ATTITUDE_QUATERNION for ground stations and logs; both autopilots ignore them."""
     boot_ms = int(attitude.t_s * 1e3) % _U32
     q = np.array(attitude.quaternion, dtype=np.float32)
     w, x, y, z = (q / np.linalg.norm(q)).tolist()
@@ -76,7 +76,7 @@ def attitude_messages(
 
 
 class TimesyncResponder:
-    """Answers TIMESYNC requests of the latched autopilot, with the clock that stamps our messages."""
+    """Answers TIMESYNC requests of the latched autopilot with the clock of our messages' time stamps."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0

@@ -1,7 +1,7 @@
 """The samples of one of the autopilot's IMUs, from the best message that it will send.
 
-What is asked for is lost at every restart of the autopilot, may be refused, answered late or never; so nothing is
-believed but the messages that arrive: the answer to a request only saves time.
+A request is lost at every restart of the autopilot, and may be refused, answered late or never. So only messages that
+arrive count: the answer to a request only saves time.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
 
-SILENCE_S: Final = 2.0  # without a sample: the stream is asked for again
+SILENCE_S: Final = 2.0  # time without a sample after which the stream is requested again
 
 SLOWER_RATES_HZ: Final = (100.0, 50.0, 40.0, 25.0, 10.0)  # ArduPilot allows 1.25 times its loop rate
 
-_ASKS: Final = 3  # for a message that nobody refuses and that does not come
+_ASKS: Final = 3  # requests for a message that is not refused and does not arrive
 
-_BETTER_AGAIN_S: Final = 30.0  # between requests for a better message that merely never came
+_BETTER_AGAIN_S: Final = 30.0  # time between requests for a better message that was not refused
 
 _LOOK_S: Final = 0.25
 _TURN_S: Final = 1.0
 BEAT_WITHIN_S: Final = 20.0  # a request may wait behind fifteen others that go unanswered
-_BESIDE_CONSOLE: Final = 0.85  # share of the rate that the bias' answers leave on a slow line
+_BESIDE_CONSOLE: Final = 0.85  # fraction of the rate that the console's answers leave on a slow line
 _TEMPERATURE_RATE_HZ: Final = 2.0
 _ASK_SCRIPT_S: Final = 1.0  # time between requests to ArduPilot's script, which sends for 3 s after one
-_SEEN_BY_RATE_HZ: Final = 4.0  # of PX4's integers beside floats: a write looks for 0.4 s (`px4_writes`)
-_ABSENT_AFTER: Final = 10  # readings of nothing but zeros in a row, and there is no such IMU
+_SEEN_BY_RATE_HZ: Final = 4.0  # rate of PX4's integers beside floats: a write observes them for 0.4 s (`px4_writes`)
+_ABSENT_AFTER: Final = 10  # all-zero readings in a row after which the IMU counts as absent
 
 
 @dataclasses.dataclass(slots=True)
@@ -67,11 +67,11 @@ _RESTARTED: Final = "the autopilot restarted"
 
 
 class ImuStream:
-    """Asks for one IMU's messages (1, 2 or 3), keeps them coming and hands on their samples in vehicle FRD.
+    """Requests one IMU's messages (1, 2 or 3), keeps them coming and passes on their samples in vehicle FRD.
 
-    Slower than `rate_hz` when the autopilot denies that; `may_be_slow`: the eleven samples a second of ArduPilot's
-    script will do. `on_kind_change` is called before the first sample of another message (and with None when there is
-    none any more), so that nobody mixes two resolutions in one mean.
+    The rate is below `rate_hz` if the autopilot denies that. `may_be_slow`: the eleven samples a second of ArduPilot's
+    script suffice. `on_kind_change` is called before the first sample of another message (and with None when samples
+    end), so that no mean mixes two resolutions.
     """
 
     def __init__(
@@ -88,8 +88,8 @@ class ImuStream:
     ) -> None:
         self.samples = 0
         self._starting = f"waiting for the autopilot to start IMU {instance}"
-        self.problem = self._starting  # why there are no samples, one line; empty while there are
-        self.turns = 0  # turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not
+        self.problem = self._starting  # reason why there are no samples, one line; empty while they arrive
+        self.turns = 0  # turns of `run`, at least one every `BEAT_WITHIN_S`, with or without samples
         self._vehicle, self._instance = vehicle, instance
         self._on_sample, self._on_kind_change = on_sample, on_kind_change
         self._ekf_bias, self._may_be_slow = ekf_bias, may_be_slow
@@ -107,7 +107,7 @@ class ImuStream:
 
     @property
     def wants_script(self) -> bool:
-        """The script's floats are better than the current source, or are the current source."""
+        """Return True if the script's floats are the current source, or better than it."""
         for source in self._sources:
             if source.message.from_script and self._usable(source):
                 return True
@@ -117,7 +117,7 @@ class ImuStream:
 
     @property
     def decided(self) -> bool:
-        """Samples come, or every message that could carry them was requested in vain."""
+        """Return True once samples arrive, or every message that could carry them was requested in vain."""
         return self.problem not in (self._starting, _NO_HEARTBEAT, _RESTARTED)
 
     @property
@@ -125,7 +125,7 @@ class ImuStream:
         return None if self._current is None else self._current.rates_hz[self._current.rate]
 
     async def run(self) -> None:
-        """Keep the samples coming until cancelled; raises nothing else."""
+        """Keep the samples coming until cancelled; errors are logged, not raised."""
         kinds = {each.message for firmware in FIRMWARES for each in firmware.imu_messages.get(self._instance, ())}
         subscriptions = [self._link.subscribe(kind, self._on_message) for kind in kinds]
         subscriptions.append(self._vehicle.on_event.add(self._on_event))
@@ -156,7 +156,7 @@ class ImuStream:
             await self._pause(60.0)
             return
         if self._ekf_bias.may_look:
-            # Floats that begin late would begin a measurement anew.
+            # Wait for the bias: a later change to floats would restart a measurement.
             await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
         sources = [_Source(message, self._rates_hz) for message in messages]
         self._sources = [source for source in sources if self._may_be_slow() or not source.message.from_script]
@@ -178,14 +178,14 @@ class ImuStream:
         for source in filter(self._usable, self._sources):
             for _ in range(_ASKS):
                 if self._restart.is_set() or source.refused or source.message.from_script:
-                    break  # the script's take over as soon as they come
+                    break  # the script's samples take over as soon as they arrive
                 answered = await self._ask(source)
                 if await self._sends(source):
                     return source
                 if source.absent:
                     break
                 if not answered and source.rate + 1 < len(source.rates_hz):
-                    source.rate += 1  # the denial may have been lost or be late
+                    source.rate += 1  # a denial may have been lost or be late
         return None
 
     async def _ask(self, source: _Source) -> bool:
@@ -197,7 +197,7 @@ class ImuStream:
             rate_hz = source.rates_hz[source.rate]
             result = await self._vehicle.commands.request_message_interval(source.message.message.id, rate_hz)
             if result == mavlink.MAV_RESULT_DENIED and not self._restart.is_set():
-                # Too fast; or, in the same word, no such message.
+                # DENIED means too fast, or no such message.
                 if source.rate + 1 < len(source.rates_hz):
                     source.rate += 1
                     continue
@@ -218,7 +218,7 @@ class ImuStream:
         return False
 
     async def _keep(self, source: _Source) -> _Source | None:
-        """Serve from a source until it is silent for good, the autopilot is lost, or a better one sends: return it."""
+        """Use a source until it stays silent, the autopilot is lost, or a better source sends; return the latter."""
         loop = asyncio.get_running_loop()
         self._switch(source)
         silent_asks = 0
@@ -229,13 +229,13 @@ class ImuStream:
         while not await self._pause(_LOOK_S):
             now_s = loop.time()
             if not self._usable(source):
-                if not source.message.from_script:  # which has stopped by itself
+                if not source.message.from_script:  # the script stops by itself
                     self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, source.message.message.id, 0.0)
                 return None
             better = self._better_than(source)
             if better is not None:
                 self._switch(better)
-                await self._ask(better)  # it may send by itself, at another rate
+                await self._ask(better)  # it may come unrequested, at another rate
                 return better
             if now_s - source.last_s < SILENCE_S:
                 silent_asks = 0
@@ -267,7 +267,7 @@ class ImuStream:
         return found
 
     async def _ask_for_better(self, source: _Source, asked_s: float) -> float:
-        """Now and then, and as soon as all can be used; when that was."""
+        """Request better messages every `_BETTER_AGAIN_S`, at once if a source becomes usable; return the time."""
         if not all(map(self._usable, self._sources)):
             return -math.inf
         now_s = asyncio.get_running_loop().time()
@@ -279,7 +279,7 @@ class ImuStream:
         return now_s
 
     async def _ask_for_temperature(self, source: _Source) -> None:
-        """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
+        """Request an integer message for the IMU's temperature: HIGHRES_IMU carries the barometer's."""
         if source.message.message is imu_messages.HIGHRES.message:
             rate_hz = _TEMPERATURE_RATE_HZ if source.message is imu_messages.HIGHRES else _SEEN_BY_RATE_HZ
             for each in (each for each in self._sources[1:] if not each.message.from_script):
@@ -288,13 +288,13 @@ class ImuStream:
                     return
 
     def _usable(self, source: _Source) -> bool:
-        """Not while it wants a bias that is not known, or is of another IMU; from the script only while disarmed."""
+        """Return whether a source is usable: the EKF bias that it lacks is known; the script's only while disarmed."""
         if source.message.from_script:
             return self._vehicle.arm_state is ArmState.DISARMED
         return not source.message.lacks_bias or self._ekf_bias.known_of(self._instance)
 
     async def _pause(self, seconds: float) -> bool:
-        """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
+        """Wait, at most until the autopilot is lost or restarts; return whether it did."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + seconds
         while not self._restart.is_set():
@@ -305,7 +305,7 @@ class ImuStream:
             await comes(self._restart, min(left_s, _TURN_S))
         return True
 
-    # --- what arrives
+    # --- inputs
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("lost", "rebooted"):
@@ -342,7 +342,7 @@ class ImuStream:
     def _lose(self, problem: str) -> None:
         self._switch(None)
         if problem != self.problem:
-            # The loss of the autopilot itself has been said once already.
+            # The loss of the autopilot itself has been logged already.
             logger.log(logging.WARNING if self._vehicle.alive else logging.DEBUG, "IMU %d: %s", self._instance, problem)
         self.problem = problem
 

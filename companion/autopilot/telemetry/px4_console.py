@@ -1,14 +1,14 @@
 """Floats of PX4's IMUs, read at its console over MAVLink (SERIAL_CONTROL), as by a ground station's "MAVLink console".
 
-HIGHRES_IMU is the reading of the IMU that flies in floats, less the bias of its EKF, which no message tells: `EkfBias`
-reads it. It is published once a second, or as soon as it has moved by 0.001 rad/s or m/s^2, and wanders slowly between.
+HIGHRES_IMU has the readings of the IMU used for flight, as floats, minus the bias of its EKF, which no message carries:
+`EkfBias` reads it. PX4 publishes it once a second and after a change by 0.001 rad/s or m/s^2; it wanders slowly.
 
-`ImuStatus` has `vehicle_imu_status` of the other IMUs printed: means of 0.1 s of an IMU's raw readings, in the
-vehicle's axes, nothing taken off (`VehicleIMU.cpp`). A few of them a second tell the bias that the integers of
-SCALED_IMU hide; whether the aircraft was still in between, the integers tell.
+`ImuStatus` prints `vehicle_imu_status` of the other IMUs: means over 0.1 s of an IMU's raw readings, in the vehicle's
+axes, without any correction (`VehicleIMU.cpp`). A few of them a second show the bias that the integers of SCALED_IMU
+hide. The integers show whether the aircraft was still in between.
 
-`listener` prints what is published, in five decimals: 2 deg/h, 1 micro-g. Nothing else is typed there, and nothing
-while the autopilot is not known to be disarmed. Each of PX4's MAVLink ports has its own console (autopilots 10.3).
+The command `listener` prints published topics with five decimals: 2 deg/h, 1 micro-g. No other command is typed there,
+and none unless the autopilot is known to be disarmed. Each MAVLink port of PX4 has its own console (autopilots 10.3).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _PROMPT: Final = re.compile("(nsh|pxh)> ")
 
 
 class Px4Console:
-    """Has the console print topics."""
+    """Makes the console print topics."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.text = ""
@@ -53,7 +53,7 @@ class Px4Console:
         link.subscribe(mavlink.MAVLink_serial_control_message, self._on_text)
 
     async def listener(self, topic: str, pattern: re.Pattern[str], *which: str) -> re.Match[str] | None:
-        """Have it print what is published; None: it did not in time, or something else."""
+        """Print a topic and match it to `pattern`; None: no answer in time, or another text."""
         async with self._lock:
             self.text, self._asked = "", topic
             self._answered.clear()
@@ -68,27 +68,27 @@ class Px4Console:
     def _on_text(self, message: mavlink.MAVLink_serial_control_message, _t_s: float) -> None:
         number, before = message.get_seq(), self._number
         if self._asked and message.device == _SHELL and self._vehicle.sent(message) and number != before:
-            self._number = number  # the same again is a copy
+            self._number = number  # a message with the same number is a copy
             text = bytes(message.data[: message.count]).decode("ascii", "replace")
             self.text = (self.text + text)[-_LONGEST:]
             if _PROMPT.search(self.text, max(self.text.find(self._asked), 0)) and self._asked in self.text:
                 self._answered.set()
 
 
-LOOK_EVERY_S: Final = 5.0  # at the bias and at which EKF flies, in turn: 1300 bytes, 4.5 % of 57600 baud
+LOOK_EVERY_S: Final = 5.0  # time between reads of the bias and of the EKF in use: 1300 bytes, 4.5 % of 57600 baud
 _AT_FIRST_S: Final = 1.0
 MISSES: Final = 10
-_AGAIN_S: Final = 60.0  # after so many answers that did not come or were not understood
+_AGAIN_S: Final = 60.0  # pause after `MISSES` answers in a row that were missing or not understood
 _TURN_S: Final = 0.5
 _OLD_S: Final = 45.0
 _CALM_S: Final = 60.0
-"""New offsets set the estimate to nothing, and it is some seconds until it is back. On a deck they are watched for 40 s
-by the integers, and floats that came back earlier would begin that anew."""
+"""Wait after new offsets, which reset the estimate for some seconds. On a deck the integers show their effect for 40 s,
+and floats that came back earlier would restart that check."""
 _UNITS: Final = np.repeat([1e-3, 1e-2], 3)
-_JUMP: Final = 0.5 * _UNITS  # largest step from one look to the next: 100 deg/h, 0.5 mg
-_STEADY: Final = 0.02 * _UNITS  # within a second, before it is used: 4 deg/h, 0.02 mg
+_JUMP: Final = 0.5 * _UNITS  # largest change between two reads of a bias in use: 100 deg/h, 0.5 mg
+_STEADY: Final = 0.02 * _UNITS  # largest change within a second before the bias is used: 4 deg/h, 0.02 mg
 
-# Seventy bytes that are lost leave no other match: each value has its neighbours beside it.
+# The patterns include each value's neighbours, so a text that lost a message of 70 bytes cannot match wrongly.
 _PRIMARY: Final = re.compile(r"primary_instance: (\d+)\s|estimator_selector_status[^>]*never published")
 _BIAS: Final = re.compile(
     rf"gyro_device_id: {_ID}gyro_bias: {_VECTOR}gyro_bias_limit.*"
@@ -102,18 +102,18 @@ _IMU: Final = re.compile(
 
 
 class EkfBias:
-    """Reads the bias again and again; `run` it."""
+    """Reads the EKF's bias repeatedly; `run` is its task."""
 
     def __init__(self, console: Px4Console, vehicle: Vehicle) -> None:
         self.instance: int | None = None  # IMU (1..) that HIGHRES_IMU shows; None while its bias is not known
-        self.settled = asyncio.Event()  # set once the bias is known, or the first answer did not tell it
-        self.reading: EkfBiasReading | None = None  # latest reading; `known_of` says whether it may be used
+        self.settled = asyncio.Event()  # set once the bias is known, or a first read has failed
+        self.reading: EkfBiasReading | None = None  # latest reading; `known_of` returns whether it may be used
         self.on_read: Listeners[EkfBiasReading] = Listeners()
         self._console, self._vehicle = console, vehicle
         self._held, self._misses = 0, 0
         self._woken = asyncio.Event()
         self._from_s = -math.inf
-        self._imus: dict[tuple[int, int], int] = {}  # by device ids of accelerometer and gyro, from 1
+        self._imus: dict[tuple[int, int], int] = {}  # IMU, from 1, by device ids of accelerometer and gyro
         self._primary: int | None = None
         self._at_bias = False
 
@@ -126,7 +126,7 @@ class EkfBias:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """While offsets are written the bias does nothing but step, and for some time after."""
+        """Suspend reading during a write of offsets and for some time after it, as the bias steps then."""
         self._held += 1
         self.forget()
         try:
@@ -136,7 +136,7 @@ class EkfBias:
             self.step()
 
     def step(self) -> None:
-        """Wait for the bias to come back: other offsets are in force."""
+        """Forget the bias, and wait until the EKF has estimated it again under other offsets."""
         self.forget()
         self._from_s = asyncio.get_running_loop().time() + _CALM_S
 
@@ -155,7 +155,7 @@ class EkfBias:
 
     @property
     def may_ask(self) -> bool:
-        """The console may be asked for what new offsets do not move."""
+        """Return True if the console may be used now, for values that do not depend on the offsets."""
         return self._vehicle.kind.tells_ekf_bias and self._vehicle.arm_state is ArmState.DISARMED and not self._held
 
     @property
@@ -178,13 +178,13 @@ class EkfBias:
         return _AT_FIRST_S if self._at_bias else 0.0
 
     async def _read(self) -> bool:
-        """Read which EKF flies, or the bias of that one; False: the console did not print it."""
+        """Read which EKF is in use, or its bias, in turn; return False if the console did not print it."""
         self._at_bias = self._primary is not None and (self.instance is None or not self._at_bias)
         if not self._at_bias:
             found = await self._console.listener("estimator_selector_status", _PRIMARY)
             if found is None:
                 return False
-            primary = int(found[1] or 0)  # a single EKF has no selector
+            primary = int(found[1] or 0)  # with a single EKF, no selector is published
             if primary != self._primary:
                 self.forget()
                 self._primary = primary
@@ -225,11 +225,11 @@ class EkfBias:
             self.settled.clear()
 
 
-PAUSE_S: Final = 0.2  # each answer costs the autopilot a task, and a console on the same port its calm
-SLOW_PAUSE_S: Final = 0.9  # on a line of 57600 baud, of which 1100 bytes an answer are then a fifth
+PAUSE_S: Final = 0.2  # pause between requests: each answer costs the autopilot a task
+SLOW_PAUSE_S: Final = 0.9  # pause on a line of 57600 baud, of which answers of 1100 bytes then take a fifth
 _STATUS_IDLE_S: Final = 0.5
 _STATUS_MISSES: Final = 5
-_STATUS_AGAIN_S: Final = 30.0  # after so many answers in a row that did not come or were not understood
+_STATUS_AGAIN_S: Final = 30.0  # pause after `_STATUS_MISSES` answers in a row that were missing or not understood
 _STATUS: Final = re.compile(
     rf"timestamp: (\d+) [^\n]*\n\s*accel_device_id: {_ID}gyro_device_id: {_ID}.*"
     rf"mean_accel: {_VECTOR}mean_gyro: {_VECTOR}var_accel: {_VECTOR}.*temperature_accel: (\S+)\s",
@@ -238,7 +238,7 @@ _STATUS: Final = re.compile(
 
 
 class ImuStatus:
-    """Has the console print the status of the IMUs that want it, in turn; `run` it."""
+    """Makes the console print the status of the wanted IMUs, one after another; `run` is its task."""
 
     def __init__(
         self,
@@ -249,9 +249,9 @@ class ImuStatus:
         *,
         slow: bool,
     ) -> None:
-        """`wanted`: instances (1 to 3) whose telemetry is integers.
+        """Prepare the reader; `wanted` returns the instances (1 to 3) whose telemetry is integers.
 
-        `tell` is given instance, device ids of gyro and accelerometer, and the mean of 0.1 s of raw readings.
+        `tell` gets the instance, the device ids of gyro and accelerometer, and the mean of 0.1 s of raw readings.
         """
         self._console, self._ekf_bias, self._wanted, self._tell = console, ekf_bias, wanted, tell
         self._pause_s = SLOW_PAUSE_S if slow else PAUSE_S
@@ -272,10 +272,10 @@ class ImuStatus:
         if found is None:
             return False
         if not self._ekf_bias.may_ask or self._seen.get(instance) == found[1]:
-            return True  # offsets are being written meanwhile, or it is the same again
+            return True  # a write of offsets has begun meanwhile, or the status is the same as before
         self._seen[instance] = found[1]
         ax, ay, az, gx, gy, gz = map(float, found.group(4, 5, 6, 7, 8, 9))
-        degc = float(found[13])  # it may print "nan"
+        degc = float(found[13])  # the text may be "nan"
         mean = ImuSample(
             asyncio.get_running_loop().time(),
             (gx, gy, gz),

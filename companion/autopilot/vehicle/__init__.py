@@ -1,1 +1,1 @@
-"""The autopilot on the link: heartbeats, arm state, place, clock, estimator; commands to it, and its parameters."""
+"""The autopilot on the link: heartbeats, arm state, place, clock and estimator; its commands and parameters."""

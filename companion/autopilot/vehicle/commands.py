@@ -1,8 +1,8 @@
 """Commands to the autopilot, one at a time, and the wait for their COMMAND_ACK.
 
-An ACK names the command but not its parameters, so two SET_MESSAGE_INTERVAL in flight could not be told apart: of
-each command one is in flight, the others wait their turn. No answer is an answer too (None): an autopilot may be
-slow with its ACKs or never send them, and nobody may hang on that.
+An ACK names the command but not its parameters, so the ACKs of two SET_MESSAGE_INTERVAL could not be distinguished.
+Therefore each command has one request in flight, and the others queue. A missing answer gives the result None: an
+autopilot may be slow with its ACKs or never send them, and no caller may hang.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from companion.links.mavlink.link import MavlinkLink, Message
 
 _COPY_S: Final = 0.5
 _TWICE_S: Final = 0.1
-"""Pause after a refusal. A request that two routes brought twice is answered twice: the second refusal must not
-answer the next request."""
-MAX_WAITING: Final = 16  # commands of one kind; the newest beyond is dropped and answered None at once
+"""Pause after a refusal. A request that arrives over two routes is answered twice, and the second refusal must not
+count for the next request."""
+MAX_WAITING: Final = 16  # most queued requests of one command; a further one is dropped with the result None
 
 
 _Answer = asyncio.Future[int | None]
@@ -36,24 +36,24 @@ def _settle(answer: _Answer, result: int | None) -> None:
 
 
 class Commands:
-    """COMMAND_LONG to one autopilot: to what `target` gives, None while it is not known."""
+    """Sends COMMAND_LONG to one autopilot; `target` returns its ids, None while unknown."""
 
     def __init__(self, link: MavlinkLink, target: Callable[[], tuple[int, int] | None]) -> None:
-        self.results: Counter[str] = Counter()  # by result's name, and "no answer", "dropped" (never sent)
+        self.results: Counter[str] = Counter()  # counts by name of the result, "no answer" or "dropped" (never sent)
         self._link = link
         self._target = target
         self._queues: dict[int, deque[_Request]] = {}
         self._in_flight: dict[int, _Request] = {}
         self._timers: dict[int, asyncio.TimerHandle] = {}
-        """End of each request in flight, or of the pause after a refusal; by command."""
+        """Timeout of the request in flight, or end of the pause after a refusal, by command."""
         self._last_ack = (0, 0, 0, -math.inf)
         link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 
     def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> _Answer:
-        """Send when its turn comes; the future brings the MAV_RESULT, or None when none came in time.
+        """Queue a request; the future gets the MAV_RESULT, or None after the timeout.
 
-        The time runs from the sending; IN_PROGRESS starts it anew. The future never carries an exception, so it may
-        be left alone.
+        The timeout runs from the sending; IN_PROGRESS restarts it. The future never gets an exception, so it may be
+        ignored.
         """
         answer: _Answer = asyncio.get_running_loop().create_future()
         queue = self._queues.setdefault(command, deque())
@@ -86,7 +86,7 @@ class Commands:
         while queue and command not in self._timers:
             request = queue.popleft()
             parameters, _, answer = request
-            if answer.done():  # whoever waited has gone
+            if answer.done():  # the caller has cancelled it
                 continue
             if target is None:
                 answer.set_result(None)
@@ -122,7 +122,7 @@ class Commands:
             return
         if not self._link.is_for_us(message):
             return
-        # Two routes bring a packet twice; the second must not answer the next request of the same command.
+        # A packet may arrive over two routes; its copy must not count for the next request of the same command.
         copy = (message.command, message.get_seq(), message.result)
         if copy == self._last_ack[:3] and t_s - self._last_ack[3] < _COPY_S:
             return
@@ -145,7 +145,7 @@ LONGEST_PAUSE_S: Final = 30.0
 @dataclasses.dataclass(slots=True)
 class _Wanted:
     message: type[Message]
-    rate_hz: float | None  # None: wanted once, and again after a restart
+    rate_hz: float | None  # None: requested once, and again after a restart
     of: FirmwareName | None
     heard_s: float = -math.inf
     asked_s: float = -math.inf
@@ -153,14 +153,14 @@ class _Wanted:
 
 
 class StandingRequests:
-    """Asks for messages by interval; less and less often where they never come."""
+    """Requests messages at an interval; repeats a request less and less often while its message does not arrive."""
 
     def __init__(self, commands: Commands) -> None:
         self._commands = commands
         self._wanted: list[_Wanted] = []
 
     def add(self, message: type[Message], rate_hz: float | None, of: FirmwareName | None = None) -> None:
-        """Want a message from now on, `of` one firmware or all; without a rate, once after every `forget_asking`."""
+        """Request a message from now on (`of` one firmware or any); without a rate, once after each `forget_asking`."""
         self._wanted.append(_Wanted(message, rate_hz, of))
 
     def heard(self, message: Message, t_s: float) -> None:
@@ -169,7 +169,7 @@ class StandingRequests:
                 wanted.heard_s, wanted.pause_s = t_s, FIRST_PAUSE_S
 
     def forget_asking(self) -> None:
-        """Ask at once for whatever is missing: what was streamed before a loss is gone after a restart."""
+        """Make all requests due again: a restart during the loss of the autopilot ends its streams."""
         for wanted in self._wanted:
             wanted.asked_s, wanted.pause_s = -math.inf, FIRST_PAUSE_S
             if wanted.rate_hz is None:

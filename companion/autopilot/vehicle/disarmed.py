@@ -1,13 +1,13 @@
-"""The one place that decides whether the autopilot is surely disarmed: it is asked, and its answer is waited for.
+"""Proof that the autopilot is disarmed, by a question and its answer; the only place that decides this.
 
-A heartbeat tells the past: it may have waited in a radio, in the kernel, or here while our process stood still. So the
-question is a TIMESYNC with a number that nobody can know beforehand. Both firmwares send it back at once, armed or not
-(autopilots 2, 4.5). A heartbeat that comes behind that answer was sent after the question left. No clock is compared
-with another one, and no wall clock is read.
+A heartbeat may be old: it may have waited in a radio, in the kernel, or here while our process was stopped. So the
+question is a TIMESYNC with a random number. Both firmwares return the number at once, armed or not (autopilots 2, 4.5).
+A heartbeat that arrives after the answer was sent after the question. No clock is compared with another one, and no
+wall clock is read.
 
-On an unsigned link whoever hears the question can answer it. What is proven there: some sender under the autopilot's
-ids said "disarmed" after the question, and none said "armed" within 3 s, nor in the time that the slowest answers of
-late have taken. On a signed link the autopilot itself has said so.
+On an unsigned link anybody who hears the question can answer it. There the proof is: some sender with the autopilot's
+ids said "disarmed" after the question, and none said "armed" within 3 s, nor within the time of the slowest recent
+answer. On a signed link the autopilot itself has said so.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.events import comes
 from companion.messages import message
 
-PROOF_HOLDS_S: Final = 1.5  # from the question to the write: some heartbeats come once a second only
+PROOF_HOLDS_S: Final = 1.5  # time from the question to the write; some heartbeats come only once a second
 
 LONGEST_PAUSE_S: Final = 0.1
-"""After a longer pause of our own loop no earlier question counts: what is read then may have waited for that long."""
+"""Longest pause of our own loop; after a longer one earlier questions are void, as messages may have waited."""
 
 ASK_AGAIN_S: Final = 0.3
-GIVE_UP_S: Final = 8.0  # with a fifth lost both ways 26 questions stay unanswered once in 10^11 times
+GIVE_UP_S: Final = 8.0  # with a fifth of packets lost both ways, 26 questions stay unanswered once in 10^11
 
-_LONGEST_WAIT_S: Final = 0.75  # slower answers are not waited for, so that a proof holds for a while
-_PULSE_S: Final = 0.02  # our own loop is checked while an answer is awaited
-_REMEMBERED: Final = 8  # questions whose answers are still known, and answers whose times are
+_LONGEST_WAIT_S: Final = 0.75  # longest wait for slow answers, so that a proof holds for a while afterwards
+_PULSE_S: Final = 0.02  # interval of checks for pauses of our own loop during a wait
+_REMEMBERED: Final = 8  # number of questions, and of answer times, that are remembered
 
 
 class DisarmedProof:
-    """Judges answers to our questions. Pure: numbers and times come in."""
+    """Judges answers to our questions. Pure logic: numbers and times are arguments."""
 
     def __init__(self) -> None:
         self._asked_s: dict[int, float] = {}
@@ -50,20 +50,20 @@ class DisarmedProof:
         """Times from question to answer, also of a second answer to the same question."""
         self._begun_s = self._awake_s = math.inf
         self._answered_s = self._proven_s = -math.inf
-        """When the latest question was asked that has an answer; and that has a disarmed heartbeat behind it."""
+        """Times of the latest answered question, and of the latest one followed by a disarmed heartbeat."""
 
     @property
     def slowest_s(self) -> float:
-        """The longest time of a recent answer. A forger may be nearer than the autopilot: wait for both."""
+        """Longest recent time to an answer; a forger may answer before the autopilot, so wait for both."""
         return min(max(self._answers_s, default=0.0), _LONGEST_WAIT_S)
 
     def begin(self, now_s: float) -> None:
-        """Only questions from here on count."""
+        """Start a new proof: earlier questions do not count."""
         self._begun_s = self._awake_s = now_s
         self._answered_s = self._proven_s = -math.inf
 
     def awake(self, now_s: float) -> bool:
-        """Note that our own loop runs; False after a pause, which takes the worth from all earlier questions."""
+        """Note that our own loop runs; return False after a pause, which voids all earlier questions."""
         paused = now_s - self._awake_s > LONGEST_PAUSE_S
         if paused:
             self._asked_s.clear()
@@ -89,14 +89,14 @@ class DisarmedProof:
         self._proven_s = self._answered_s
 
     def holds(self, now_s: float) -> bool:
-        """Tell whether it was disarmed after a question, and nobody said "armed" in the time that answers take."""
+        """Return whether a disarmed heartbeat followed a question, and no armed one in the time answers take."""
         return self.awake(now_s) and self.slowest_s <= now_s - self._proven_s <= PROOF_HOLDS_S
 
 
 class DisarmedCheck:
-    """Asks one autopilot, before each thing that may only be done to it while it is disarmed.
+    """Asks one autopilot for its arm state before each action that requires it to be disarmed.
 
-    `state`: what its heartbeats say; `name`: of the autopilot, for people.
+    `state` returns the state by heartbeats, `name` the autopilot's name for messages.
     """
 
     def __init__(
@@ -107,10 +107,10 @@ class DisarmedCheck:
         self._news = asyncio.Event()
 
     async def ensure(self) -> None:
-        """Return in the moment in which it is surely disarmed; whoever asked acts before anything else runs.
+        """Return at the moment when the autopilot is surely disarmed; the caller must act before the next await.
 
         Raises:
-            NotDisarmedError: it is armed, two speak in its name, or nothing proves that it is disarmed.
+            NotDisarmedError: it is armed, two senders use its ids, or nothing proves that it is disarmed.
         """
         loop = asyncio.get_running_loop()
         begun_s = ask_s = loop.time()
@@ -134,10 +134,10 @@ class DisarmedCheck:
                     ask_s = -math.inf
         finally:
             if request is not None:
-                request.cancel()  # or unanswered ones would queue up before the next
+                request.cancel()  # otherwise unanswered requests would queue up before the next one
 
     def proven(self) -> bool:
-        """Tell whether it is surely disarmed, by all that has been received; asked again before the bytes leave."""
+        """Return whether everything received proves the autopilot disarmed; the link calls it before it sends."""
         return self._state() is ArmState.DISARMED and self._proof.holds(asyncio.get_running_loop().time())
 
     def answered(self, number: int) -> None:

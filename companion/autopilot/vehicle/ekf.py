@@ -1,12 +1,12 @@
 """The autopilot's own estimator: its gyro biases, its attitude (ATTITUDE, #30), and whether its yaw is a heading.
 
-ArduPilot tells its gyro biases in AHRS (#163): omegaI is minus the estimate. After a step in the offsets EKF3 keeps its
-old estimate, which is now wrong by minus the step. The heading turns by that times 17 to 25 s before EKF3 has learned
-(autopilots 1.7, 9.3.1). With right offsets nothing is left to estimate, so omegaI shows how far it is from settled.
+ArduPilot reports its gyro biases in AHRS (#163): omegaI is minus the estimate. After a step in the offsets EKF3 keeps
+its old estimate, which is then wrong by minus the step. The heading turns by that times 17 to 25 s before EKF3 has
+learned (autopilots 1.7, 9.3.1). With right offsets the true bias is zero, so omegaI shows how far EKF3 is from settled.
 
-No message gives a sigma of the yaw. It is a heading while the autopilot has a healthy magnetometer (SYS_STATUS) and
-its estimator compares one with its yaw and finds them agreeing (EKF_STATUS_REPORT, ESTIMATOR_STATUS): then it is as
-good as a compass next to motors and wires is, and no better.
+No message gives a sigma of the yaw. The yaw is a heading while the autopilot has a healthy magnetometer (SYS_STATUS)
+and its estimator finds that the yaw agrees with it (EKF_STATUS_REPORT, ESTIMATOR_STATUS). Then it is as good as a
+compass next to motors and wires.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from companion.physics.units import DEG
 
 ADJUSTING: Final = "EKF adjusting"
 SETTLED_RAD_S: Final = 0.02 * DEG
-"""Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (autopilots
-9.3.1); and 72 deg/h times 25 s turn the heading by 0.5 deg, less than a compass knows."""
+"""Largest bias estimate of a settled EKF, per axis: 72 deg/h. After a reset it wanders up to 52 deg/h on the ground
+(autopilots 9.3.1); and 72 deg/h times 25 s turn the heading by 0.5 deg, less than a compass error."""
 
 _AHRS: Final[int] = mavlink.MAVLINK_MSG_ID_AHRS
 _AHRS_RATE_HZ: Final = 4.0
@@ -46,7 +46,7 @@ _AHRS_LOOK_S: Final = 0.25
 
 
 class EkfWatch:
-    """Asks for AHRS while somebody wants to know, and averages what comes over 2 s."""
+    """Requests AHRS while its bias is wanted, and averages the messages over 2 s."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -56,7 +56,7 @@ class EkfWatch:
         vehicle.hear(mavlink.MAVLink_ahrs_message, self._on_ahrs)
 
     async def bias_rad_s(self) -> float | None:
-        """Return the largest axis of the estimate, mean of the last 2 s or less; None: this autopilot does not tell."""
+        """Return the estimate's largest axis, averaged over up to 2 s; None: this autopilot does not report it."""
         for _ in range(_ASKS):
             if (found := self._mean(0.0)) is not None:
                 return found
@@ -66,12 +66,12 @@ class EkfWatch:
         return self._mean(0.0)
 
     async def settle(self, within_s: float, go_on: Callable[[str], None]) -> str | None:
-        """Wait until the estimate has settled (None), armed or restarted: what a pilot should know.
+        """Wait until the estimate has settled (None); return a warning for the pilot if that was not seen.
 
-        `go_on` is told every look how far it is; what it raises ends the waiting too.
+        The wait ends early when the autopilot arms or restarts. `go_on` gets the progress; its errors end the wait.
         """
         loop = asyncio.get_running_loop()
-        self._seen.clear()  # what came before the write says nothing
+        self._seen.clear()  # values from before the write do not count
         boots, give_up_s = self._vehicle.boots, loop.time() + within_s
         if await self.bias_rad_s() is None and self._vehicle.boots == boots:
             return message("ekf_not_settled", bias=_words(None))
@@ -104,7 +104,7 @@ class EkfWatch:
         self._vehicle.commands.request_message_interval(_AHRS, _AHRS_RATE_HZ)
 
     def _mean(self, at_least_s: float) -> float | None:
-        """Average the last 2 s, or as much more as a busy line needs for 2 s of readings; None without."""
+        """Average the last 2 s of readings, which span more time on a busy line; None: too few readings."""
         now_s = asyncio.get_running_loop().time()
         taken: list[tuple[float, float, float, float]] = []
         for each in reversed(self._seen):
@@ -127,9 +127,9 @@ def _words(bias_rad_s: float | None) -> str:
 
 
 HEADING_SIGMA_DEG: Final = 10.0
-"""Sigma of an autopilot's compass that agrees with its gyros; next to iron, or badly calibrated, it is off by more."""
+"""Sigma of an autopilot's compass that agrees with its gyros; near iron, or badly calibrated, its error is larger."""
 _RATE_HZ: Final = 1.0
-_STEADY_DEG: Final = 2.0  # turn of yaw in `_STEADY_S` at rest: beyond, the estimator still looks for it
+_STEADY_DEG: Final = 2.0  # largest turn of yaw in `_STEADY_S` at rest; more means that the estimator has not settled
 _STEADY_S: Final = 5.0
 _UP_RATE_HZ: Final = 5.0
 _UP_LEAST: Final = 4
@@ -169,7 +169,7 @@ class OwnCompass:
 
 
 class OwnAttitude:
-    """Listens to the latched autopilot; `wanted`: asks for what the heading needs, all the time."""
+    """Attitude of the latched autopilot; `wanted`: keep requesting the messages that the heading needs."""
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._vehicle, self._wanted = vehicle, wanted
@@ -178,7 +178,7 @@ class OwnAttitude:
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, _RATE_HZ if wanted else None)
 
     def heading(self) -> OwnHeading | None:
-        """Return its yaw from true north; None while it has none that can be believed."""
+        """Return the autopilot's yaw from true north; None while it is not trustworthy."""
         now_s = asyncio.get_running_loop().time()
         seen = self._since(now_s - _STEADY_S)
         if len(seen) < 2 or not self._compass.agrees(now_s):
@@ -187,7 +187,7 @@ class OwnAttitude:
         turned = [math.remainder(yaw - last, 2.0 * math.pi) for _, _, _, yaw in seen]
         if max(turned) - min(turned) > _STEADY_DEG * DEG:
             return None
-        # Without a place it knows no declination.
+        # Without a position the autopilot does not know the declination.
         north_deg = 0.0 if self._vehicle.place.position is not None else UNKNOWN_DECLINATION_SIGMA_DEG
         return OwnHeading((last + sum(turned) / len(turned)) / DEG % 360.0, math.hypot(HEADING_SIGMA_DEG, north_deg))
 
@@ -203,7 +203,7 @@ class OwnAttitude:
             commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
 
     def up(self, since_s: float) -> Array | None:
-        """Mean direction of up in the vehicle's axes, (3,), of a second at least from then on; None before that."""
+        """Return the mean direction of up since a time, (3,), vehicle axes; None: less than a second of data."""
         seen = self._since(since_s)
         if len(seen) < _UP_LEAST or seen[-1][0] - seen[0][0] < _UP_LEAST_S:
             return None
@@ -211,7 +211,7 @@ class OwnAttitude:
         return np.asarray(np.mean(ups, axis=0))
 
     async def up_since(self, since_s: float) -> Array | None:
-        """Wait for it a few seconds; None: this autopilot does not tell."""
+        """Wait a few seconds for `up`; None: no attitude arrives."""
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + _OLD_S
         while (found := self.up(since_s)) is None and loop.time() < give_up_s:

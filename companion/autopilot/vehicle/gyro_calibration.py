@@ -1,9 +1,9 @@
-"""ArduPilot's own gyro calibration, by command, for what only it can do: reset the EKF's gyro bias (autopilots 1.7).
+"""ArduPilot's own gyro calibration, by command: only this resets the EKF's gyro bias (autopilots 1.7).
 
-It also (autopilots 1.5, 3, 9.3.1) measures the gyros of all instances to some 10 deg/h, the Earth's rotation included.
-It writes their offsets, calibration temperatures and device ids, and zeros the values of absent gyros. The answer comes
-at its end, after 0.5 to 30 s; while it runs the offsets read zero. A second command meanwhile is answered early,
-as if all were done. So the command is sent once, and the offsets show its end.
+The calibration also measures the gyros of all instances to some 10 deg/h, with the Earth's rotation in the result
+(autopilots 1.5, 3, 9.3.1). It writes their offsets, calibration temperatures and device ids, and zeros the values of
+absent gyros. The answer comes at its end, after 0.5 to 30 s; while it runs the offsets read zero. A second command
+meanwhile gets an early answer, as if all were done. So the command is sent once, and the offsets show its end.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from companion.messages import message
 logger = logging.getLogger(__name__)
 
 TIMEOUT_S: Final = 40.0  # longest wait: ArduPilot gives up after some 30 s
-_LOST_AFTER_S: Final = 3.0  # old offsets still in force so long after the command: it was lost or refused
+_LOST_AFTER_S: Final = 3.0  # if the old offsets are still there after this time, the command was lost or refused
 _LOOK_S: Final = 0.25
-_AFTERWARDS_S: Final = 0.5  # from the last offset to the end: the saving, and the EKF's reset
+_AFTERWARDS_S: Final = 0.5  # time from the last offset to the end of the calibration, for saving and the EKF's reset
 
 GyroOutcome = Literal["reset", "not converged", "unanswered", "not run"]
-"""End of the calibration.
+"""Outcome of the calibration.
 
 "reset": converged, the EKF's gyro bias is reset. "not converged": the firmware stored its best guess, did not reset the
-EKF, and refuses to arm ("Gyros not calibrated") until a gyro calibration succeeds or it restarts. "unanswered": it ran,
-and the answer was lost. "not run": refused or lost, nothing has changed.
+EKF, and refuses to arm ("Gyros not calibrated") until a gyro calibration succeeds or it restarts. "unanswered": the
+calibration ran, but the answer was lost. "not run": the command was refused or lost, and nothing has changed.
 """
 
 
@@ -52,7 +52,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
 
 
 async def read_active_tcal(parameters: ParameterClient, values: Mapping[str, float]) -> list[str]:
-    """Return the names of the active temperature calibrations; with one on, gyro calibration changes its meaning."""
+    """Return the active temperature calibrations' names; a gyro calibration changes CALTEMP and so their effect."""
     switches = [names.tcal_enable for names in _present(values)]
     return [name for name, value in (await parameters.read_many(switches, optional=True)).items() if value]
 
@@ -65,13 +65,13 @@ def changed(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str
 async def calibrate(
     parameters: ParameterClient, before: Mapping[str, float], go_on: Callable[[str], None]
 ) -> tuple[GyroOutcome, str, dict[str, float]]:
-    """Let the firmware calibrate, once; return the outcome, a warning ("": none) and the values now in force.
+    """Run the firmware's calibration once; return the outcome, a warning ("": none) and the present values.
 
-    `before` was read just now; `go_on` is called with the progress in words.
+    `before`: the values just before the calibration; `go_on` is called with the progress as text.
 
     Raises:
-        NotDisarmedError: not disarmed when the command was about to leave: nothing was done.
-        AutopilotError: no answer any more, or a restart; any of its parameters may have changed.
+        NotDisarmedError: not disarmed just before the command; nothing was done.
+        AutopilotError: the autopilot stopped answering or restarted; any of the parameters may have changed.
     """
     vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
     boots = vehicle.boots
@@ -86,13 +86,13 @@ async def calibrate(
     try:
         while loop.time() < sent_s + TIMEOUT_S:
             if answer.done():
-                await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
+                await asyncio.sleep(_LOOK_S)  # reads without a pause would fill the line
             else:
                 await asyncio.wait([answer], timeout=_LOOK_S)
             parameters.require_same_boot(boots, "it calibrated its gyros")
             state = await _state(parameters, before)
             if state == "ended":
-                # An acknowledgement that is still on its way says more than its absence.
+                # Wait for the ACK, which may still be on its way and has the result.
                 await asyncio.wait([answer], timeout=_AFTERWARDS_S)
                 break
             answered = answer.done() and answer.result() is not None
@@ -110,8 +110,8 @@ async def calibrate(
 
 
 async def wait_until_over(parameters: ParameterClient, before: Mapping[str, float]) -> None:
-    """After an interruption, wait until a calibration that may have been started has ended, or never ran."""
-    # Old offsets, or zeros, tell nothing while it may run: it stores its result at its end.
+    """After an interruption, wait until a calibration that may have been started has ended, or did not run."""
+    # Old offsets or zeros prove nothing yet, as the calibration stores its result at its end.
     vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
     boots, since_s = vehicle.boots, loop.time()
     while loop.time() < since_s + TIMEOUT_S and vehicle.boots == boots:
@@ -123,7 +123,7 @@ async def wait_until_over(parameters: ParameterClient, before: Mapping[str, floa
 
 
 async def _state(parameters: ParameterClient, before: Mapping[str, float]) -> Literal["running", "ended", "untouched"]:
-    """Tell the state by the offsets of the instances with a gyro: zero while it runs, set together at its end."""
+    """Find the state from the offsets of present gyros: zero while it runs, all set together at its end."""
     vectors = [names.gyro_offset for names in _present(before) if before.get(names.gyro_id, 1.0)]
     offsets = [name for vector in vectors for name in vector]
     now = dict.fromkeys(offsets, 0.0) | await parameters.read_many(offsets, optional=True)

@@ -1,7 +1,7 @@
-"""Sort heartbeats: which are the autopilot's, whether it is armed, whether it has restarted. Pure: time comes in.
+"""Logic of heartbeats: which are the autopilot's, whether it is armed, whether it restarted. Times are arguments.
 
-Anybody on an unsigned link can say "disarmed" under the autopilot's ids, as often as he likes; but the autopilot's own
-heartbeats are heard too. So "armed" outweighs "disarmed", and who says both by turns is not believed at all.
+Anybody on an unsigned link can send "disarmed" with the autopilot's ids, but the autopilot's own heartbeats arrive too.
+So "armed" outweighs "disarmed", and a sender that alternates between both is not believed at all.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.messages import message
 
-ARMED_HOLDS_S: Final = 3.0  # over disarmed heartbeats: one comes a second at least, and two may be lost
+ARMED_HOLDS_S: Final = 3.0  # time for which "armed" outweighs "disarmed": at 1 Hz two heartbeats may be lost
 
 _CHANGES: Final = 4
-_CHANGES_WITHIN_S: Final = 5.0  # arming and disarming twice within it is more than pilots do
+_CHANGES_WITHIN_S: Final = 5.0  # arming and disarming twice within this time is more than pilots do
 _ONLY_ARMED_S: Final = 10.0
 _ONLY_DISARMED_S: Final = 30.0
-"""A contradiction is over when only "armed", or only "disarmed", has been heard for so long. The other sender may have
-been silenced; "armed" is believed earlier, as it permits nothing."""
-_RESTARTS_S: Final = 1.0  # none restarts twice within it; two whose times since boot alternate seem to
-_TWO_HOLDS_S: Final = 5.0  # after the last sign of a second autopilot nothing is believed of either
+"""Time of only "armed", or only "disarmed", that ends a contradiction. The other sender may have been silenced; "armed"
+is believed earlier, as it permits nothing."""
+_RESTARTS_S: Final = 1.0  # two restarts within this time mean two autopilots, whose times since boot alternate
+_TWO_HOLDS_S: Final = 5.0  # time after the last sign of a second autopilot for which neither is believed
 
 
 class ArmState(enum.Enum):
@@ -36,14 +36,14 @@ class ArmState(enum.Enum):
 
     @property
     def why_not_written(self) -> str | None:
-        """Why nothing may be written, for people; None: it may."""
+        """Reason why nothing may be written, as text for people; None: writing is allowed."""
         if self is ArmState.DISARMED:
             return None
         return message("aircraft_is_armed") if self is ArmState.ARMED else message("unknown_whether_armed")
 
 
 class ArmingWatch:
-    """Takes the heartbeats of one vehicle and says what may be believed of them."""
+    """Decides the arm state from the heartbeats with one vehicle's ids, of which some may be forged."""
 
     def __init__(self) -> None:
         self._armed: bool | None = None
@@ -64,14 +64,14 @@ class ArmingWatch:
         self._armed = armed
 
     def restarted(self, t_s: float) -> None:
-        """Forget what came before; only "armed" still counts, as a restart can be forged too."""
+        """Forget earlier "disarmed" heartbeats; "armed" still counts, as a restart can be forged."""
         self._armed = None
         if t_s - self._restarted_s < _RESTARTS_S:
             self.two_seen(t_s)
         self._restarted_s = t_s
 
     def flashed(self) -> None:
-        """Another firmware runs there now; its restart may have been seen before its first heartbeat."""
+        """Note that another firmware runs now; its restart may have been seen before its first heartbeat."""
         self._restarted_s = -math.inf
 
     def armed(self, t_s: float) -> bool | None:
@@ -84,18 +84,18 @@ class ArmingWatch:
         self._two_s = t_s
 
     def conflict(self, t_s: float, system_id: int | None) -> str | None:
-        """Describe two autopilots under the ids of one, of which nothing is believed; None without."""
+        """Describe a conflict: two autopilots with the same ids, of which neither is believed; None: no conflict."""
         if self.contradicts_itself(t_s):
             return message("armed_and_disarmed_by_turns", system=system_id)
         return message("two_autopilots_with_one_id", system=system_id) if t_s - self._two_s < _TWO_HOLDS_S else None
 
     def contradicts_itself(self, t_s: float) -> bool:
-        """Check for armed and disarmed heartbeats by turns, from two autopilots, or from one and a forger."""
+        """Check for alternating armed and disarmed heartbeats, of two autopilots, or of one and a forger."""
         only_armed = self._armed is True and t_s - self._disarmed_s >= _ONLY_ARMED_S
         return self._contradicted and not only_armed and t_s - self._armed_s < _ONLY_DISARMED_S
 
 
-ADOPT_OTHER_COMPONENT_S: Final = 2.0  # heard for so long before it is latched
+ADOPT_OTHER_COMPONENT_S: Final = 2.0  # time of heartbeats from a component other than 1 before it is latched
 
 _NOT_AIRCRAFT: Final = frozenset(
     getattr(mavlink, f"MAV_TYPE_{name}")
@@ -111,21 +111,21 @@ def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
 
 
 def unique_id(message: mavlink.MAVLink_autopilot_version_message) -> str | None:
-    """AUTOPILOT_VERSION.uid2 as 36 hex digits, else uid as 16; None where the board tells neither."""
+    """Return AUTOPILOT_VERSION.uid2 as 36 hex digits, otherwise uid as 16; None: the board reports neither."""
     if any(message.uid2):
         return bytes(message.uid2).hex()
     return f"{message.uid:016x}" if message.uid else None
 
 
 def version_text(packed: int) -> str:
-    """Major, minor, patch and kind of release from AUTOPILOT_VERSION.flight_sw_version, one byte each."""
+    """Decode AUTOPILOT_VERSION.flight_sw_version: major, minor, patch and kind of release, one byte each."""
     major, minor, patch, kind = packed.to_bytes(4, "big")
     suffix = "-dev" if kind < 64 else "-alpha" if kind < 128 else "-beta" if kind < 192 else "-rc" if kind < 255 else ""
     return f"{major}.{minor}.{patch}{suffix}"
 
 
 class Latch:
-    """Decides which autopilot is taken."""
+    """Decides which autopilot to latch."""
 
     def __init__(self, system_id: int | None) -> None:
         self._system_id = system_id
@@ -143,32 +143,31 @@ class Latch:
         return t_s - first_s >= ADOPT_OTHER_COMPONENT_S
 
 
-_BACK_S: Final = 0.5  # late and repeated packets step back by milliseconds
+_BACK_S: Final = 0.5  # step back that means a restart; late and repeated packets step back by milliseconds
 
 _GAP_S: Final = 2.0
 _CONFIRM_S: Final = 0.5
-_CLOCKS: Final = 1.01  # more than two quartz clocks ever differ by
-_WRAP_S: Final = 2**32 * 1e-3  # time_boot_ms is a 32 bit number: it starts again after 49.7 days
+_CLOCKS: Final = 1.01  # ratio beyond that of any two quartz clocks
+_WRAP_S: Final = 2**32 * 1e-3  # time_boot_ms has 32 bits: it starts again at zero after 49.7 days
 
 
 class BootClock:
-    """Tells restarts from the time since boot that many messages carry; all of them count from the same boot.
+    """Detects restarts from the time since boot, which many messages carry.
 
-    A restart shows in one of two ways. The time goes back. Or, after a silence, it has advanced by less than half
-    of what the host's clock has, and is not longer than the silence: a restart while the link was lost, of which the
-    time since boot has meanwhile overtaken the old one. (Half, since a simulator may run slower than real time; on a
-    busy machine slower than that, but an autopilot that was up for longer than we heard nothing has not restarted
-    meanwhile. And the first messages after a silence of our own making are old ones from a buffer, so this second way
-    must hold for another half second.)
+    A restart shows in one of two ways. First, the time goes back. Second, after a silence, the time has advanced by
+    less than half of the host's clock and is shorter than the silence: the autopilot restarted while the link was lost,
+    and its time since boot has overtaken the old one. Half, because a simulator may run slower than real time, on a
+    busy machine even slower than half; then a time since boot longer than the silence excludes a restart. The second
+    way must hold for another half second, as the first messages after a pause of our own process are old.
     """
 
     def __init__(self) -> None:
-        self.latest: tuple[float, float] | None = None  # the time since boot that was heard last, and when
+        self.latest: tuple[float, float] | None = None  # latest time since boot, and the time when it arrived
         self._before_gap: tuple[float, float] | None = None
         self._suspected_s = 0.0
 
     def rebooted(self, boot_s: float, t_s: float) -> bool:
-        """Note a time since boot received at `t_s`; return whether a restart lies between it and the last."""
+        """Note a time since boot received at `t_s`; return whether the autopilot restarted since the previous one."""
         if self.latest is None:
             self.latest = (boot_s, t_s)
             return False

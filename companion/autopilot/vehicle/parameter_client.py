@@ -1,9 +1,9 @@
-"""Single parameters over MAVLink: read by name, write one, watch what anybody writes.
+"""Single parameters over MAVLink: read by name, write, and listeners to every value that the autopilot sends.
 
-Every write is guarded: immediately before each PARAM_SET that leaves, the first as well as every repetition, the
-aircraft must be surely disarmed (`vehicle.disarmed`). Neither autopilot refuses a PARAM_SET while armed (autopilots
-1.3, 4.4), so nobody else will. MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm;
-`writer` asks again at the end.
+Every write is guarded: immediately before each PARAM_SET is sent, also a repeated one, the aircraft must be surely
+disarmed (`vehicle.disarmed`). No other guard exists, as neither autopilot refuses a PARAM_SET while armed (autopilots
+1.3, 4.4). MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm, so `parameter_writer`
+checks again at the end.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from companion.messages import message
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
-_REMEMBERED_TYPES: Final = 4096  # more parameters than any firmware has; what is not remembered is asked for
+_REMEMBERED_TYPES: Final = 4096  # more than the parameters of any firmware; the type of others is read before a write
 
 _TIMEOUT_S: Final = 1.0
 _TRIES: Final = 4
 _TRIES_MORE: Final = 8
-"""While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
-four tries fail once in sixty exchanges, which is once a calibration; eight once in 3500."""
-_LOSSY: Final = 0.05  # share of requests repeated, above which silence says little about a name
+"""Most tries while heartbeats arrive, or the line is known to lose packets. With a fifth of packets lost both ways,
+four tries fail once in sixty exchanges, which is once a calibration; eight fail once in 3500."""
+_LOSSY: Final = 0.05  # fraction of repeated requests above which silence is weak evidence of a missing name
 _LOSS_MEMORY: Final = 0.1
 
 _AT_ONCE: Final = 6  # requests in flight: ArduPilot queues some twenty and answers one every few milliseconds
@@ -56,13 +56,13 @@ _ERROR_WORDS: Final = {
     7: "its type does not match",
     8: "it could not be read",
 }
-"""MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
+"""Texts for MAV_PARAM_ERROR; the generated dialect has only the first five values."""
 
 _Answer = float | str  # Value of a PARAM_VALUE, or PARAM_ERROR in words
 
 
 class _Inbox:
-    """Answers about one name during one exchange, PARAM_ERROR in words; when full the oldest is dropped."""
+    """Queue of the answers about one name during one exchange (PARAM_ERROR as text); when full, drops the oldest."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -91,12 +91,12 @@ class ParameterClient(Parameters):
         self.vehicle = vehicle
         self.writes = 0  # PARAM_SET messages sent, repetitions included
         self._link = link
-        self._repeated = 0.0  # share of requests that were answered only after a repetition, of late
+        self._repeated = 0.0  # fraction of recent requests that were answered only after a repetition
         self._inboxes: list[_Inbox] = []
-        self.on_value: Listeners[[str, float]] = Listeners()  # every PARAM_VALUE of the autopilot, whoever caused it
+        self.on_value: Listeners[[str, float]] = Listeners()  # notified of all values sent, whoever asked
         self._answering: str | None = None
-        self._absent: set[str] = set()  # in this boot: told by silence, that takes seconds to learn
-        self._types: dict[str, int] = {}  # heard since the restart, so these exist, however silent it is
+        self._absent: set[str] = set()  # names missing in this boot; silence takes seconds to show that
+        self._types: dict[str, int] = {}  # types by name, seen since the restart, so these parameters exist
         vehicle.hear(mavlink.MAVLink_param_value_message, self._on_value)
         vehicle.hear(mavlink.MAVLink_param_error_message, self._on_error)
         vehicle.on_event.add(self._on_event)
@@ -114,7 +114,7 @@ class ParameterClient(Parameters):
         self.require_same_boot(boots, doing)
 
     def require_same_boot(self, boots: int, doing: str) -> None:
-        """Raise AutopilotRebootedError if the autopilot has started since `boots` were counted."""
+        """Raise AutopilotRebootedError if the autopilot has restarted since the count was `boots`."""
         if self.boots != boots:
             raise self._rebooted(doing)
 
@@ -132,11 +132,11 @@ class ParameterClient(Parameters):
         return ParameterTimeoutError(words)
 
     async def read(self, name: str) -> float:
-        """Read one that must exist.
+        """Read a parameter that must exist.
 
         Raises:
             ParameterTimeoutError: no answer within all retries.
-            ParameterRefusedError: PARAM_ERROR, such as that it does not exist.
+            ParameterRefusedError: PARAM_ERROR, for instance because it does not exist.
             AutopilotRebootedError: the autopilot restarted meanwhile.
         """
         answer, tries = await self._ask_repeatedly(name, self._required_tries())
@@ -147,12 +147,12 @@ class ParameterClient(Parameters):
         raise self._unanswered(name, tries)
 
     async def read_optional(self, name: str) -> float | None:
-        """Read as `read`; None when the autopilot has no such parameter.
+        """Read a parameter like `read`; return None if the autopilot has no such parameter.
 
-        Firmware from ArduPilot 4.7 and PX4 1.17 on says so (PARAM_ERROR). Older ones are silent, and ArduPilot 4.8
-        often too, as its PARAM_ERROR may leave by another link. Silence means absence only while heartbeats come and
-        the autopilot answers for another parameter right after. An absent name is remembered until it restarts or
-        announces it.
+        ArduPilot from 4.7 and PX4 from 1.17 answer with PARAM_ERROR then. Older ones are silent, and often ArduPilot
+        4.8 too, as its PARAM_ERROR may go to another link. Silence means absence only while heartbeats arrive and the
+        autopilot answers for another parameter right after. An absent name is remembered until the autopilot restarts
+        or announces it.
         """
         if name in self._absent:
             return None
@@ -168,7 +168,7 @@ class ParameterClient(Parameters):
             raise self._refused(f"read {name}", answer)
         if not self.vehicle.alive or not await self._answers_at_all():
             raise self._unanswered(f"{name} and other parameters", tries)
-        # It answers again or for others only: a silence that ends in this moment must not be taken for an absence.
+        # Try once more: the autopilot may only now have begun to answer again, so its silence was no absence.
         answer, _ = await self._ask_repeatedly(name, [1])
         if isinstance(answer, float):
             return answer
@@ -195,16 +195,16 @@ class ParameterClient(Parameters):
     async def write(self, name: str, value: float) -> float:
         """Set a parameter and wait for the autopilot to confirm that value, within 1 ulp.
 
-        It is sent as the type that the autopilot has announced; a REAL32 is rounded to float32. Another value in
-        between may answer somebody else's write, so the wait goes on; if nothing else comes it counts as the answer.
+        The value is sent as the type that the autopilot has announced; a REAL32 is rounded to float32. A different
+        value may be the answer to somebody else's write, so the wait goes on; without a further one it is the answer.
 
         Raises:
-            NotDisarmedError: armed, or unknown whether armed, when a PARAM_SET was about to leave. If it was a
-                repetition, the first one may have had its effect.
-            ParameterTimeoutError: no answer within all retries; it may have had its effect.
-            ParameterMismatchError: answered with another value.
+            NotDisarmedError: armed or arm state unknown just before a PARAM_SET. If that was a repetition, the first
+                one may have taken effect.
+            ParameterTimeoutError: no answer within all retries; the write may have taken effect.
+            ParameterMismatchError: the answer has another value.
             ParameterRefusedError: PARAM_ERROR, or the value is not a finite number.
-            AutopilotRebootedError: the autopilot restarted meanwhile; it may have had its effect.
+            AutopilotRebootedError: the autopilot restarted meanwhile; the write may have taken effect.
         """
         kind = await self._type_of(name)
         whole = kind in _INTEGER_FORMATS
@@ -221,7 +221,7 @@ class ParameterClient(Parameters):
                 if other is not None and tries > _TRIES:
                     break
                 request = mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
-                # Nothing may be awaited between the guard and this.
+                # No await is allowed between the guard and this line.
                 self.writes += self._link.send(request, self.vehicle.disarmed.proven)
                 deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
                 while (answer := await inbox.get(deadline_s)) is not None:
@@ -242,7 +242,7 @@ class ParameterClient(Parameters):
 
     @property
     def integers_bytewise(self) -> bool:
-        """Integers travel as bytes; a known firmware decides, not an AUTOPILOT_VERSION that may be forged."""
+        """Return True if integers are sent as bytes; AUTOPILOT_VERSION, maybe forged, counts for no known firmware."""
         if (known := self.vehicle.kind.integers_bytewise) is not None:
             return known
         return bool((self.vehicle.capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
@@ -263,7 +263,7 @@ class ParameterClient(Parameters):
             self._inboxes.remove(inbox)
 
     def _required_tries(self) -> Iterator[int]:
-        """1, 2, ... of a request that must be answered: the more, while the autopilot is heard."""
+        """Yield the numbers of the tries, 1, 2, ..., of a required request: more tries while heartbeats arrive."""
         for tries in range(1, _TRIES_MORE + 1):
             if tries > _TRIES and not self.vehicle.alive:
                 return
@@ -290,7 +290,7 @@ class ParameterClient(Parameters):
         return None, count
 
     async def _answers_at_all(self) -> bool:
-        """Ask for a parameter that must exist: the last one that was answered, else the first of the list."""
+        """Request a parameter that must exist: the last one that was answered, otherwise the first of the list."""
         name, index = (self._answering, -1) if self._answering is not None else ("", 0)
         with self._exchange(name) as inbox:
             for _ in self._required_tries():
@@ -299,7 +299,7 @@ class ParameterClient(Parameters):
         return False
 
     async def _type_of(self, name: str) -> int:
-        """The type to write a parameter as; only firmware that carries integers byte by byte minds."""
+        """Return the type for writing a parameter; it matters only to firmware that sends integers as bytes."""
         if not self.integers_bytewise:
             return _REAL32
         if name not in self._types:
@@ -339,13 +339,13 @@ class ParameterClient(Parameters):
 
 def _wire_name(name: str) -> bytes:
     data = name.encode("ascii")
-    if len(data) > 16:  # the codec would cut it, and the rest may be another parameter's name
+    if len(data) > 16:  # the codec would truncate it, maybe to another parameter's name
         raise ValueError(f"{name!r} is longer than the 16 characters of a MAVLink parameter name")
     return data
 
 
-# ArduPilot sends every value as a number and ignores the type it is sent back. PX4 puts the bytes of an integer into
-# the float field, and refuses a PARAM_SET whose type is not the parameter's own (autopilots 7.5).
+# ArduPilot sends every value as a number and ignores the type of a PARAM_SET. PX4 puts the bytes of an integer into the
+# float field, and refuses a PARAM_SET whose type is not the parameter's own (autopilots 7.5).
 
 _INTEGER_FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_UINT8: "<B",
@@ -355,17 +355,17 @@ _INTEGER_FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_UINT32: "<I",
     mavlink.MAV_PARAM_TYPE_INT32: "<i",
 }
-_HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}  # MAVLink 1 and 2, by the first byte of a packet
+_HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}  # header lengths of MAVLink 1 and 2, by the first byte of a packet
 
 _REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 
 
 def _decode(message: mavlink.MAVLink_param_value_message, *, bytewise: bool) -> float:
-    """Return the value that a PARAM_VALUE means; integers of 32 bits are exact in a Python float."""
+    """Decode the value of a PARAM_VALUE; a Python float holds 32 bit integers exactly."""
     if not bytewise or message.param_type not in _INTEGER_FORMATS:
         return float(message.param_value)
-    # The bytes as they came: a float that is no number would lose some of its bits on the way through one. The value
-    # is the first field of the payload (param_value float, count, index, id, type).
+    # Use the received bytes: an integer whose bytes are a NaN would lose bits as a float. The value is the first field
+    # of the payload (param_value float, count, index, id, type).
     packet = bytes(message.get_msgbuf() or b"")
     start = _HEADER_BYTES.get(packet[0], len(packet)) if packet else 0
     carried = packet[start : start + 4] or struct.pack("<f", message.param_value)
@@ -373,7 +373,7 @@ def _decode(message: mavlink.MAVLink_param_value_message, *, bytewise: bool) -> 
 
 
 def _encode(value: float, kind: int, *, bytewise: bool) -> float | None:
-    """Return the float that carries a value as a type; None when none can (a fraction, out of range, no number)."""
+    """Encode a value of a type as a float; None: impossible (a fraction, out of range, not a number)."""
     if not bytewise or kind not in _INTEGER_FORMATS:
         return value
     form = _INTEGER_FORMATS[kind]
@@ -384,5 +384,5 @@ def _encode(value: float, kind: int, *, bytewise: bool) -> float | None:
     except (struct.error, OverflowError, ValueError):
         return None
     number: float = struct.unpack("<f", carried)[0]
-    # A pattern that stands for a signalling NaN does not survive as a float.
+    # A bit pattern of a signalling NaN changes in a float.
     return number if struct.pack("<f", number) == carried else None

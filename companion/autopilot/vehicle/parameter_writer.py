@@ -1,7 +1,8 @@
-"""Several parameters as one: all are written, or the old values restored, or the error names those that are not.
+"""Writes of several parameters as one: all are written, or the old values restored, or the error names the rest.
 
-MAVLink knows no transaction, so this is the nearest thing to one (autopilots 8): read each old value, write one by one,
-each guarded, read every one back, check the arm state again; on any failure restore in reverse order, just as guarded.
+MAVLink has no transactions, so this is an approximation (autopilots 8): read each old value, write one by one, each
+guarded, read all back, and check the arm state again. After any failure restore in reverse order, guarded in the same
+way.
 """
 
 from __future__ import annotations
@@ -46,18 +47,18 @@ from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
-TAKEN_S: Final = 1.3  # time until PX4 uses the last value; until then the far one acts
+TAKEN_S: Final = 1.3  # time until PX4 uses the last value; until then it uses the far one
 
 _LATE_ECHO_S: Final = 0.3
-"""Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""
+"""Wait for late answers to earlier writes before reading back: ArduPilot also sends old Y and Z after a write of X."""
 
-_RECOVERY_S: Final = 30.0  # wait for a restarted or silent autopilot before its old values are given up
+_RECOVERY_S: Final = 30.0  # longest wait for a restarted or silent autopilot before a restore is given up
 
-_PUT_BACK_S: Final = 60.0  # longest restore in all, where heartbeats come but answers are bad
+_PUT_BACK_S: Final = 60.0  # longest duration of a restore if heartbeats arrive but answers fail
 
-_TELL_REBOOT_S: Final = 2.0  # for the time since boot, after heartbeats have come back
+_TELL_REBOOT_S: Final = 2.0  # longest wait for the time since boot after heartbeats have come back
 
-_ROUNDS: Final = 2  # attempts of a restore; a late echo may have passed for a confirmation the first time
+_ROUNDS: Final = 2  # attempts of a restore, as a late answer may be mistaken for a confirmation in the first
 
 
 class _Failure(Exception):  # noqa: N818 - never leaves this module
@@ -70,25 +71,25 @@ class ParameterWriter:
     """Writes sets of parameters to one autopilot, one set at a time."""
 
     def __init__(self, parameters: ParameterClient, vehicle: Vehicle) -> None:
-        self.written: dict[str, WrittenParameter] = {}  # by the last operation, whatever its end: also a cancel
+        self.written: dict[str, WrittenParameter] = {}  # outcome of the last operation, whatever its end
         self.left_changed: tuple[str, ...] = ()
-        self.left_far: tuple[str, ...] = ()  # parameters of `left_changed` that have their far value
+        self.left_far: tuple[str, ...] = ()  # parameters of `left_changed` that still have their far value
         self._parameters = parameters
         self._vehicle = vehicle
         self._lock = asyncio.Lock()
         self._boots = 0
-        self._give_up_s = 0.0  # until then wait for a known arm state
-        self._deadline_s = 0.0  # of a restore
+        self._give_up_s = 0.0  # end of the wait for a known arm state
+        self._deadline_s = 0.0  # deadline of a restore
 
     async def apply(self, changes: Sequence[Change], probe: FarProbe | None = None) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
 
-        Vectors with a far value (`Change.via`) come last and one at a time, each verified by `probe`. Returns every
+        Vectors with a far value (`Change.via`) are written last, one at a time, each verified by `probe`. Returns every
         parameter as "stored": read back, its effect not verified. A cancel first restores the old values.
 
         Raises:
-            NothingWrittenError: not disarmed at the start, or the autopilot is just calibrating itself.
-            WriteFailedError: nothing, or everything that could be, is as before.
+            NothingWrittenError: not disarmed at the start, or the autopilot is calibrating itself.
+            WriteFailedError: the old values are restored, except those in `left_changed`.
         """
         async with self._lock:
             items = self._begin(changes)
@@ -103,8 +104,8 @@ class ParameterWriter:
             except (_Failure, AutopilotError) as failure:
                 await self._fail(items, failure)
             except asyncio.CancelledError:
-                # In a task of its own: in a cancelled one asyncio.timeout raises CancelledError when it expires, before
-                # Python 3.11.4, and the rest would not be put back. Debian 12 has 3.11.2.
+                # Restore in another task: before Python 3.11.4, asyncio.timeout raises CancelledError in a cancelled
+                # task when it expires, and the rest would not be restored. Debian 12 has 3.11.2.
                 await asyncio.create_task(self._put_back(items, leave_foreign=False))
                 logger.warning("%s", with_restore("write cancelled", self.left_changed, restored=True))
                 raise
@@ -113,13 +114,13 @@ class ParameterWriter:
             return self._publish(items)
 
     async def restore(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
-        """Restore `before` of every change, last first, as far as possible; returns them as "rolled_back".
+        """Restore `before` of every change, last first, as far as possible; return them as "rolled_back".
 
-        A value that is neither `before` nor `after` is somebody else's and is left.
+        A value that is none of ours and not `before` is somebody else's and stays.
 
         Raises:
-            NothingWrittenError: as `apply`; nothing was restored.
-            WriteFailedError: `left_changed` names what could not be restored.
+            NothingWrittenError: for the reasons of `apply`; nothing was restored.
+            WriteFailedError: `left_changed` names the parameters that could not be restored.
         """
         async with self._lock:
             items = self._begin(changes)
@@ -133,9 +134,9 @@ class ParameterWriter:
             return self.written
 
     async def undo(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
-        """Restore `before` of every change, or none: refused when somebody has changed one since.
+        """Restore `before` of every change, or of none; refuse if somebody has changed one since.
 
-        Raises as `apply`; "rolled_back" in the error then means that the value from before the undo is in force.
+        Raises the errors of `apply`; in them "rolled_back" means that the value from before the undo is restored.
         """
         swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
         done = await self.apply(swapped)
@@ -145,7 +146,7 @@ class ParameterWriter:
         }
         return self.written
 
-    # --- forward
+    # --- writing
 
     def _begin(self, changes: Sequence[Change]) -> list[PendingChange]:
         names = [change.parameter for change in changes]
@@ -169,9 +170,9 @@ class ParameterWriter:
                 raise _Failure("changed by someone else", reads_otherwise(name, now, before))
 
     async def _write_by_far(self, vectors: Sequence[PendingVector], probe: FarProbe | None) -> None:
-        """Write one vector after another: its far value, and when that is in use all new values, the far axis last.
+        """Write one vector after another: its far value and, once that is in use, all new values, the far axis last.
 
-        So whatever ends this, the far axis differs from its old value as long as any other axis does.
+        With this order, if anything ends the write, the far axis differs from its old value while any other axis does.
         """
         wrong: list[str] = []
         for far, others in vectors:
@@ -182,18 +183,18 @@ class ParameterWriter:
                     await self._write_new(item)
                 await self._write(far, far.change.after)
             else:
-                # The other vectors go on: each tells which IMU its slot acts on.
+                # Continue with the other vectors: each shows the IMU on which its slot acts.
                 wrong.append(words)
                 await self._write(far, far.change.before)
             far.is_far = False
         if vectors:
-            # Whoever is told that it is done may arm.
+            # Wait until PX4 uses the values: the pilot may arm as soon as the write is reported as done.
             await VehicleTimer(self._vehicle).let_pass(POLL_S)
         if wrong:
             raise _Failure("wrong slot, orientation or scale", "; ".join(wrong))
 
     async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
-        """Write the far value and wait until it is in use; return why it is not, if so."""
+        """Write the far value and wait until it is in use; return the reason if it is not."""
         verify = None if probe is None else probe(item.change.parameter)
         await self._write(item, item.change.far)
         item.is_far = True
@@ -241,21 +242,21 @@ class ParameterWriter:
         self._parameters.require_same_boot(self._boots, f"{name} was read")
         return value
 
-    # --- back
+    # --- restoring
 
     async def _fail(self, items: list[PendingChange], failure: _Failure | AutopilotError) -> None:
-        """Find out what happened to the autopilot, restore the old values, and raise WriteFailedError."""
+        """Find the cause of a failure, restore the old values, and raise WriteFailedError."""
         reason = str(failure)
         kind = failure.kind if isinstance(failure, _Failure) else kind_of(failure, self._vehicle, self._boots)
         if not self._vehicle.alive and any(item.sent for item in items):
-            # It fell silent: if it comes back, learn first whether it restarted.
+            # The autopilot is silent: if it comes back, find out first whether it restarted.
             self._give_up_s = asyncio.get_running_loop().time() + _RECOVERY_S
             if await self._wait_disarmed():
                 await self._vehicle.hear_boot_time(_TELL_REBOOT_S)
         elif kind in ("answered another value", "changed by someone else", "no answer") and any(
             item.sent for item in items
         ):
-            # Another value may be that of a start-up calibration, which is not ours to overwrite.
+            # Check for a restart: a different value may be that of a start-up calibration, which must stay.
             await self._vehicle.hear_boot_time()
         if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
             kind, name, doing = "rebooted in the middle", self._vehicle.name, f"its parameters were written ({reason})"
@@ -264,10 +265,10 @@ class ParameterWriter:
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
     async def _put_back(self, items: list[PendingChange], *, leave_foreign: bool) -> None:
-        """Restore old values in reverse order, a vector with a far value by way of it, until the deadline."""
+        """Restore old values in reverse order until the deadline; vectors with a far value get that value first."""
         touched = [item for item in reversed(items) if item.sent]
         for item in touched:
-            item.outcome, item.left, item.read_back = "failed", True, None  # until known better
+            item.outcome, item.left, item.read_back = "failed", True, None  # until read back
         now_s = asyncio.get_running_loop().time()
         self._give_up_s, self._deadline_s = now_s + _RECOVERY_S, now_s + _PUT_BACK_S
         try:
@@ -300,8 +301,8 @@ class ParameterWriter:
         if not await self._wait_disarmed() or self._late():
             return
         if leave_foreign or item.confirmed:
-            # What is neither ours nor the old value came from a start-up calibration or another ground station. Of a
-            # value that was never confirmed nobody knows: it may be what the autopilot has made of ours.
+            # A value that is neither ours nor the old one came from a start-up calibration or another ground station.
+            # But if ours was never confirmed, it may also be the autopilot's version of ours.
             now = await self._read_in_force(change.parameter)
             known = (change.before, *change.ours)
             if not any(_same(now, value) for value in known) and (leave_foreign or now is not None):
@@ -325,9 +326,9 @@ class ParameterWriter:
         return None
 
     async def _wait_disarmed(self) -> bool:
-        """Wait until the arm state is known, for a limited time in all; whether it is disarmed."""
+        """Wait until the arm state is known, at most until `_give_up_s`; return whether it is disarmed."""
         loop = asyncio.get_running_loop()
-        # The state may become known without an event, so there is none to wait for.
+        # Poll, as the state may become known without an event.
         while self._vehicle.arm_state is ArmState.UNKNOWN and loop.time() < self._give_up_s:
             await asyncio.sleep(0.1)
         return self._vehicle.arm_state is ArmState.DISARMED
@@ -358,7 +359,7 @@ class ParameterWriter:
 
 
 def kind_of(error: CompanionError, vehicle: Vehicle, boots: int) -> FailureKind:
-    """The cause in a word of what has ended a write; `boots`: restarts of the autopilot until it began."""
+    """Return the kind of failure that ended a write; `boots`: count of restarts when the write began."""
     if vehicle.boots != boots or isinstance(error, AutopilotRebootedError):
         return "rebooted in the middle"
     if isinstance(error, WriteFailedError):

@@ -1,8 +1,8 @@
-"""The autopilot as seen from outside: which one it is, whether it is armed, whether it restarted, where it stands.
+"""State of the autopilot as seen over the link: identity, arm state, restarts and place.
 
-`arm_state` is what its heartbeats say: UNKNOWN as soon as the last one is 2 s old, and after a restart until the next
-one; DISARMED only when no armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`heartbeats`).
-Heartbeats tell the past: whoever writes to the autopilot asks `disarmed.ensure` before every message that leaves.
+`arm_state` follows the heartbeats: UNKNOWN once the last one is 2 s old, and after a restart until the next one;
+DISARMED only if no armed heartbeat with the vehicle's ids has come for 3 s, from any sender (`heartbeats`). Heartbeats
+may be old, so code that writes to the autopilot calls `disarmed.ensure` before every message.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ __all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 
 logger = logging.getLogger(__name__)
 
-HEARTBEAT_TIMEOUT_S: Final = 2.0  # older, nobody knows whether the aircraft is armed (autopilots 8)
+HEARTBEAT_TIMEOUT_S: Final = 2.0  # age of the last heartbeat beyond which the arm state is unknown (autopilots 8)
 
 _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
-_SLOWEST: Final = 5.0  # the most of our seconds that are given for one of the autopilot's
+_SLOWEST: Final = 5.0  # longest wait for one second of the autopilot's clock, in seconds of ours
 _POLL_S: Final = 0.05
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
-"""Events of `Vehicle.on_event`. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
-says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them.
-"disarmed" comes when that is believed: 3 s after the last armed heartbeat."""
+"""Events of `Vehicle.on_event`. "found": latched, or heard again after "lost". "armed" and "disarmed": the state in the
+heartbeat differs from the one before; the very first heartbeat causes "found" and one of them. "disarmed" comes when
+that is believed: 3 s after the last armed heartbeat."""
 
 
 class Vehicle:
-    """The one autopilot that is calibrated: the vehicle's of that system id, else the first real one that is heard.
+    """The autopilot to calibrate: that of the given system id, otherwise the first real one heard.
 
-    Once latched it stays, and the link's system id follows. `is_carried`: as for `TimeAndPlace`.
+    The choice is final ("latched"), and the link's system id follows it. `is_carried`: see `TimeAndPlace`.
 
-    A real autopilot is a heartbeat with a known autopilot type and the type of a vehicle: ground stations,
-    gimbals, ADS-B receivers and the like are ignored, whatever they claim. Component 1 is taken at once; another
-    component only if it is ArduPilot or PX4 and component 1 stays silent for 2 s.
+    A real autopilot sends heartbeats with a known autopilot type and the type of a vehicle; those of ground stations,
+    gimbals, ADS-B receivers and the like are ignored. Component 1 is latched at once, another component only if it is
+    ArduPilot or PX4 and component 1 stays silent for 2 s.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Vehicle:
         self.kind: Firmware = UNHEARD
         self.version: str | None = None  # Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come
         self.capabilities: int | None = None  # MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come
-        self.uid: str | None = None  # the board's; like version and capabilities None until AUTOPILOT_VERSION has come
+        self.uid: str | None = None  # id of the board; None until AUTOPILOT_VERSION has come
         self.system_status: int | None = None
         self.signs = False  # The autopilot signed its last heartbeat (MAVLink 2)
         self.boots = 0
@@ -98,7 +98,7 @@ class Vehicle:
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
-        # Before anybody else hears of the message that shows a restart.
+        # Subscribe first, so that a restart is detected before any other handler gets the message that shows it.
         for kind in (
             mavlink.MAVLink_system_time_message, mavlink.MAVLink_global_position_int_message,
             mavlink.MAVLink_attitude_message, mavlink.MAVLink_scaled_imu_message, mavlink.MAVLink_scaled_imu2_message,
@@ -120,7 +120,7 @@ class Vehicle:
 
     @property
     def arm_state(self) -> ArmState:
-        """ARMED or DISARMED while the latched autopilot's last heartbeat is younger than 2 s, else UNKNOWN.
+        """ARMED or DISARMED while the latched autopilot's last heartbeat is younger than 2 s, otherwise UNKNOWN.
 
         ARMED for 3 s after any armed heartbeat; UNKNOWN while there is a `conflict`.
         """
@@ -134,7 +134,7 @@ class Vehicle:
 
     @property
     def conflict(self) -> str | None:
-        """Description of two autopilots under the ids of one; then the arm state is UNKNOWN. None without."""
+        """Description of two autopilots with the same ids, which makes the arm state UNKNOWN; None: no conflict."""
         return self._arming.conflict(asyncio.get_running_loop().time(), self.system_id)
 
     @property
@@ -156,7 +156,7 @@ class Vehicle:
 
     @property
     def why_silent(self) -> str:
-        """Return a possible cause, to append to the words that the autopilot is heard but does not answer."""
+        """Possible cause if the autopilot is heard but does not answer, to append to a message; may be empty."""
         return "; the autopilot signs its messages: does it refuse unsigned ones?" if self.signs else ""
 
     def sent(self, message: Message) -> bool:
@@ -166,15 +166,15 @@ class Vehicle:
     def hear(
         self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: FirmwareName | None = None
     ) -> None:
-        """Hand over every such message of the latched autopilot; with a rate, ask for it (`of` a firmware) too."""
+        """Call `handler` with every such message of the latched autopilot; `rate_hz`: request it (`of` a firmware)."""
         self._link.subscribe(message, self._of_ours(handler))
         if rate_hz is not None:
             self._wanted.add(message, rate_hz, of)
 
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
-        """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
+        """Request the time since boot and wait for it; afterwards `boots` counts every restart until now.
 
-        Without this a quick restart shows only once its time messages come again. False: none came in time.
+        Otherwise a quick restart shows only when time messages arrive again. Returns False if none came in time.
         """
         request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
@@ -229,24 +229,24 @@ class Vehicle:
             self._ask_soon()
             self._tell("found")
         self._wanted.heard(message, now_s)
-        # A disarmed heartbeat within 3 s of an armed one is neither news yet.
+        # A disarmed heartbeat within 3 s after an armed one causes no event yet.
         believed = armed == self._arming.armed(now_s) and not self._arming.contradicts_itself(now_s)
         if believed and armed is not self._armed_told:
             self._armed_told = armed
             self._tell("armed" if armed else "disarmed")
 
     def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
-        """Check that a heartbeat under our ids is our vehicle's: ArduPilot and PX4 both are system 1 by default."""
+        """Check that a heartbeat with our vehicle's ids is from it: ArduPilot and PX4 are both system 1 by default."""
         kind = firmware_with(message.autopilot)
         if kind is self.kind:
             return True
         if kind is OTHER:
-            return False  # some device that pretends; whether it is armed means nothing
+            return False  # another device uses the ids; its arm state means nothing
         if not self._lost:
             self._arming.two_seen(asyncio.get_running_loop().time())
             self._log_conflict()
             return False
-        # Another firmware has been flashed while we heard nothing.
+        # Another firmware was flashed while no heartbeats arrived.
         self.kind = kind
         self.boot = BootClock()
         self._arming.flashed()
@@ -256,8 +256,8 @@ class Vehicle:
     def _is_on_our_link(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
         """Check that a heartbeat was signed on the link on which we hear the autopilot.
 
-        It signs each of its links apart: what was held back on another one is not news here. Unsigned heartbeats
-        (None) count until the first signed one.
+        The autopilot signs each of its links separately, so a delayed message of another link is recognised. Unsigned
+        heartbeats (None) count until the first signed one.
         """
         link_id = self._link.signed_on(message)
         if self._lost or self._heartbeat_link_id is None:
@@ -284,14 +284,14 @@ class Vehicle:
         self.found.clear()
         self._tell("lost")
 
-    # --- what is asked for
+    # --- requests
 
     def _tick(self) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         if self._stalled(now_s):
             logger.warning("%s", message("program_stood_still", seconds=f"{now_s - self._tick_due_s:.1f}"))
-            self._link.settled()  # what has waited is no news
+            self._link.settled()  # messages that waited meanwhile are old
         self._tick_due_s = now_s + _TICK_S
         self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
         if not self._lost:
@@ -301,22 +301,22 @@ class Vehicle:
             self._wanted.ask_for_missing(now_s, self.firmware)
 
     def _stalled(self, now_s: float) -> bool:
-        """Check whether our own loop stood still, and messages that waited meanwhile are not read yet."""
+        """Check whether our own loop was stopped, so that messages may have waited unread."""
         return now_s - self._tick_due_s > _STALL_S
 
     def _ask_soon(self) -> None:
-        # What was streamed before a loss is gone if the autopilot restarted meanwhile.
+        # The streams have ended if the autopilot restarted while it was lost.
         self._wanted.forget_asking()
         self._wanted.ask_for_missing(asyncio.get_running_loop().time(), self.firmware)
 
-    # --- what the other messages tell
+    # --- other messages
 
     def _on_boot_ms(self, message: Any, t_s: float) -> None:
         if self.sent(message):
             self._follow(message.time_boot_ms * 1e-3, t_s)
 
     def _on_boot_us(self, message: Any, t_s: float) -> None:
-        # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
+        # Skip UTC, which the field may carry instead of the time since boot.
         if self.sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
             self._follow(message.time_usec * 1e-6, t_s)
 
@@ -355,15 +355,15 @@ class Vehicle:
         self.capabilities = message.capabilities
         self.uid = unique_id(message)
         if before[0] is not None and before != (self.version, self.capabilities, self.uid):
-            # Within one boot it does not change: one of the two is forged, and the autopilot speaks last.
+            # The version cannot change within a boot, so one is forged: request it again for the true one.
             self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
 
 class VehicleTimer:
-    """This instant on our clock and on the autopilot's, which a simulated one on a busy machine lets run slower.
+    """Timer since its creation, on our clock and on the autopilot's, which is slower in a simulator on a busy machine.
 
-    What an autopilot does "at most once a second" (autopilots 9.2) it does by its own clock. To conclude after so many
-    of our seconds that it has ignored a value would blame a slow simulator for what it had no time to do.
+    An autopilot does things "at most once a second" (autopilots 9.2) by its own clock. By our clock alone, a slow
+    simulator that had no time to use a value would seem to have ignored it.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -371,7 +371,7 @@ class VehicleTimer:
         self._boot, self._boots = vehicle.boot.latest, vehicle.boots
 
     def has_passed(self, seconds: float) -> bool:
-        """Check that so much time has passed on both clocks; on ours alone while the other is unknown."""
+        """Check that this time has passed on both clocks; on ours alone while the other is unknown."""
         gone_s = asyncio.get_running_loop().time() - self._t_s
         if gone_s < seconds:
             return False

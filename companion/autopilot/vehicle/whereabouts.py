@@ -1,8 +1,8 @@
-"""Time and place by the autopilot, as far as they can be believed.
+"""Time and place reported by the autopilot, after checks against faults and forgery.
 
-A place is believed when it may be one, and once it has been said again. While the aircraft stands still it does not
-change by more than matters: what is farther off is believed only after it has been said for half a minute without
-contradiction. Until then the old place stays, and `doubt` says what a calibration waits for.
+A first place is accepted if it is possible and has been repeated. While the aircraft stands still, a place much farther
+off is accepted only after half a minute of reports without contradiction. Until then the old place stays, and `doubt`
+gives the reason why a calibration waits.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
-LATEST_UNIX_TIME_S: Final = 4102444800.0  # 2100: later is no time but a fault
+LATEST_UNIX_TIME_S: Final = 4102444800.0  # the year 2100; a later time is a fault
 
 FAR_M: Final = 10_000.0
-"""Less changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h at most, and is more than GNSS wanders."""
-FAR_HEIGHT_M: Final = 300.0  # 0.1 mg of gravity, half of what a calibration aims at; GNSS wanders by less
+"""Least distance that matters: it changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h at most; GNSS wanders
+by less."""
+FAR_HEIGHT_M: Final = 300.0  # least height that matters: 0.1 mg of gravity, half of a usual target; GNSS wanders less
 
-CONFIRMED_AFTER_S: Final = 2.5  # a first place: what one packet says is not enough
+CONFIRMED_AFTER_S: Final = 2.5  # time of reports before a first place is accepted: one packet is not enough
 SETTLED_AFTER_S: Final = 30.0
-SILENT_S: Final = 5.0  # time for which a place counts after it was said last
+SILENT_S: Final = 5.0  # time for which a reported place counts without a further report
 
 _EARTH_RADIUS_M: Final = 6_371_000.0
 _ESTIMATE: Final = "autopilot GLOBAL_POSITION_INT"
@@ -39,7 +40,7 @@ _RECEIVER: Final = "autopilot GPS_RAW_INT"
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Position:
-    """Position by the autopilot; the height is above mean sea level."""
+    """Position reported by the autopilot; the height is above mean sea level."""
 
     latitude_deg: float
     longitude_deg: float
@@ -48,29 +49,29 @@ class Position:
 
 
 class TimeAndPlace:
-    """Takes the autopilot's messages; whoever calls has made sure that they are the autopilot's.
+    """Time and place from messages; the caller must check that they are the autopilot's.
 
-    `is_carried`: whether the aircraft moves, or may fly: then its place changes rightly.
+    `is_carried` returns whether the aircraft moves, or may fly, so that its place may change.
     """
 
     def __init__(self, is_carried: Callable[[], bool] = lambda: False) -> None:
         self.position: Position | None = None
         self._is_carried = is_carried
-        self._anchor: Position | None = None  # that others are compared with; stays while the aircraft stands still
-        self._claim: Position | None = None  # said and not believed yet; None: nowhere on Earth
+        self._anchor: Position | None = None  # accepted place, compared with reports; stays while the aircraft does
+        self._claim: Position | None = None  # reported, not accepted yet; None: an impossible place
         self._since_s = self._heard_s = -math.inf
         self._unix_minus_loop_s: float | None = None
 
     @property
     def unix_time_s(self) -> float | None:
-        """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
+        """UTC of the autopilot (from its GNSS), extrapolated by the loop's clock; None: it has no UTC."""
         if self._unix_minus_loop_s is None:
             return None
         return self._unix_minus_loop_s + asyncio.get_running_loop().time()
 
     @property
     def doubt(self) -> str | None:
-        """Why the place is not known for sure at this moment, and what helps; None while it is, or none is said."""
+        """Reason why the place is in doubt at this moment, and the remedy; None: no doubt, or no place reported."""
         now_s = asyncio.get_running_loop().time()
         if now_s - self._heard_s >= SILENT_S:
             return None
@@ -82,7 +83,7 @@ class TimeAndPlace:
         return message("position_in_doubt", change=change, seconds=f"{left_s:.0f}")
 
     def restarted(self) -> None:
-        """Forget what the autopilot has said; an aircraft that stands still is where it was."""
+        """Forget the autopilot's reports, but keep the accepted place for comparison: the aircraft stands still."""
         self.position = self._claim = self._unix_minus_loop_s = None
         self._heard_s = -math.inf
 
@@ -104,7 +105,7 @@ class TimeAndPlace:
     def _hear(self, place: Position | None, t_s: float) -> None:
         if _is_near(place, self._anchor):
             self.position = place
-            self._since_s = t_s  # who contradicts it begins anew
+            self._since_s = t_s  # a contradicting place must be reported for the full time again
         elif place is not None and _is_near(place, self.position) and self._is_carried():
             self.position = self._anchor = place
         elif t_s - self._heard_s >= SILENT_S or not _is_near(place, self._claim):
@@ -119,7 +120,7 @@ class TimeAndPlace:
 
 
 def _position(latitude_1e7: int, longitude_1e7: int, height_mm: int, source: str) -> Position | None:
-    # (0, 0) is what ArduPilot sends while it knows no position.
+    # ArduPilot sends (0, 0) while it knows no position.
     if (latitude_1e7, longitude_1e7) == (0, 0):
         return None
     place = Position(latitude_1e7 * 1e-7, longitude_1e7 * 1e-7, height_mm * 1e-3, source)

@@ -1,1 +1,1 @@
-"""The calibration in force, the arm gate, and automatic calibrations."""
+"""The active calibration, the arm gate, and automatic calibrations."""

@@ -1,11 +1,11 @@
 """Automatic calibrations, so that a fresh result is active before anyone arms.
 
 While the aircraft is disarmed and still, and at_arm is "gate" or "warn", it is calibrated at the first opportunity, and
-again when that is worth it. Every write wears the autopilot's flash: offsets that a still window confirms are not
-written again, and the writes of a day are bounded, also over restarts.
+again when new offsets would be clearly better. Every write wears the autopilot's flash: offsets that a still window
+confirms are not written again, and the number of writes a day is limited, also across restarts.
 
-Choices of people are never overwritten: after an undo, a cancel, or a change by another station automatic calibrations
-stop until the next request or restart, with a message.
+Choices of people are never overwritten: after an undo, a cancel, or a change by another station, automatic calibrations
+stop with a message until the next request or restart.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ POLL_S: Final = 1.0
 SPACING_S: Final = 300.0
 """Least time between automatic writes; sigma_use holds for 180 s."""
 WORTH_FOR_S: Final = 30.0
-"""Time of better windows before good offsets are replaced."""
+"""Time for which every window must promise better offsets before good offsets are replaced."""
 PER_DAY: Final = 24
-"""Most automatic writes a day: some 300 parameters; a page of flash bears 10 000 rewrites."""
+"""Most automatic writes a day, some 300 parameters; a flash page withstands 10 000 rewrites."""
 FAILURES: Final = 3
 RETRY_S: Final = 60.0  # Wait after a failure; doubled with each further one
 TIMEOUT_S: Final = 180.0
 
 
 class Automatic:
-    """Starts calibrations by itself; `run` decides when."""
+    """Starts automatic calibrations; `run` decides when."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], in_force: ActiveCalibration) -> None:
         self._core, self._manager, self._imus, self._in_force = core, in_force.manager, imus, in_force
@@ -56,7 +56,7 @@ class Automatic:
         self._failures = 0
         self.turns = 0
         self.stopped: str | None = None
-        """Reason to wait for a request; None while it works."""
+        """Reason why automatic calibrations stopped until a request; None while they go on."""
 
     @property
     def wanted(self) -> bool:
@@ -64,20 +64,20 @@ class Automatic:
         return wanted.at_arm != "off" and wanted.push and self._core.only_listening is None
 
     def why_not(self) -> str | None:
-        """Return the remedy where none will start by itself; None when one will as soon as needed."""
+        """Return the remedy if no automatic calibration can start now; None: one starts as soon as it is needed."""
         if not self.wanted or self.stopped is not None:
             return "calibrate"
         if self._writes_today() >= PER_DAY:
             return "calibrate (flash spared)"
         now_s = asyncio.get_running_loop().time()
-        # Offsets replaced by a boot, or a new zero, are urgent, unless a calibration has failed.
+        # Offsets replaced by a boot, and a new gradienter zero, are urgent unless a calibration has failed.
         urgent = any(finding.why in (Why.REPLACED, Why.ALIGNED) for finding in self._in_force.findings(now_s))
         if self._next_s > now_s and not (urgent and self._failures == 0):
             return f"again in {math.ceil((self._next_s - now_s) / 60)} min"
         return None
 
     def _writes_today(self) -> int:
-        # A clock that has jumped: writes in the future count as of today.
+        # If the clock has jumped back, writes in its future count as today's.
         since_s = time.time() - 86400.0
         return sum(write["at_unix_s"] > since_s for write in self._writes)
 
@@ -106,7 +106,7 @@ class Automatic:
                 logger.info("nothing is written by itself: %s", answer.reason)
 
     async def _still_ours(self) -> bool:
-        """Read the offsets, as another station may have set them unnoticed."""
+        """Read the offsets and return whether they are unchanged; another station may have set them unnoticed."""
         try:
             same = [await imu.refresh() for imu in self._imus.values()]
         except AutopilotError as error:

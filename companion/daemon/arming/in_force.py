@@ -1,8 +1,8 @@
 """The active calibration of each IMU, its age, and the findings against it.
 
-Three inputs: calibrations that end, the offsets that the autopilot reports (`OffsetWatch`), and the output in the
-rolling window. A result that contradicts earlier ones and that nobody requested is held back: the active calibration
-and the gate stay as they are, until somebody requests a calibration or the output changes again.
+The inputs are finished calibrations, the offsets that the autopilot reports (`OffsetWatch`), and the output in the
+rolling window. The result of an automatic calibration is held back if it contradicts earlier ones: the active
+calibration and the gate stay as they are until somebody requests a calibration or the output changes again.
 """
 
 from __future__ import annotations
@@ -46,29 +46,30 @@ from companion.samples import TRIADS, Triad, rows_of
 
 logger = logging.getLogger(__name__)
 
-# Offsets that the pilot restored or somebody else set stay until a request; those replaced by a boot are written again.
+# Reasons that a good window clears. It does not clear the others: offsets restored by the pilot or set by somebody else
+# stay until a request, and offsets replaced by a boot are written again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
-"""Findings that count although a result is held back: choices of people, and writes without a seen effect."""
-SETTLED_EVERY_S: Final = 5  # Interval of checks of the output without a finding; otherwise every second
+"""Findings that count even while a result is held back: choices of people, and writes without a visible effect."""
+SETTLED_EVERY_S: Final = 5  # Interval between checks of the output while there is no finding; otherwise 1 s
 
 
 @dataclasses.dataclass(slots=True)
 class _TriadState:
-    """Gyros or accelerometers of one IMU: `held` is the active calibration, or why there is none."""
+    """State of the gyros or accelerometers of one IMU; `held`: the active calibration, or why there is none."""
 
     held: Held | Why = Why.NEVER
     shelved: Held | None = None
-    """State before a restart that kept the offsets; restored once a window agrees."""
+    """Calibration before a restart that kept the offsets; active again once a window agrees with it."""
     present: Present | None = None
     in_doubt: tuple[str, Held] | None = None
-    """Reason and value of a result held back, as long as the output stays there."""
+    """Result held back, with its reason; dropped when the output no longer agrees with it."""
     judged: bool = True
-    """False: its integer readings carry no information."""
+    """False: integer readings too coarse to show the bias, so this triad is left out."""
 
 
 class ActiveCalibration:
-    """The active calibration; `poll` often, `measure` whenever there may be a new window."""
+    """The active calibration; call `poll` often, and `measure` whenever there may be a new window."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
@@ -79,7 +80,7 @@ class ActiveCalibration:
             "gyro": settings.target_gyro_sigma_rad_s,
             "accel": settings.target_accel_sigma_m_s2,
         }
-        # The IMUs that the autopilot flies with; where it has none of them, all.
+        # IMUs used by the autopilot; if it uses none of the configured ones, all of them.
         flown = [imu.name for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
         names = flown or [imu.name for imu in config.imu]
         self.what = What.BOTH if config.gradienter is not None else What.GYROS
@@ -91,11 +92,11 @@ class ActiveCalibration:
         self._worth_since_s: float | None = None
         self.offsets = OffsetWatch(core.vehicle, imus, self._lose)
         self.calibration: Record | None = None
-        """The last finished calibration of this run, while any of its values is active."""
+        """Record of the last finished calibration of this run; None after an undo."""
         self.undone = False
         calibrating.alignment.on_change.add(self._realigned)
 
-    # --- what is known
+    # --- state
 
     def findings(self, now_s: float) -> list[Objection]:
         found: list[Objection] = []
@@ -126,12 +127,12 @@ class ActiveCalibration:
 
     @property
     def earlier(self) -> Record | None:
-        """The last good calibration, also from before this start, if it has not been undone."""
+        """The last good calibration, from this run or an earlier one, unless it was undone."""
         return None if self.undone else self.manager.last_good
 
     @property
     def worth_writing_s(self) -> float:
-        """Seconds for which every window has promised better offsets; one in a hundred does so by chance."""
+        """Seconds for which every window has promised better offsets; one window in a hundred does so by chance."""
         return 0.0 if self._worth_since_s is None else self._measured_s - self._worth_since_s
 
     @property
@@ -144,19 +145,19 @@ class ActiveCalibration:
 
     @property
     def calibrated_s(self) -> float | None:
-        """Time of the oldest active calibration; None where offsets were only confirmed."""
+        """Time of the oldest active calibration; None if some offsets were only confirmed, not calibrated."""
         times = [held.calibrated_s for held in self._judged if isinstance(held, Held)]
         known = [time_s for time_s in times if time_s is not None]
         return min(known) if times and len(known) == len(times) else None
 
     @property
     def confirmed_s(self) -> float | None:
-        """Time at which all offsets were last confirmed; None while some never were."""
+        """Time since which all offsets are confirmed (the oldest confirmation); None while some never were."""
         known = [held.confirmed_s for held in self._judged if isinstance(held, Held)]
         return min(known) if known and len(known) == len(self._judged) else None
 
     def sigma(self, triad: Triad) -> float | None:
-        """Return the largest active sigma_use, rad/s or m/s^2; None without any."""
+        """Return the largest active sigma_use, rad/s or m/s^2; None: no active calibration."""
         held = [state.held for (_, of), state in self._triads.items() if of == triad]
         return max((max(each.sigma_use) for each in held if isinstance(each, Held)), default=None)
 
@@ -170,7 +171,7 @@ class ActiveCalibration:
         found = ((name, imu.obstacle) for name, imu in self._imus.items())
         return next((f"imu {name}: {obstacle}" for name, obstacle in found if obstacle is not None), None)
 
-    # --- what happens
+    # --- events
 
     def on_ended(self, job: Job, result: JobResult) -> None:
         self._forget_window()
@@ -188,7 +189,7 @@ class ActiveCalibration:
 
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
         corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s
-        # Without telemetry of an IMU "stored" is the best outcome.
+        # For an IMU without telemetry "stored" is the best possible outcome, so it counts as seen.
         for triad in TRIADS:
             seen = outcomes_of(triad, imu.written) <= {"verified"} or not corrected
             found = held_of(imu, triad, now_s, averaged_s, corrected=corrected, seen=seen)
@@ -218,9 +219,9 @@ class ActiveCalibration:
 
     def _lose(self, name: str, why: Why) -> None:
         for state in (state for key, state in self._triads.items() if key[0] == name and state.judged):
-            if why is not Why.REBOOTED:  # which has kept them
+            if why is not Why.REBOOTED:  # a reboot keeps the offsets, so a result held back stays held back
                 state.in_doubt = None
-            # A restart does not change offsets that never were, or that were restored on purpose.
+            # A restart changes nothing where there was no active calibration, or the offsets were restored on purpose.
             if isinstance(state.held, Held) or why in (Why.CHANGED, Why.FAILED):
                 if isinstance(state.held, Held) and why is Why.REBOOTED:
                     state.shelved = state.held
@@ -232,8 +233,8 @@ class ActiveCalibration:
             state.present = None
 
     async def measure(self, now_s: float) -> bool:
-        """Check the present output when due; return whether it was."""
-        second = math.floor(now_s)  # the collector's seconds end with the clock's
+        """Check the present output if due; return whether a check was made."""
+        second = math.floor(now_s)  # the collector's seconds end on whole seconds of the clock
         settled = self.measured and self._worth_since_s is None and not self.findings(now_s)
         if second == self._looked_s or (settled and second - self._looked_s < SETTLED_EVERY_S):
             return False
@@ -251,7 +252,7 @@ class ActiveCalibration:
         except CalibrationRefusedError:
             self._forget_window()
             return True
-        if known == self.offsets.known():  # else the offsets have changed during the estimate
+        if known == self.offsets.known():  # otherwise the offsets have changed during the estimate
             self._note(solution, window.end_s, window.end_s - window.start_s)
             await self._memory.look(solution)
         return True
@@ -290,7 +291,7 @@ class ActiveCalibration:
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:
-        """Drop a result held back once the output agrees with the active one, or with neither, or after long."""
+        """Return whether a result stays held back: while it is recent, and only it agrees with the output."""
         if state.in_doubt is None:
             return False
         measured = state.in_doubt[1]
@@ -322,12 +323,12 @@ class ActiveCalibration:
                     averaged_s=averaged_s,
                 )
         elif worst_axis(held, present) is None and (end_s > held.confirmed_s or not held.seen):
-            # A write voids earlier telemetry, so that this window was sent under the new offsets.
+            # A write voids earlier telemetry, so this window was sent under the new offsets.
             confirmed_s = max(end_s, held.confirmed_s)
             state.held = msgspec.structs.replace(held, confirmed_s=confirmed_s, temperature_degc=degc, seen=True)
 
     def _from_record(self, key: Key, now_s: float) -> Held | None:
-        """Return the calibration before this start, if the IMU has run with its offsets ever since."""
+        """Return the calibration from before this start if the IMU has run with its offsets ever since."""
         (name, triad), record = key, self.earlier
         calibration = self._imus[name].calibration if name in self._imus else None
         imu = None if record is None else next((each for each in record.imus if each.name == name), None)
@@ -339,5 +340,5 @@ class ActiveCalibration:
         found = held_of(imu, triad, now_s, self._config.calibration.min_still_s, corrected=True, seen=False)
         if found is None or not self._memory.on_since(name, record.started_at):
             return None
-        # No clock of now tells how long ago that was.
+        # Its age is unknown: the present clock began after it.
         return msgspec.structs.replace(found, calibrated_s=None)

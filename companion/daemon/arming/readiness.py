@@ -1,7 +1,7 @@
 """The answer to an arming request with its reason, prepared four times a second.
 
-PX4 waits for it with its commander thread stopped (autopilots 5.2): nothing may be computed, read or awaited then.
-`Readiness._reasons` lists the reasons against arming in the order in which they are reported, also without a gate.
+PX4's commander thread stops until the answer arrives (autopilots 5.2), so nothing is computed, read or awaited then.
+`Readiness._reasons` lists the reasons against arming in the order in which they are reported, with or without a gate.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
 """Stillness required after somebody has let go of the aircraft."""
-COUNTDOWN_KEPT_S: Final = 2.0  # Age at which a countdown starts anew
-OLDEST_ANSWER_S: Final = 1.5  # Age at which an answer that was not renewed is void
+COUNTDOWN_KEPT_S: Final = 2.0  # Age of the last countdown beyond which it may rise again
+OLDEST_ANSWER_S: Final = 1.5  # Age at which an answer that was not updated is void
 _STEPS: Final[dict[State, str]] = {
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
@@ -45,7 +45,7 @@ _CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.REBOOTED: "checking after restart",
     Why.UNSEEN: _STEPS[State.VERIFYING],
 }
-"""Findings that the next still window settles by itself."""
+"""Findings that the next still window clears without a calibration."""
 _NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
 """Conditions without which the gate stays closed, whatever calibration is active."""
 _WAITS: Final = {
@@ -53,13 +53,13 @@ _WAITS: Final = {
     Precondition.RESTORED: f"{_STEPS[State.UNDOING]}: wait",
 }
 LATE_S: Final = 2.0
-"""Time until the last second of telemetry is complete and judged."""
+"""Delay until the last second of telemetry is complete and checked."""
 
 ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
 
 class Readiness:
-    """The arm gate's answer with its words; `run` keeps it fresh."""
+    """The arm gate's answer with its reason; `run` keeps it fresh."""
 
     def __init__(self, core: Core, owed: RebootOwed, in_force: ActiveCalibration, automatic: Automatic) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
@@ -69,7 +69,7 @@ class Readiness:
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._countdown = -math.inf, math.inf
-        """Time of the last countdown to a calibration, and the seconds that it named."""
+        """Time at which the countdown to a calibration was last computed, and its seconds."""
         self._has_gated = False
         self.turns = 0
 
@@ -79,7 +79,7 @@ class Readiness:
 
     @property
     def asks_script(self) -> bool:
-        """Return whether ArduPilot's script gets the answer: while this gates, and afterwards, to release it."""
+        """Return whether ArduPilot's script gets the answer: while the gate is on, and afterwards, to release it."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
 
@@ -98,12 +98,12 @@ class Readiness:
             try:
                 self.update()
                 await asyncio.sleep(0)  # answer a request that has arrived meanwhile
-                # The output during a write says nothing about the offsets after it.
+                # The output during a write does not show the effect of the offsets after it.
                 if not self._writing and await self._measured(loop.time()):
                     self.update()
                 self.turns += 1
             except Exception:
-                # Without a renewed answer the gate closes by itself.
+                # Without an updated answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")
             await asyncio.sleep(POLL_S)
 
@@ -123,7 +123,7 @@ class Readiness:
         if self.at_arm == "gate":
             self._answer = self.judge(now_s)
         else:
-            # No gate; the answer names the state in which it would arm.
+            # Without a gate the answer gives the state in which the aircraft would arm.
             state, words = self.state(now_s)
             self._answer = ArmAnswer("wait" if state == "uncalibrated" else "accept", words)
         self._answered_s = now_s
@@ -133,16 +133,16 @@ class Readiness:
         return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
     def judge(self, now_s: float) -> ArmAnswer:
-        """Return the answer of a gate at this moment, whether there is one or not."""
+        """Return the answer that a gate gives at this moment, also if the gate is off."""
         answer = next(self._reasons(now_s), None) or ArmAnswer("accept", self.state(now_s)[1])
         if not self._on_deck or answer.hold_still_s is None:
             return answer
-        # Nobody can hold a deck still.
+        # On a deck, "hold still" is no advice: nobody can hold a deck still.
         status, meanwhile = self._collector.status(now_s), "" if answer.meanwhile == BY_ITSELF else answer.meanwhile
         return ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
 
     def _reasons(self, now_s: float) -> Iterator[ArmAnswer]:
-        """Yield the reasons against arming in the order in which they are reported; without any it may arm."""
+        """Yield the reasons against arming in the order in which they are reported; none: the aircraft may arm."""
         if (unmet := self._manager.blocking_reason(_NEEDED)) is not None:
             wait = _WAITS.get(unmet[0])
             yield ArmAnswer("refuse", unmet[1]) if wait is None else ArmAnswer("wait", wait)
@@ -169,17 +169,17 @@ class Readiness:
         if glance.moving or glance.steady_s < STEADY_S:
             yield ArmAnswer.hold_still(STEADY_S - glance.steady_s)
 
-    # --- how long yet
+    # --- remaining time
 
     def _until_calibrated_s(self, now_s: float) -> float:
         status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
         if status.enough:
             return write_s
-        # Before the noise is known this is the longest wait.
+        # Until the noise is known, the remaining time is the maximum.
         whole_s = status.still_s / status.progress if status.progress > 0.0 else self._wanted.settings.max_s
         left_s: float = max(1, math.ceil(whole_s - status.still_s)) + write_s
         named_at_s, named_s = self._countdown
-        # Only a movement makes it longer.
+        # Only a movement may raise the countdown.
         if self._collector.glance(now_s).moves is None and now_s - named_at_s < COUNTDOWN_KEPT_S:
             left_s = min(left_s, named_s)
         self._countdown = now_s, left_s
@@ -187,7 +187,7 @@ class Readiness:
 
     @property
     def _check_s(self) -> float:
-        """Time until the effect of new offsets is seen and the EKF has settled."""
+        """Expected time from a write until its effect is seen and the EKF has settled."""
         kind = self._vehicle.kind
         return kind.settle_s + min(self._min_still_s, LOOK_S) + LATE_S + kind.ekf_reset_s
 
@@ -198,7 +198,7 @@ class Readiness:
             return ArmAnswer.hold_still(self._check_s - self._collector.glance(now_s).still_s, words, words)
         return ArmAnswer("wait", f"{words}: {left_s} s at most" if left_s else f"{words}: wait", against=words)
 
-    # --- in words, for arming, status and history
+    # --- texts for arming, status and history
 
     def state(self, now_s: float) -> tuple[ArmedState, str]:
         state, words = self._state(now_s)

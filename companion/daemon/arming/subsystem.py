@@ -34,7 +34,7 @@ QUEUE: Final = 16
 POLL_S: Final = 1.0
 RETRY_S: Final = 30.0
 SCRIPT_STARTS_S: Final = 10.0
-"""Time for the script to answer: scripting starts some seconds after the first heartbeat."""
+"""Longest wait for the script to show itself: scripting starts some seconds after the first heartbeat."""
 
 
 class Armings:
@@ -46,7 +46,7 @@ class Armings:
         self._queue: asyncio.Queue[ArmingRecord] = asyncio.Queue(QUEUE)
         self.last: ArmingRecord | None = None
         self.seen_disarmed = False
-        """False: the daemon may have started in flight."""
+        """False: never seen disarmed by this daemon, which may have started in flight."""
 
     async def run(self) -> None:
         try:
@@ -85,20 +85,20 @@ class Armings:
 
 
 class GateSetup:
-    """Checks whether the autopilot asks before it arms."""
+    """Checks whether the autopilot is set up to ask the companion before it arms."""
 
     def __init__(self, core: Core) -> None:
         self._core, self._vehicle = core, core.vehicle
         self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self._said: str | None = None
         self.problem: str | None = None
-        """Missing settings, for people; None while complete or not known."""
+        """Missing settings, as text for people; None: complete, or not known yet."""
         self.known = False
         core.parameters.on_value.add(self._on_parameter)
 
     async def _read(self) -> None:
         self.known = False
-        while self._core.wanted.at_arm != "gate":  # may be set at the flight line
+        while self._core.wanted.at_arm != "gate":  # a ground station may switch the gate on at the flight line
             await asyncio.sleep(POLL_S)
         await self._vehicle.found.wait()
         self.problem = await self._vehicle.kind.find_gate_problem(
@@ -124,7 +124,7 @@ class Arming(Subsystem):
         self._recovery = offsets.recovery
         self.in_force = ActiveCalibration(core, devices.imus, calibrating)
         self.automatic = Automatic(core, devices.imus, self.in_force)
-        # In this order: automatic calibrations ask for the active one.
+        # The order matters: `Automatic` reads the state of `ActiveCalibration`.
         calibrating.manager.on_ended.add(self.in_force.on_ended)
         calibrating.manager.on_ended.add(self.automatic.on_ended)
         self.readiness = Readiness(core, offsets.owed, self.in_force, self.automatic)
@@ -135,7 +135,7 @@ class Arming(Subsystem):
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "disarmed":
             self.armings.seen_disarmed = True
-        elif event == "armed" and self.armings.seen_disarmed:  # a daemon that starts in flight sees no arming
+        elif event == "armed" and self.armings.seen_disarmed:  # a start in flight is no arming
             self.armings.add()
 
     def commands(self) -> Mapping[str, Handler]:
@@ -161,7 +161,7 @@ class Arming(Subsystem):
         return tasks
 
     def _calibration(self) -> Object | None:
-        """Return the active calibration, else the last good one, without its age: the wall clock may be wrong."""
+        """Return the active calibration, otherwise the last good one, without its age: the clock may be wrong."""
         in_force, now_s = self.in_force, asyncio.get_running_loop().time()
         known, record = in_force.calibration is not None, in_force.calibration or in_force.earlier
         if record is None:
@@ -188,7 +188,7 @@ class Arming(Subsystem):
         }
 
     async def _answer_history(self, request: History, _face: str) -> AsyncIterator[Object]:
-        # Reading a thousand records would hold the event loop too long.
+        # Reading a thousand records would block the event loop too long.
         yield await self._core.offload(self._history, request.limit)
 
     def _history(self, limit: int | None) -> Object:

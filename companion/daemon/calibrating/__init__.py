@@ -1,1 +1,1 @@
-"""One calibration or alignment from request to record."""
+"""Calibrations, alignments and undos, from request to record."""

@@ -1,6 +1,6 @@
-"""Starts, adopts, cancels and undoes calibrations, one at a time, and keeps their records.
+"""Manager of calibrations: starts, adopts, cancels and undoes them, one at a time, and keeps their records.
 
-`run` is a calibration itself. Nothing is ever cut off in the middle of a write: a cancel waits for the next safe point.
+The module `run` has the calibration itself. A cancel waits for the next safe point and never interrupts a write.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from companion.storage.records import RecordStore
 logger = logging.getLogger(__name__)
 
 STARTS_PER_S: Final = 1.0
-"""Requests a second that are served for long: nobody presses faster, a script that starts and cancels does."""
+"""Sustained limit of starts per second: no person presses faster, but a script that starts and cancels might."""
 BURST: Final = 10.0
 
 
@@ -57,7 +57,7 @@ REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = 
     Precondition.ARM_STATE_KNOWN: "unknown",
     Precondition.RESTORED: "busy",
 }
-"""Kind of the refusal where a condition is not met; "other" for those left out."""
+"""Kind of refusal for each unmet condition; conditions not listed: "other"."""
 
 
 def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple[Precondition, str]]:
@@ -92,7 +92,7 @@ class CalibrationManager:
         """The running or the latest job."""
         self.reason = ""
         self.last: Record | None = None  # Record of the latest calibration, loaded from disk at start
-        self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified of the end of a job, before its requester
+        self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified when a job ends, before its requester
         core.vehicle.on_event.add(self._on_event)
         self._recovery.on_recovered = self._recovered
 
@@ -107,7 +107,7 @@ class CalibrationManager:
 
     @property
     def progress_percent(self) -> int:
-        """Progress of the latest job; 100 from `done` on, though its record may still be on its way to the disk."""
+        """Progress of the latest job; 100 once done, although its record may not be on disk yet."""
         if self.job is None or self._machine.state is State.DONE:
             return 100
         return self.job.progress_percent
@@ -159,13 +159,13 @@ class CalibrationManager:
         return self._start(run, Event.REQUEST, self._finish(run, run.calibrate()))
 
     def start_job(self, job: Job, run: Callable[[Job], Awaitable[str]], missing: str | None) -> Job | Refusal:
-        """Start a job of a kind in `NO_CALIBRATION`, or refuse; `missing`: why this aircraft cannot do it, if so."""
+        """Start a job of a kind in `NO_CALIBRATION`, or refuse; `missing`: reason why this aircraft cannot do it."""
         if (refusal := self._refusal(missing)) is not None:
             return refusal
         return self._start(job, Event.REQUEST, self._finish(job, run(job)))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
-        """Start restoring the values from before the last write (see `Recovery.undo`), or refuse."""
+        """Start to restore the values from before the last write (see `Recovery.undo`), or refuse."""
         running = self._automatic_run()
         missing = None if running is not None else self._recovery.why_no_undo()
         if (refusal := self._refusal(missing, "nothing_to_undo", but=running)) is not None:
@@ -173,7 +173,7 @@ class CalibrationManager:
         job = Job("undo", What.BOTH, requester)
         if running is None:
             return self._start(job, Event.UNDO, self._finish(job, self._undo(job, force=force)))
-        # An undo does not wait for a calibration that nobody requested.
+        # An undo does not wait for an automatic calibration.
         running.cancel(requester)
         return self._start(job, None, self._undo_instead(self._task, running, job, force=force))
 
@@ -192,7 +192,7 @@ class CalibrationManager:
     def _refusal(
         self, missing: str | None, kind: Literal["nothing_to_undo", "other"] = "other", *, but: Job | None = None
     ) -> Refusal | None:
-        """Refuse what cannot be started; `but` is a running job that does not count."""
+        """Return a refusal if a job cannot start, otherwise None; `but`: a running job that does not block it."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
         if but is None and (found := self.blocking_reason()) is not None:
@@ -225,7 +225,7 @@ class CalibrationManager:
         elif event == "disarmed":
             self._core.collector.reset("just disarmed")
 
-    # --- one job to its end
+    # --- end of a job
 
     async def _finish(self, job: Job, work: Awaitable[str]) -> None:
         try:
@@ -268,11 +268,11 @@ class CalibrationManager:
             self._machine.on(Event.FAULT if result.outcome == "failed" else Event.CANCEL)
         self.reason = result.reason
         severity = Severity.ERROR if result.outcome == "failed" else Severity.NOTICE
-        outcome = "" if result.outcome == "cancelled" else f"{result.outcome}: "  # a cancel's reason says so itself
+        outcome = "" if result.outcome == "cancelled" else f"{result.outcome}: "  # a cancel's reason begins with it
         words = f"{job.kind.capitalize()} {outcome}{result.reason}"
         logger.log(logging.ERROR if result.outcome == "failed" else logging.INFO, "%s", words)
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
-            # A pilot who has just armed has no use for the end of what nobody asked for.
+            # After arming, the failure of an automatic calibration would only distract the pilot.
             self._core.say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
             if self.blocking_reason((Precondition.RESTORED,)) is not None:
                 self._core.say(Severity.WARNING, "Restore pending: disarm and keep the link up", Weight.RESULT)
@@ -302,7 +302,7 @@ class CalibrationManager:
             self._core.say(Severity.WARNING, f"Record not kept: {error}")
 
     async def _note_undone(self, step: ChangeSet) -> bool:
-        """Note in the history that a step was undone; return whether it was a calibration's."""
+        """Note in the history that a step was undone; return whether a calibration had made that step."""
         if step.origin.what in BY_HAND:
             await self._by_hand.undone(step)
             return False

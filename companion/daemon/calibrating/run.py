@@ -1,7 +1,7 @@
 """One calibration from request to record: its state, and its phases in their order.
 
-`CalibrationRun.calibrate` reads from start to end. `estimation.machine` has the table of states; a phase reports events
-to it, and raises an error where the calibration cannot go on.
+`CalibrationRun.calibrate` runs the phases. `estimation.machine` has the table of states; a phase reports events to it,
+and raises an error if the calibration cannot go on.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ logger = logging.getLogger(__name__)
 Key = tuple[str, Triad]  # Name of an IMU, and its gyros or its accelerometers
 
 WRONG_IMU_ATTEMPTS: Final = 3
-"""Most writes that act on the wrong IMU: two of three may be mistaken for the right one."""
+"""Most attempts to write: with three IMUs, two may be taken for the right one before it is found."""
 _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
 
 
@@ -70,7 +70,7 @@ class CalibrationParts(NamedTuple):
 
 
 class CalibrationRun(Job):
-    """One calibration; `Job` adds request, progress, cancel and outcome."""
+    """One calibration; the base class `Job` has request, progress, cancel and outcome."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class CalibrationRun(Job):
         reboot: bool = False,
         automatic: bool = False,
     ) -> None:
-        """`before`: the last calibration, if it was good and has not been undone."""
+        """Prepare a run; `before`: the last calibration, if it was good and has not been undone."""
         kind = AUTOMATIC if automatic else "calibration"
         super().__init__(kind, what, requester, timeout_s, reboot=reboot, automatic=automatic)
         self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
@@ -93,19 +93,19 @@ class CalibrationRun(Job):
         self.begun_s = asyncio.get_running_loop().time()
         self.log = WriteLog()
         self.alignment: AlignmentUsed | None = None
-        """Active alignment of the gradienter; None: zero and sigma of the configuration."""
+        """Active alignment of the gradienter; None: the configured zero and sigma apply."""
         self.calibrations: dict[str, ImuCalibration] = {}
-        """Calibrations in force in the autopilot while its IMUs were measured."""
+        """Calibrations that the autopilot used, by IMU, while its IMUs were measured."""
         self.held_back: dict[Key, Doubt] = {}
-        """Triads that contradict earlier calibrations and are not written, as nobody requested it."""
+        """Triads that an automatic run does not write because they contradict earlier calibrations."""
         self._forget()
 
     def _forget(self) -> None:
         self.measured: Window | None = None  # Window of telemetry under the active offsets
         self.solution: Solution | None = None
-        """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
-        self.points: dict[str, Point] = {}  # Biases by IMU for later predictions, once this calibration has ended well
-        self.unchanged: set[Key] = set()  # Triads whose offsets are as good as new ones, and stay
+        """Estimate: the residual of the output for IMUs of the autopilot, the whole bias for others."""
+        self.points: dict[str, Point] = {}  # Biases by IMU for later predictions, kept if this calibration succeeds
+        self.unchanged: set[Key] = set()  # Triads that keep their offsets, which are as good as new ones
         self.plan: Plan | None = None
         self.held_back.clear()
         self.log.written.clear()
@@ -114,7 +114,7 @@ class CalibrationRun(Job):
     async def calibrate(self) -> str:
         """Run all phases; return the result in one line.
 
-        After an error or a cancel the autopilot is as before, or the error says what is not.
+        After an error or a cancel the old values are restored, or the error names those that are not.
         """
         self._announce()
         self._measuring.begin()
@@ -168,13 +168,14 @@ class CalibrationRun(Job):
             self.measured = await self._measuring.measure(self)
             if await self._offsets.offsets_still_hold():
                 return
-            # The window holds telemetry under other offsets than those now in force.
+            # The window was measured under other offsets than the present ones.
             self._machine.on(Event.MOVED)
 
     async def _estimate(self) -> None:
-        """Estimate biases, weigh them with earlier ones, and hold back contradictions that nobody requested.
+        """Estimate biases, weigh them with earlier ones, and hold back contradictions of an automatic run.
 
-        A contradiction is written on request only: a gradienter that has moved would spoil good offsets unnoticed.
+        A result that contradicts earlier ones is written on request only: a gradienter that has moved would spoil good
+        offsets unnoticed.
         """
         assert self.measured is not None
         core, memory, unix_s = self._core, self._parts.memory, self.log.started_at.timestamp()
@@ -188,7 +189,7 @@ class CalibrationRun(Job):
         self.calibrations = {imu.name: self._imus[imu.name].in_force for imu in solution.imus if imu.name in self._imus}
         solution = memory.with_offsets(solution)
         weighed: Solution = await core.offload(weigh, solution, expectation)
-        # From here on nobody can adopt this run: a request must not get half of a result.
+        # A run with a result held back cannot be adopted: a request must not get half of a result.
         if self.automatic and core.wanted.push:
             written = {i.name for i in core.config.imu if i.source == "autopilot" or i.autopilot_instance}
             self.held_back = {key: doubt for key, doubt in weighed.doubted.items() if key[0] in written}
@@ -210,7 +211,7 @@ class CalibrationRun(Job):
         assert self.solution is not None
         core, rivalry, slots = self._core, self._offsets.rivalry, self._offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}
-        push = core.wanted.push  # may be switched while parameters are read: for all IMUs or for none
+        push = core.wanted.push  # read once, as it may change while parameters are read: for all IMUs or for none
         targets: list[ImuPlan] = []
         for estimate in self.solution.imus:
             imu, instance = self._imus.get(estimate.name), sources[estimate.name].autopilot_instance
@@ -233,7 +234,7 @@ class CalibrationRun(Job):
         refuse_shared(targets, slots)
         if targets:
             stops = rivalry.changes([target.calibration for target in targets])
-            # Written first, so that no rival acts in between; undone last.
+            # Rivals are switched off first, so that none acts during the write; an undo restores them last.
             targets[0] = dataclasses.replace(targets[0], changes=(*stops, *targets[0].changes))
             for change in stops:
                 words = f"{change.parameter} is switched off; companion undo switches it on again"
@@ -268,8 +269,8 @@ class CalibrationRun(Job):
     async def _remember(self) -> None:
         points = self.points
         if self._core.wanted.push and not self.automatic:
-            # The requester knows of every contradiction, and the measured biases are active. But gyros that may have
-            # turned are no news.
+            # The requester was told of each contradiction, and the measured biases are in use: mark them as chosen.
+            # Leave out gyros if only earlier calibrations bounded the platform's turn: they bring nothing new.
             told = self.solution is not None and self.solution.turn.by != "earlier calibrations"
             points = {name: point.as_chosen(gyro=told) for name, point in points.items()}
         await self._parts.memory.keep(points)
@@ -317,7 +318,7 @@ def in_short(triads: Collection[Key]) -> str:
 
 
 def _less(points: Mapping[str, Point], held_back: Collection[Key]) -> dict[str, Point]:
-    """Leave out triads held back: repeated measurements must not confirm each other."""
+    """Remove triads that were held back: repeated measurements must not confirm each other."""
     left: dict[str, Point] = {}
     for name, point in points.items():
         kept = msgspec.structs.replace(point, **{triad: None for imu, triad in held_back if imu == name})

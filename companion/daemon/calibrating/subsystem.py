@@ -1,4 +1,4 @@
-"""Calibrations and alignments as the daemon's interfaces see them: commands and status."""
+"""Commands and status of calibrations and alignments."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2
 HEARD_WITHIN_S: Final = 5.0
-"""Longest wait of an undo for an autopilot not heard since the start."""
+"""Longest wait of an undo for the first heartbeat of the autopilot."""
 ALIGN_TIMEOUT_S: Final = 900.0
-"""An alignment that nobody ends must not keep calibrations from starting for ever."""
+"""Default time limit: an alignment that nobody finishes must not block calibrations for ever."""
 _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
     "zero": ALIGNMENT,
     "tilts": ALIGNMENT,
@@ -74,7 +74,7 @@ class Calibrating(Subsystem):
             part.load()
 
     def commands(self) -> Mapping[str, Handler]:
-        """Return the handlers; they raise RequestRefusedError, or another CompanionError after the start."""
+        """Return the handlers; they raise RequestRefusedError, or another CompanionError once the job has started."""
         return {
             "calibrate": self._calibrate,
             "align": self._align,
@@ -165,7 +165,7 @@ class Calibrating(Subsystem):
 
     async def _hear(self) -> None:
         vehicle = self._core.vehicle
-        if vehicle.heartbeat_age_s is None:  # the daemon may have started just now
+        if vehicle.heartbeat_age_s is None:  # the daemon may have only just started
             await comes(vehicle.found, HEARD_WITHIN_S)
 
     async def _align(self, asked: Align, face: str) -> AsyncIterator[Object]:
@@ -197,7 +197,7 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, **found}
 
     def start_alignment(self, asked: Align, by: str) -> Job | Refusal:
-        """Start an alignment, or refuse; CalibrationRefusedError where no kind is named."""
+        """Start an alignment, or refuse; raise CalibrationRefusedError if the request names no kind of alignment."""
         action = next((each for each in _KINDS if each == asked.action), None)
         if action is None:
             allowed = Align.fields()["action"].allowed
@@ -261,7 +261,7 @@ class Calibrating(Subsystem):
             }
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
 
-    # --- bias curves over temperature, into the temperature calibration of the autopilot
+    # --- bias curves over temperature, written as the autopilot's temperature calibration
 
     def _why_no_curve_undo(self) -> str | None:
         steps = self._offsets.ledger.steps(self._core.vehicle.system_id)
@@ -272,10 +272,10 @@ class Calibrating(Subsystem):
         return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
 
     async def _write_curves(self, job: Job, *, overwrite: bool) -> str:
-        """Measure, write the curves of all IMUs or of none, verify that the output stays; return what was written.
+        """Measure, write the curves, and verify that the output does not change; return a summary as text.
 
-        `overwrite`: replace a temperature calibration that is not ours. After an error or a cancel the old values are
-        restored, or the error names those that are not.
+        The curves of all IMUs are written, or none. `overwrite`: also replace a temperature calibration that is not
+        ours. After an error or a cancel the old values are restored, or the error names those that are not.
         """
         log = WriteLog()
         await self._core.offload(self.memory.follow)
@@ -297,7 +297,7 @@ class Calibrating(Subsystem):
         return f"written: {'; '.join(words)}"
 
     async def _curve_targets(self, window: Window, *, overwrite: bool) -> tuple[list[ImuPlan], list[str], list[str]]:
-        exchanged = self.memory.forgotten()  # the curve of an IMU that was replaced must not be written
+        exchanged = self.memory.forgotten()  # the curve of a replaced IMU must not be written
         targets: list[ImuPlan] = []
         words: list[str] = []
         left: list[str] = []
@@ -326,7 +326,7 @@ class Calibrating(Subsystem):
         return targets, words, left
 
     def _accelerometer_curve(self, name: str, gyro: Curve) -> Polynomial | None:
-        """Return the accelerometers' curve if it spans the gyros' temperatures: an autopilot has one span for both."""
+        """Return the accelerometers' curve if its temperatures span the gyros': an autopilot has one span for both."""
         curve, calibration = self.memory.curve(name, "accel"), self._imus[name].in_force
         if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
             return None

@@ -1,7 +1,7 @@
 """One IMU of the autopilot: its telemetry, the offsets subtracted in it, and changes of these by others.
 
-Samples count only while these offsets are known; a change by anybody voids what was collected before. Others may be
-people, or a boot that measures the gyros (INS_GYR_CAL = 1).
+Samples count only while these offsets are known; a change by anybody voids the samples collected before. Other writers
+are people, or a boot that calibrates the gyros (INS_GYR_CAL = 1).
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ logger = logging.getLogger(__name__)
 
 RETRY_S: Final = 3.0
 CONFIRMED_WITHIN_S: Final = 3.0
-"""A later reading does not show which offsets were in force in between."""
+"""Longest time from an announced change to a reading that refutes it: a later one does not cover the time between."""
 
 
 class AutopilotImu:
-    """Gives the collector the samples of one autopilot IMU while the offsets behind them are known."""
+    """Passes the samples of one autopilot IMU to the collector while the offsets subtracted in them are known."""
 
     def __init__(self, core: Core, imu: Imu, slots: SlotMemory, ekf_bias: EkfBias, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
@@ -51,9 +51,9 @@ class AutopilotImu:
         self.on_sample: Listeners[ImuSample] = Listeners()
         self.on_counting: Listeners[ImuSample] = Listeners()  # Listeners to samples that count, before the collector
         self.on_raw: Listeners[float, Six, float | None] = Listeners()
-        """Listeners to means of raw readings: time, output less the offsets in force, temperature in deg C."""
+        """Listeners to means of raw readings: time, output less the present offsets, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
-        """Listeners to readings: the one before, unless we have written since, and the present one."""
+        """Listeners to readings of the offsets: the previous one (None after a write of ours), and the present one."""
         self.on_change: Listeners[[]] = Listeners()
         self.input = models.imu_input(core.profiles.imu(self.name), None)
         self._slots, self._ekf_bias, self._profiles = slots, ekf_bias, core.profiles
@@ -61,7 +61,7 @@ class AutopilotImu:
         self._known: ImuCalibration | None = None
         self._ours = 0
         self._announced: tuple[str, float, float] | None = None
-        """Name, value and time of a parameter that somebody says was changed."""
+        """Name, value and time of a parameter change that somebody announced and `refresh` has not checked yet."""
         self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self.stream = ImuStream(
             core.link,
@@ -78,7 +78,7 @@ class AutopilotImu:
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:
-        """Count no samples, and read no offsets, while we write them ourselves."""
+        """Suspend counting samples and reading offsets while we write offsets ourselves."""
         self._ours += 1
         self.calibration = self._known = None
         self.on_change.tell()
@@ -95,20 +95,20 @@ class AutopilotImu:
 
     @property
     def decided(self) -> bool:
-        """Return whether it is known if this IMU exists: offsets and samples have come, or failed."""
+        """Return True once it is known if this IMU exists: offsets and samples have arrived, or failed to."""
         if self.calibration is None:
             return self.failures > 0 or (self.stream.decided and bool(self.stream.problem))
         return self.stream.decided
 
     @property
     def in_force(self) -> ImuCalibration:
-        """Return the calibration that the autopilot subtracts; raise AutopilotError while it is not known."""
+        """The calibration that the autopilot subtracts; raises AutopilotError while it is unknown."""
         if self.calibration is None:
             raise AutopilotError(f"imu {self.name}: {self.problem}")
         return self.calibration
 
     async def refresh(self) -> bool:
-        """Read the offsets; False, with samples voided, where they differ. Raise AutopilotError if unreadable."""
+        """Read the offsets; if they have changed, void the samples and return False. Raises AutopilotError."""
         assumed, announced, self._announced = self.calibration, self._announced, None
         why = "offsets read again" if announced is None else f"{announced[0]} was changed"
         try:
@@ -118,7 +118,7 @@ class AutopilotImu:
                 self._upset(why)
             raise
         if self._ours:
-            return False  # we have begun to write meanwhile: nobody knows which of them this still is
+            return False  # a write of ours began meanwhile: the values read may be older or newer
         known, self._known = self._known, fresh
         self.calibration, self.problem, self.failures = fresh, "", 0
         part = part_of(self._vehicle.firmware, fresh.gyro_id, fresh.accel_id)
@@ -153,7 +153,7 @@ class AutopilotImu:
         if known is None:
             return
         if (gyro_id, accel_id) != (known.gyro_id, known.accel_id):
-            # The console knows which device it is; the slots' order was a guess.
+            # The console names the devices; the order of the slots was a guess.
             self._slots.learn("gyro", gyro_id, self.instance)
             self._slots.learn("accel", accel_id, self.instance)
             self.reading.again()
@@ -192,13 +192,13 @@ class AutopilotImu:
         if known is None or self._ours:
             return
         if known.contradicts({name: value}):
-            # Anybody can say so; `refresh` asks the autopilot, and voids what was collected if it is true.
+            # Anybody can announce a change; `refresh` asks the autopilot, and voids the samples if it is true.
             self._announced = self._announced or (name, value, asyncio.get_running_loop().time())
         else:
             active = {rival.parameter: rival.value for rival in known.rivals}
             watched = {rival.parameter for rival in self._vehicle.kind.rivals}
             if name not in watched or active.get(name, 0) == value:
-                return  # else what is in force is the same, but not what will become of it
+                return  # otherwise a rival was switched: offsets are the same, but may be overwritten later
         self.reading.again(REREAD_EVERY_S)
 
     def _on_event(self, event: VehicleEvent) -> None:
@@ -236,19 +236,19 @@ def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
 
 
 _Known = tuple[tuple[float, ...], int]
-"""Offsets, and number of boots. Without names: PX4 may move an IMU to other parameters."""
+"""Offsets without their parameter names, as PX4 may move an IMU to other parameters; and the number of boots."""
 
 
 class OffsetWatch:
-    """Compares offsets; `poll` often. `lost` is called with an IMU whose offsets are not ours any more, and why."""
+    """Detects changes of the offsets; call `poll` often. `lost` gets the IMU that lost our offsets, and the reason."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost
         self._known: dict[str, _Known] = {}
-        self._before: dict[str, _Known] = {}  # Offsets before a job, until those after it are read
+        self._before: dict[str, _Known] = {}  # Offsets before a job, kept until those after it are read
         self._failed = self._asked_restart = False
-        self._written: dict[str, dict[str, float]] = {}  # Values just written, by IMU, until they are read
-        self.foreign: str | None = None  # Change by somebody else since the last request, in short
+        self._written: dict[str, dict[str, float]] = {}  # Values just written, by IMU, kept until they are read
+        self.foreign: str | None = None  # Change by somebody else since the last request, as a short text
 
     def known(self) -> dict[str, _Known]:
         return dict(self._known)
@@ -283,10 +283,10 @@ class OffsetWatch:
             if failed or not after_job:
                 changed = before[0] != now[0]
             else:
-                # The EKF may have settled for minutes: only what was written must still be there.
+                # Settling of the EKF may have changed other values for minutes: check only the written ones.
                 changed = bool(written) and calibration.contradicts(written)
             if changed and rebooted and (failed or restarted):
-                # Our own changes have been restored by now.
+                # Changes of our own have been restored by now, so the reboot or somebody else made this one.
                 self._lost(name, Why.FAILED if failed else Why.REPLACED)
             elif changed:
                 self.foreign = f"{name} was changed"

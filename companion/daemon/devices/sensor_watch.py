@@ -1,4 +1,4 @@
-"""Finds a gradienter or compass that hangs while the IMUs see the aircraft move."""
+"""Detection of a gradienter or compass whose reading stays the same while the IMUs see the aircraft move."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ logger = logging.getLogger(__name__)
 PERIOD_S: Final = 0.5
 REMEMBERED_S: Final = 300
 TILTED_DEG: Final = 3.0
-"""Least tilt that shows a hanging sensor: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
+"""Least tilt that proves a sensor stuck: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
 QUIET_S: Final = 3.0
-"""Largest lag of a witness behind the other IMUs; the autopilot's has one while its offsets are written."""
+"""Largest lag of an IMU behind the others to count as a witness; a write of offsets causes one."""
 LATE_S: Final = 1.0
-"""Largest delay at which an IMU may begin to be a witness: later it has not seen the pose before."""
+"""Largest delay of an IMU's first second behind the others' to count as a witness: a later IMU missed the start."""
 TURNED_DEG: Final = 15.0
 TURNING_RAD_S: Final = math.radians(12.0)
-"""The least rate that counts as turning; less may be a bias, of up to 10 deg/s."""
+"""Least rate that counts as turning; a bias may be up to 10 deg/s."""
 
 
 NO_OFFSETS: Final = object()
-"""Offsets of an IMU whose readings nobody changes."""
+"""Offsets of an IMU whose readings no autopilot corrects."""
 
 
 class SensorWatch:
     """Checks every sensor twice a second.
 
-    The IMUs are the witnesses of a tilt or a turn, in their own axes: no mounting is needed. `offsets_of`: the offsets
-    subtracted from an IMU's readings, or None while unknown. An IMU with other offsets, or another orientation of the
-    board, begins anew as a witness: the change must not look like a tilt.
+    The IMUs are the witnesses of a tilt or a turn. Each measures it in its own axes, so no mounting is needed.
+    `offsets_of`: the offsets subtracted from an IMU's readings, or None while unknown. After a change of the offsets or
+    of the board's orientation an IMU's record starts anew: the change must not look like a tilt.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class SensorWatch:
         self._sensors, self._collector = sensors, collector
         self._offsets_of, self._say = offsets_of, say
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
-        """Whole seconds of each IMU: its slot, the direction of its mean force, and the turn about it in degrees."""
+        """Whole seconds of each IMU: number of the second, direction of the mean force, turn about it in degrees."""
         self._offsets: dict[str, object] = {}
         self._has_failed = False
 
@@ -67,7 +67,7 @@ class SensorWatch:
             try:
                 self.update(loop.time())
             except Exception:
-                # A fault of the watch must not end the sensors, nor fill the log.
+                # A fault of the watch must neither stop the sensors nor fill the log.
                 if not self._has_failed:
                     logger.exception("looking after the sensors failed")
                 self._has_failed = True
@@ -79,7 +79,7 @@ class SensorWatch:
             found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:
                 if is_news:
-                    # No calibration can end with it, and values written with it may be wrong.
+                    # With this sensor no calibration can finish, and values already written may be wrong.
                     words = found.words.removeprefix(f"{sensor.link.settings}: ")
                     self._say(Severity.WARNING, f"{sensor.name}: {words}", Weight.NEWS)
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
@@ -100,8 +100,8 @@ class SensorWatch:
                 seconds.append((batch.slot, down, math.degrees(about) if abs(about) > TURNING_RAD_S else 0.0))
 
     def _seen(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
-        """Return the whole seconds in between, of each IMU that has seen as much as the others."""
-        # Not as the clock: while a sensor is implausible, nothing is collected of any IMU.
+        """Return the whole seconds between two times, of each IMU that covers as much of them as the others."""
+        # Measured against the newest second, not the clock: collection stops while a sensor is implausible.
         newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
         found = [
             [second for second in seconds if since_s <= second[0] <= until_s - 1.0]
@@ -117,9 +117,9 @@ class SensorWatch:
         if since_s is None or last_s is None:
             return None
         near_s = sensor.health.stream.near_since_s or since_s
-        # The least that any IMU saw counts.
+        # The smallest tilt that any IMU saw counts.
         tilted_deg = min((_tilted_deg(each, since_s) for each in self._seen(near_s, last_s)), default=0.0)
-        # Turns are summed up, and what is not seen of one adds up likewise.
+        # Turns add up, and so do turns too slow to count: begin the sum shortly before the reading froze.
         seen = self._seen(max(near_s, since_s - BEFORE_S), last_s) if "compass" in sensor.kinds else []
         turned_deg = min((abs(sum(turn_deg for *_, turn_deg in each)) for each in seen), default=0.0)
         if turned_deg > TURNED_DEG:
@@ -144,7 +144,7 @@ class SensorWatch:
 
 
 def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:
-    """Return the tilt since the first second, if it has lasted since `since_s`."""
+    """Return the tilt from the first second's pose if the latest seconds since `since_s` all show it; otherwise 0."""
     stayed = [down for slot, down, _ in seconds[1:] if slot >= since_s][-TILTED_SECONDS:]
     if len(stayed) < TILTED_SECONDS:
         return 0.0

@@ -1,4 +1,4 @@
-"""The companion's own devices: port, decoder, dialogue, and where the samples go."""
+"""The companion's own serial devices: port, decoder, dialogue, and listeners to the samples."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 RATE_SPAN_S: Final = 2.0
 TICK_S: Final = 0.02
-"""Shortest time between two messages to a device, and period of the dialogue while it goes on."""
+"""Shortest time between two messages to a device, and period of checks while the dialogue goes on."""
 COARSE_S: Final = 0.25
 LIVELY_S: Final = 1.0
 LOOK_AGAIN_S: Final = 60.0
@@ -41,11 +41,11 @@ RESTARTED: Final = "restarted"
 FLOOD_S: Final = 1.0
 GOOD_AFTER_S: Final = 1.0
 AGAIN_S: Final = 60.0
-"""Shortest time between two warnings of one trouble; others go to the detailed log, as a loose wire would fill it."""
+"""Shortest time between two warnings of one kind of trouble; repeats go to the debug log, as a loose wire has many."""
 
 
 class SensorHealth:
-    """Present trouble of one sensor, and how often each trouble has begun."""
+    """Present trouble of one sensor, and the number of times each kind of trouble began."""
 
     def __init__(self, link: ByteLink, protocol: str, decoder: Decoder) -> None:
         self.link, self._decoder = link, decoder
@@ -72,7 +72,7 @@ class SensorHealth:
         return Trouble(found.key, f"{self.link.settings}: {found.words}", found.implausible)
 
     def update(self, now_s: float, stuck: Trouble | None = None) -> tuple[Trouble | None, bool]:
-        """Count and log changes, twice a second; return the trouble, and whether it was logged as a warning now."""
+        """Count and log changes (call twice a second); return the trouble, and whether a warning was logged now."""
         self._stuck = stuck
         if (breaks := self._decoder.times.clock.breaks) != self._breaks:
             self.counts[RESTARTED] += breaks - self._breaks
@@ -80,7 +80,7 @@ class SensorHealth:
             self._warn(Trouble(RESTARTED, message("device_restarted")), now_s)
         found = self.trouble(now_s)
         if found is not None and found.key == FLOOD:
-            # The bytes thrown away have damaged its frames; two calls fall into FLOOD_S.
+            # Dropped bytes damage frames, which is no fault of the device; FLOOD_S spans two calls.
             self.stream.excuse()
         return found, self._report(found, now_s)
 
@@ -98,7 +98,7 @@ class SensorHealth:
         if found.key == self._reported:
             return False
         if found.key == ABSENT or (now_s - self._opened_s < SILENT_AFTER_S and not found.implausible):
-            return False  # the port reports its own loss; a port just opened has a moment to begin
+            return False  # `ByteLink` reports a lost port; a port just opened gets a moment to start
         if self._reported is None:
             self._began_s = now_s
         self._reported = found.key
@@ -120,7 +120,7 @@ def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
 
 
 class SensorRole:
-    """One use of a device, as `companion status` shows it."""
+    """One role of a device, with its sample count and rate, for `companion status`."""
 
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
         self.name, self.kind = role.name, role.kind
@@ -179,7 +179,7 @@ class SensorRole:
 
 
 class SerialSensor:
-    """One serial device, read and decoded once for all its roles; `take` gets the part of each sample for each role."""
+    """One serial device, read and decoded once for all its roles; `take` is called with a role and its sample."""
 
     def __init__(
         self, device: SerialDevice, take: Callable[[Role, Sample], None], offload: Offload = asyncio.to_thread
@@ -189,7 +189,7 @@ class SerialSensor:
         self.name, self.protocol = device.name, device.info.name
         self.roles = [SensorRole(self, role) for role in device.roles]
         self.decoder = device.info.decoder(settings.seconds_per_byte)
-        # A device that is only read has no dialogue, so nothing can be sent to it.
+        # A read-only device gets no dialogue, so nothing is ever sent to it.
         self.dialogue = None if device.read_only or device.info.dialogue is None else device.info.dialogue()
         name = ", ".join(role.name for role in device.roles)
         self.kinds = frozenset(role.kind for role in device.roles)
@@ -198,13 +198,13 @@ class SerialSensor:
         )
         self.health = SensorHealth(self.link, self.protocol, self.decoder)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
-        """Listeners to name, bytes and time before decoding; None for bytes that are missing."""
+        """Listeners to device name, bytes and time, before decoding; bytes of None mark a gap."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
-        """Listeners to all samples of a read and its time, before the collector."""
+        """Listeners to all samples of a read and the time of the read, before the collector."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
-        """The north of headings that were refused because another one is configured."""
+        """North of the headings that were refused because another one is configured."""
         self._spoke_s = -math.inf
         self._alone = False
         self._look_at_s = -math.inf
@@ -255,7 +255,7 @@ class SerialSensor:
             self._speak(t_s)
 
     async def _converse(self) -> None:
-        """Send what is due: often while the dialogue goes on, seldom otherwise, so that a stream costs no ticks."""
+        """Send due messages: check often during a dialogue, seldom otherwise, as ticks cost processor time."""
         loop = asyncio.get_running_loop()
         while True:
             is_lively = loop.time() - self._spoke_s < LIVELY_S
@@ -265,7 +265,7 @@ class SerialSensor:
             self._speak(loop.time())
 
     async def _look_for_others(self) -> None:
-        """Check that no other program has the port: two that write to one device, a login or a modem, do harm."""
+        """Check that no other program holds the port, such as a login or modem service: two writers do harm."""
         opening, port = self._openings, self.link.settings
         holders = () if port.is_tcp else await self._offload(find_holders, port.url)
         if opening != self._openings:

@@ -1,4 +1,4 @@
-"""Signing in the daemon: key, time over restarts, and refused senders."""
+"""MAVLink signing in the daemon: the key, the signing time across restarts, and refused senders."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ logger = logging.getLogger(__name__)
 
 PERIOD_S: Final = 1.0
 AHEAD_S: Final = 30.0
-"""Signature time reserved by one write to disk, hence the most that it jumps ahead after a power cut. Senders more
-than a minute behind are refused at first (specification), so it stays well below that."""
+"""Signature time reserved by one write to disk, so the largest jump ahead after a power cut. The specification refuses
+new senders that are more than a minute behind, so the jump stays well below that."""
 RESERVE_BEFORE_TICKS: Final = 5 * TICKS_PER_S
 UNANSWERED: Final = 3
-"""Unanswered requests in a row, one a second, after which the autopilot is taken to want signatures."""
-ASK_AGAIN_S: Final = 30.0  # Pause before an autopilot that has answered is asked again
+"""Number of unanswered requests in a row, one a second, after which the autopilot seems to require signatures."""
+ASK_AGAIN_S: Final = 30.0  # Pause after an answer of the autopilot before the next request
 AFTER_S: Final = 3.0
-"""Time without a verified message before a fault is reported: longer than a key takes to be changed."""
+"""Time without a verified message before a fault is reported; a change of the key takes less."""
 AHEAD_OF_CLOCK_S: Final = 86400.0
-"""Signature time this far ahead of the system's clock comes from a wrong clock, not from a board without power."""
+"""Lead of the signature time over the system's clock that shows a wrong clock, not just a board without power."""
 
 _COUNTED: Final[tuple[Reason, ...]] = ("other key", "unsigned", "old")
 _FAULTS: Final = {
@@ -51,10 +51,10 @@ _SENDERS: Final[dict[Reason, str]] = {
 
 
 class LinkSigning:
-    """Sign and verify one link; report whether the autopilot and the companion accept each other's messages.
+    """Signs and verifies one link; reports whether the autopilot and the companion accept each other's messages.
 
-    An autopilot that signs while the companion has no key may still accept unsigned messages, so it is asked: by
-    TIMESYNC, which both firmwares answer at once, armed or not (autopilots 2, 4.5).
+    An autopilot that signs while the companion has no key may still accept unsigned messages. A TIMESYNC request shows
+    it: both firmwares answer at once, armed or not (autopilots 2, 4.5).
     """
 
     def __init__(self, config: Config, link: MavlinkLink, vehicle: Vehicle, say: Say, offload: Offload) -> None:
@@ -65,10 +65,10 @@ class LinkSigning:
         self._stored = signing_time_in(config.storage.path)
         self._reserved = 0
         self._write_failed = False
-        self._named: set[Reason] = set()  # Reasons for which a sender other than the autopilot was named
+        self._named: set[Reason] = set()  # Reasons already reported of a sender other than the autopilot
         self.warning: str | None = None  # Present fault of the autopilot's signatures, with its remedy
         self._refused: Counter[Reason] = Counter()
-        """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
+        """Refused messages with the autopilot's ids, by reason, since the last verified one."""
         self._verified = False
         self._bad_since_s: float | None = None
         self._asked = self._unanswered = 0
@@ -76,7 +76,7 @@ class LinkSigning:
         if self.mode == "off":
             link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
         else:
-            # From the first byte on: messages before the key is read are refused too.
+            # Signing applies from the first byte on: messages before the key is read are refused too.
             self.signing = link.signing = Signing(required=self.mode == "require")
             self.signing.on_verified, self.signing.on_refused = self._on_verified, self._on_refused
 
@@ -103,13 +103,13 @@ class LinkSigning:
                 self._update(asyncio.get_running_loop().time())
                 await asyncio.sleep(PERIOD_S)
         finally:
-            # An orderly end reserves nothing: the next start continues from here.
+            # At an orderly end no time is reserved: the next start continues from this time.
             if signing is not None and signing.key is not None:
                 await asyncio.shield(self._reserve(signing, 0.0))
 
     def _read_key(self, signing: Signing) -> None:
         path = self._config.mavlink.signing_key_path
-        assert path is not None  # the configuration's rules
+        assert path is not None  # a rule of the configuration
         try:
             signing.key = read_key(path)
         except LinkError as error:
@@ -185,7 +185,7 @@ class LinkSigning:
         if self._verified:
             self._verified = False
             self._refused.clear()
-        # Where signatures are not required, an autopilot may still be without a key.
+        # If signatures are not required, an autopilot without a key is no fault.
         counted = _COUNTED if signing.required else _COUNTED[:1]
         found = max(counted, key=lambda reason: self._refused[reason])
         if not self._refused[found]:
@@ -199,7 +199,7 @@ class LinkSigning:
 
     @property
     def rejecting(self) -> str | None:
-        """Reason of signing why no autopilot is found although messages arrive, or None."""
+        """Fault of signing that keeps the autopilot from being found although messages arrive, or None."""
         if self.signing is None or not self.signing.required:
             return None
         if self.trouble:

@@ -1,7 +1,7 @@
-"""The devices: the autopilot's IMUs, our own sensors, and whether ground stations reach the companion.
+"""The devices: the autopilot's IMUs, our own sensors, and the check whether ground stations reach the companion.
 
 Both firmwares forward a command for component 191 only to a link on which they hear its heartbeat. PX4 forwards only
-between links with MAV_n_FORWARD = 1 at its start; no message tells which MAV_n our link is (autopilots 5.4).
+between links with MAV_n_FORWARD = 1 at its start; no message shows which MAV_n our link is (autopilots 5.4).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ RETRY_S: Final = 10.0
 
 
 class Reach:
-    """Knows whether a ground station reaches the companion, and what the autopilot's parameters say of forwarding."""
+    """Checks whether a ground station reaches the companion: by its heartbeats, and by the forwarding parameters."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
         self._vehicle, self._parameters, self._url = vehicle, parameters, url
@@ -71,7 +71,7 @@ class Reach:
 
 
 class Devices(Subsystem):
-    """Sources of samples; without `imu_rate_hz` each IMU is asked for as many as the connection can carry."""
+    """Sources of samples; without `imu_rate_hz` each autopilot IMU sends at the rate that the connection can carry."""
 
     def __init__(self, core: Core, imu_rate_hz: float | None) -> None:
         self._core = core
@@ -80,7 +80,7 @@ class Devices(Subsystem):
         imus = [imu for imu in core.config.imu if imu.source == "autopilot"]
         console = Px4Console(core.link, core.vehicle)
         self.ekf_bias = EkfBias(console, core.vehicle)
-        # On a deck the integers are moved enough, and the console's answers on a slow line would delay readings.
+        # Not on a deck with a slow line: motion dithers the integers there, and console answers would delay readings.
         self._asks = bool(imus) and (rate_hz >= models.IMU_RATE_HZ or core.config.vehicle.platform == "ground")
         if not self._asks:
             self.ekf_bias.settled.set()
@@ -125,7 +125,7 @@ class Devices(Subsystem):
         }
 
     def _misplaced(self, name: str) -> str | None:
-        """Return why an IMU's gravity lies along another axis than by the gradienter, in the last second, or None."""
+        """Return a warning if, in the last second, an IMU's gravity lay along another axis than the gradienter's."""
         config, collector = self._core.config, self._core.collector
         tilt, model = collector.tilt_second(), models.gradienter_model(config.gradienter)
         imu, batch = next((imu for imu in config.imu if imu.name == name), None), collector.imu_seconds().get(name)

@@ -1,1 +1,1 @@
-"""The attitude while it is sent to the autopilot, and the set-up it needs there."""
+"""The attitude sent to the autopilot, its supervision, and the settings that the autopilot needs for it."""

@@ -1,4 +1,4 @@
-"""The pushed attitude: samples in, messages out, the fallback of ArduPilot, and the texts for people."""
+"""The attitude pushed to the autopilot: samples in, messages out, the fallback of ArduPilot, and texts for people."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
 LATE_S: Final = 3.0
 SHORTEST_S: Final = 0.02
-"""Least time between two messages: ArduPilot drops any that comes sooner (autopilots 6)."""
+"""Least time between two messages: ArduPilot drops a message that comes sooner (autopilots 6)."""
 SHOWN_EVERY_S: Final = 0.2
-"""Interval of messages for people: autopilots forward them to slow radios."""
+"""Interval of attitude messages for ground stations: autopilots forward them to slow radios."""
 _ROUNDING_S: Final = 1e-6
 SCRIPT_STARTS_S: Final = 15.0
-"""Time from the first heartbeat until it is known whether there is a script."""
-WELL_S: Final = 10.0  # Time for which our heading must have been pushed before its source set is requested again
+"""Wait after the first heartbeat before reading whether there is a script on the flight controller."""
+WELL_S: Final = 10.0  # Time of uninterrupted push before the source set with our heading is requested again
 AGAIN_S: Final = 1.0
 _OURS, _COMPASS, _GYROS = 1, 2, 3
 _WORDS: Final = {
@@ -60,10 +60,10 @@ _WORDS: Final = {
 
 
 class Fallback:
-    """Source set of ArduPilot when our heading ends: gyros and GNSS in flight, set 3 (autopilots 10.4).
+    """Selects the source set of ArduPilot's EKF when our heading ends: set 3 in flight, set 2 on the ground.
 
-    The compass, set 2, is for the ground: in flight it cannot be compared. The script on the flight controller
-    (companion/lua) selects; without a script `step` requests the set. PX4 falls back to its magnetometer by itself.
+    Set 3 is gyros and GNSS (autopilots 10.4). Set 2 is the compass: in flight nothing could check it. The script on the
+    flight controller (companion/lua) selects the set; without it `step` sends a request. PX4 falls back by itself.
     """
 
     def __init__(self, core: Core) -> None:
@@ -118,7 +118,7 @@ class Fallback:
 
 
 class Sender:
-    """Sends the attitude to the autopilot when it is due; to ground stations too, if `full`."""
+    """Sends the attitude to the autopilot at its rate; with `full` also to ground stations."""
 
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
@@ -127,7 +127,7 @@ class Sender:
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf
 
     def is_due(self, t_s: float, now_s: float) -> bool:
-        """Return whether the attitude at `t_s` is due; stamps and packets keep the least time apart."""
+        """Return whether the attitude of time `t_s` is due; time stamps and sending times are `SHORTEST_S` apart."""
         return (
             t_s >= self._next_s - _ROUNDING_S
             and t_s - self._last_s >= SHORTEST_S - _ROUNDING_S
@@ -138,7 +138,7 @@ class Sender:
         self, firmware: Firmware, attitude: Attitude, levelled: Attitude, reset_counter: int, now_s: float
     ) -> None:
         t_s = attitude.t_s
-        # The rate is kept on average, but messages missed in a gap are not made up for.
+        # Keep the average rate, but do not send the messages missed in a gap.
         self._next_s = self._next_s + self._period_s if self._next_s > t_s - self._period_s else t_s + self._period_s
         self._last_s, self._left_s = t_s, now_s
         if self._link.send(vision_position_estimate(firmware, levelled, reset_counter)):
@@ -150,7 +150,7 @@ class Sender:
 
 
 class AttitudeService:
-    """Carries, pushes and supervises the attitude; `run` it."""
+    """Estimates, pushes and supervises the attitude; `run` is its task."""
 
     def __init__(self, core: Core, devices: Devices, in_force: ActiveCalibration, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
@@ -185,10 +185,10 @@ class AttitudeService:
             elif "compass" in sensor.kinds:
                 sensor.on_samples.add(self._guarded(lambda samples, _read_s: self.carrier.take_compass(samples)))
 
-    # --- what arrives
+    # --- inputs
 
     def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
-        """Wrap a sample callback: after an exception stop the push, forget the estimate, and let calibration go on."""
+        """Wrap a sample callback: an exception stops the push and drops the estimate, but calibration goes on."""
 
         def guarded(samples: Sequence[Sample], read_s: float) -> None:
             try:
@@ -207,7 +207,7 @@ class AttitudeService:
             self._push(read_s)
 
     def _push(self, read_s: float) -> None:
-        """Send what is due, in the turn of the event loop that brought the samples: a timer would skip messages."""
+        """Send the attitude if due. Runs in the event-loop turn that read the samples: a timer would skip messages."""
         if not self.health.pushing or not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()
@@ -232,7 +232,7 @@ class AttitudeService:
         self.carrier.airspeed_m_s = message.airspeed if good else None
         self._airspeed_s = t_s
 
-    # --- the rhythm
+    # --- task
 
     async def run(self) -> None:
         loop = asyncio.get_running_loop()
@@ -241,7 +241,7 @@ class AttitudeService:
             while True:
                 self.turns += 1
                 try:
-                    if not self._closed:  # else a write that takes its time would let the push begin again
+                    if not self._closed:  # otherwise the push could resume while the daemon waits for a write to end
                         await self._turn(loop.time())
                 except Exception:
                     # A doubtful attitude must not be pushed to an EKF in flight.
@@ -277,7 +277,7 @@ class AttitudeService:
         elif self._was_pushing and not self.health.pushing:
             self._say_once(Severity.WARNING, f"Attitude push stopped: {self.health.why_not}", now_s)
         elif self._restarted and now_s - self._started_s >= LATE_S:
-            self._started_s = math.inf  # told once
+            self._started_s = math.inf  # reported once
             self._say_once(Severity.WARNING, f"Attitude not pushed: {self.health.why_not}", now_s)
         self._was_pushing = self.health.pushing
         warning = self.health.warning
@@ -292,7 +292,7 @@ class AttitudeService:
             self._said = (words, now_s)
             self._say(severity, words, Weight.NEWS)
 
-    # --- what is known
+    # --- state
 
     @property
     def _restarted(self) -> bool:
@@ -307,7 +307,7 @@ class AttitudeService:
         return self.health.warning
 
     def status(self) -> Object:
-        # A missing calibration is no fault of a device.
+        # A missing calibration does not count as a fault of a device.
         calibrated = self.carrier.alignments > 0 or self._restarted
         good = not self._runs or self.health.pushing or not calibrated
         summary = self._summary() if self._runs else "starts with companion run"

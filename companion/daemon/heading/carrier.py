@@ -1,4 +1,4 @@
-"""The attitude estimator in the daemon: its samples, its calibration, and its alignments."""
+"""The attitude estimator in the daemon: its samples, calibration and alignments."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from companion.samples import CompassSample, ImuSample, Sample, Triad, Vector
 logger = logging.getLogger(__name__)
 
 KEPT_S: Final = 5.0
-"""Samples kept since a still window, which ended up to 2 s ago, to carry its alignment on to now."""
+"""Time for which samples are kept, to carry an alignment from the end of its still window (up to 2 s ago) to now."""
 _NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
 CHECK_EVERY_S: Final = 10.0
@@ -43,15 +43,15 @@ TILT_FLOOR_RAD: Final = 0.5 * DEG
 HEADING_FLOOR_RAD: Final = 3.0 * DEG
 DISAGREES_SIGMAS: Final = 3.0
 JUMP_RAD: Final = 1.0 * DEG
-"""Least change of heading at an alignment that is sent to the autopilot as a reset."""
+"""Least change of heading by an alignment that is reported to the autopilot as a reset."""
 SLOWEST_AIRSPEED_M_S: Final = 5.0
 UNCALIBRATED_ACCEL_MG: Final = 50.0
-"""Error of a consumer accelerometer where only the gyros were calibrated."""
+"""One sigma of a consumer accelerometer's bias, used if only the gyros were calibrated."""
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 def carrying_imu(config: Config) -> Imu:
-    """Return the companion's own IMU, if any: it is faster, unfiltered, and nobody else changes its offsets."""
+    """Return the IMU for the attitude: the companion's own, if any, as it is faster, unfiltered and ours alone."""
     return next((imu for imu in config.imu if imu.source == "serial"), config.imu[0])
 
 
@@ -66,10 +66,10 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
         full = [row[:3] for row in record.covariance[:3]]
         if not any(value is None for row in full for value in row):
             covariance = np.array(full, dtype=np.float64)
-    # Quantisation: a rate below one step reads zero.
+    # Add the quantisation error: a rate below one step reads zero.
     covariance = covariance + np.eye(3) * gyro_step_rad_s**2 / 12.0
     unknown = UNCALIBRATED_ACCEL_MG * MG
-    # In flight the aircraft is mostly level, however it stood when it was calibrated.
+    # Use the sigma for a level pose: in flight the aircraft is mostly level, unlike perhaps at calibration.
     level = record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
     return AttitudeSettings(
         vehicle_from_sensor=rotation_matrix(imu.mounting if serial else "ROTATION_NONE"),
@@ -95,7 +95,7 @@ def without_truncation(sample: ImuSample, step_rad_s: float) -> ImuSample:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandingAttitude:
-    """Attitude of the standing aircraft at the end of a window."""
+    """Attitude of the standing aircraft at the end of a still window."""
 
     t_s: float
     body_from_ned: Matrix
@@ -108,7 +108,7 @@ class StandingAttitude:
 def standing_attitude(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
 ) -> StandingAttitude:
-    """Estimate the attitude of a still window; blocking. Refuse readings that contradict each other."""
+    """Estimate the attitude in a still window; refuse readings that contradict each other. Blocking."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
     turn = truth.body_from_ned
@@ -119,7 +119,7 @@ def standing_attitude(
 
 
 class Carrier:
-    """Carries the attitude of one IMU."""
+    """Estimates the attitude from one IMU, between alignments and in flight."""
 
     def __init__(self, core: Core, imu: Imu, in_force: ActiveCalibration, alignment: ActiveAlignment) -> None:
         self.imu = imu
@@ -141,12 +141,12 @@ class Carrier:
         self._local: LocalEarth | None = None
         self._record: ImuRecord | None = None
         self._recent: deque[Sequence[ImuSample]] = deque()
-        """Reads within `KEPT_S` on the ground, or without an estimator."""
+        """Samples of the last `KEPT_S`, by read; collected on the ground, and while there is no estimator."""
         self.align_wanted = False
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
 
-    # --- samples, in the turn of the loop in which they were read
+    # --- samples, in the event-loop turn that read them
 
     def add(self, samples: Sequence[ImuSample]) -> None:
         self.heard_s = samples[-1].t_s
@@ -198,7 +198,7 @@ class Carrier:
 
     async def update(self, now_s: float) -> None:
         disarmed = self._vehicle.arm_state is ArmState.DISARMED
-        # With an unknown arm state the rules of flight are safe.
+        # While the arm state is unknown, the rules for flight are the safe choice.
         self.phase = "ground" if disarmed else "flight"
         on_deck = self._config.vehicle.platform == "deck"
         self.still = disarmed and not on_deck and self._collector.glance(now_s).obstacle is None
@@ -221,7 +221,7 @@ class Carrier:
     async def _follow_calibration(self) -> None:
         found = self._in_force.record_of(self.imu.name)
         if found is None and self.imu.source == "serial":
-            found = self._record  # an undo changes the autopilot, not the bias of our own sensor
+            found = self._record  # an undo changes the autopilot's offsets, not the bias of our own sensor
         if found is self._record:
             return
         self._record = found
@@ -259,7 +259,7 @@ class Carrier:
         if now is None:
             return True
         error = multiply(from_matrix(stand.body_from_ned.T), conjugate(now.quaternion))
-        # The turn about north, east and down in rad; where it is large, 2 sin(angle / 2).
+        # Rotation error about north, east and down in rad (for large errors 2 sin(angle / 2)).
         north, east, down = (math.copysign(2.0, error[0]) * part for part in error[1:])
         tilt = math.hypot(north, east)
         own = max(now.sigma_rad[0], now.sigma_rad[1])
@@ -273,7 +273,7 @@ class Carrier:
         assert self.estimator is not None
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
-        # Just landed no samples are kept: the attitude is then that of the last sample.
+        # Just after landing no samples are kept: then the attitude applies to the last sample.
         begun_s = stand.t_s if since else self.heard_s if math.isfinite(self.heard_s) else None
         self.estimator.align(begun_s, stand.body_from_ned, stand.covariance)
         self.estimator.update(since, phase=self.phase)

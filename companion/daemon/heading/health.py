@@ -1,4 +1,4 @@
-"""Health of the pushed attitude, and its difference to the autopilot's own."""
+"""Health of the pushed attitude, and its difference from the autopilot's attitude."""
 
 from __future__ import annotations
 
@@ -35,36 +35,36 @@ DIFFERS_SIGMAS: Final = 3.0
 DIFFERS_S: Final = 5.0
 ATTITUDE_RATE_HZ: Final = 10.0
 THEIR_TILT_DEG: Final = 2.0
-"""One sigma of the error of the autopilot's own tilt, with trim (AHRS_TRIM) and mounting errors."""
+"""One sigma of the autopilot's tilt, including trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
-"""One sigma of the error of the autopilot's heading, from a compass or the companion."""
-GOOD_S: Final = 3.0  # Time without a fault before a stopped push begins again
+"""One sigma of the autopilot's heading, from a compass or from the companion."""
+GOOD_S: Final = 3.0  # Time without a fault before a stopped push resumes
 TOLD_TILT_DEG: Final = 4.0
 TOLD_HEADING_DEG: Final = 8.0
-"""Smoothed differences that cause a warning; it ends at half of them."""
+"""Smoothed differences (tilt and heading) that start a warning; it ends at half of them."""
 SMOOTHED_S: Final = 3.0
-"""Smoothing time: the two differ for moments by the delays of their filters."""
+"""Smoothing time: the two attitudes differ briefly because their filters have different delays."""
 OLD_S: Final = 2.0
 STEEP_RAD: Final = math.radians(60.0)
 """Pitch beyond which roll and heading cannot be separated."""
 FORGETS_PER_S: Final = 0.02
-"""Growth of the shortest delay seen, as two clocks may drift apart, a simulated one by 1 %."""
+"""Growth of the smallest clock offset seen, s per s: two clocks may drift apart, a simulated one by 1 %."""
 HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
 STRAYS_RAD: Final = math.radians(5.0)
 FADES_S: Final = 4.0
-"""Time in which the sum fades: a drift of 1.25 deg/s goes unnoticed, and the compass corrects it."""
-STRAYS_SIGMAS: Final = 3.0  # Allowed turn in sigmas of the heading: the compass may correct a poorly known one
+"""Time constant of the fading sum: a drift up to 1.25 deg/s goes undetected, and the compass corrects it."""
+STRAYS_SIGMAS: Final = 3.0  # Allowed drift in sigmas of the heading: the compass may correct a poorly known heading
 SCALES: Final = 0.01
 """Tolerated difference between the scale factors of two gyros, as a fraction of the angle turned."""
-LATE_S: Final = 0.03  # Usual difference of the two times
+LATE_S: Final = 0.03  # Usual time difference between the two attitudes
 LONGEST_STEP_S: Final = 0.25
-"""Longest step that is compared: it hides a turn to and fro."""
+"""Longest time step that is compared: a longer one could hide a turn to and fro."""
 
 
 class HeadingDriftMonitor:
-    """Sums the turn of the heading less that of other gyros, by the rule of the script on the flight controller."""
+    """Sums our heading's turn minus that of other gyros, by the rule of the script on the flight controller."""
 
     def __init__(self) -> None:
         self.strayed_rad = 0.0
@@ -76,7 +76,7 @@ class HeadingDriftMonitor:
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
-        """Add a heading with its sigma, and the rate of the other gyros about the vertical; `late_s`: extra delay."""
+        """Add a heading, its sigma, and the other gyros' rate about the vertical; `late_s`: further time error."""
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         if before is None:
             self._sigma_rad = max(self._sigma_rad, sigma_rad)
@@ -99,7 +99,7 @@ class HeadingDriftMonitor:
 
 
 class Difference:
-    """Difference of our attitude to the latched autopilot's, by its ATTITUDE messages."""
+    """Difference between our attitude and the one in the autopilot's ATTITUDE messages."""
 
     def __init__(self, vehicle: Vehicle, carrier: Carrier) -> None:
         self._carrier = carrier
@@ -109,7 +109,7 @@ class Difference:
         self.theirs: tuple[float, Quaternion] | None = None
         """The autopilot's last attitude: time on our clock, and body to NED."""
         self.latest: tuple[float, float] | None = None
-        """Unsmoothed `tilt_rad` and `heading_rad`; None where it is too steep."""
+        """Unsmoothed `tilt_rad` and `heading_rad`; None while the pitch is beyond `STEEP_RAD`."""
         self.heard_s = -math.inf
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
@@ -132,15 +132,15 @@ class Difference:
 
     @property
     def heading_rad(self) -> float:
-        """Smoothed heading of the autopilot less ours, in [-pi, pi]."""
+        """Smoothed difference of heading, the autopilot's minus ours, in [-pi, pi]."""
         return cmath.phase(self._heading)
 
     def levelled(self, attitude: Attitude, now_s: float) -> Attitude:
-        """Return our attitude turned by the shortest arc to the autopilot's vertical, if known.
+        """Return our attitude rotated by the shortest arc to the autopilot's vertical, if that is known.
 
-        PX4 takes the yaw of its own quaternion in an order of angles that depends on the tilt. At 30 deg of tilt two
-        orders differ by up to 10 deg, and PX4 jumps to a heading that it has refused for 1 s (ev_yaw_control.cpp,
-        getEulerYaw).
+        PX4 computes the yaw of its own quaternion with an order of angles that depends on the tilt. At 30 deg of tilt
+        the yaw of two orders differs by up to 10 deg. PX4 jumps to a heading that it has refused for 1 s
+        (ev_yaw_control.cpp, getEulerYaw).
         """
         if not self.is_heard(now_s):
             return attitude
@@ -197,7 +197,7 @@ class Difference:
             self._offset_s += forgotten_s
             self._forgotten_s += forgotten_s
             if offset_s < self._offset_s - LATE_S:
-                # A delay that ends would look like a difference in a turn.
+                # The end of a delay would look like a heading difference during a turn.
                 self.straying.skip()
         if offset_s <= self._offset_s:
             self._offset_s, self._forgotten_s = offset_s, 0.0
@@ -216,10 +216,10 @@ def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tu
 
 
 class Health:
-    """Judges whether the attitude may be pushed; call `judge` several times a second.
+    """Decides whether the attitude may be pushed; call `judge` several times a second.
 
-    A different heading stops the push if the two have agreed since the last alignment, or if the autopilot's comes from
-    its own compass (`own_agrees`): one of the two is wrong. Only an alignment ends a drift in flight.
+    A heading that differs from the autopilot's stops the push if both agreed since the last alignment, or if the
+    autopilot's comes from its own compass (`own_agrees`): one of them is wrong. Only an alignment ends a heading drift.
     """
 
     def __init__(
@@ -277,7 +277,7 @@ class Health:
         if silent_s > SILENT_S:
             return f"IMU {carrier.imu.name} sends nothing"
         if carrier.doubt is not None:
-            self._agreed = True  # before it is pushed
+            self._agreed = True  # `Resume` pushes nothing before the two attitudes agree
             return carrier.doubt
         straying = self._difference.straying
         if self._strayed is None and straying.is_too_far and carrier.phase == "flight":
@@ -321,7 +321,7 @@ class Health:
             return None
         if self._differs_since_s is None:
             self._differs_since_s = now_s
-        # A difference that has stopped the push keeps it stopped until it ends.
+        # A difference that has stopped the push keeps it stopped as long as it lasts.
         return words if now_s - self._differs_since_s >= DIFFERS_S or not self.pushing else None
 
     def _compare(self, now_s: float) -> None:

@@ -1,6 +1,6 @@
-"""Start in flight: the attitude resumes from the last calibration, or not at all.
+"""Start of the daemon in flight: the attitude resumes with the last calibration, or not at all.
 
-Roll and pitch come from the autopilot, the heading from our compass. Nothing is pushed before the two attitudes agree.
+Roll and pitch come from the autopilot, the heading from our compass. Nothing is pushed before it agrees with ours.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from companion.estimation.solution.site import LocalEarth, Whereabouts, local_ea
 from companion.physics.frames import vector
 from companion.physics.units import DEG
 
-AGREES_S: Final = 0.7  # Time of agreement before the push, and of disagreement before a new start
-FRESH_S: Final = 1.0  # Largest age of the autopilot's attitude; the gyros carry it on
-LATEST: Final = 10  # Records searched for one that is not cancelled or failed
+AGREES_S: Final = 0.7  # Time of agreement before the push starts, and of disagreement before the estimate starts anew
+FRESH_S: Final = 1.0  # Largest age of the autopilot's attitude to start from; the gyros extrapolate it
+LATEST: Final = 10  # Number of latest records searched for a calibration that is done
 DECLINATION_SIGMA_DEG: Final = 1.0
-"""Error of a stored declination: 0.3 to 0.5 deg of the model, and the distance flown since."""
+"""One sigma of a stored declination: 0.3 to 0.5 deg from the model, the rest from the distance flown since."""
 
 
 class Resume:
-    """Resumes the attitude in flight; `step` several times a second until `pending` is false."""
+    """Resumes the attitude in flight; call `step` several times a second until `pending` is false."""
 
     def __init__(
         self, core: Core, carrier: Carrier, difference: Difference, calibrating: Calibrating, imu: AutopilotImu | None

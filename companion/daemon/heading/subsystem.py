@@ -1,4 +1,4 @@
-"""The pose for people, the attitude for the autopilot, and the check of the autopilot's settings for it."""
+"""The pose shown to people, the attitude pushed to the autopilot, and the check of the autopilot's settings for it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Heading(Subsystem):
         self._core = core
         self.attitude: AttitudeService | None = None
         if core.config.push.attitude != "off":
-            # Imported here: the start is shorter without.
+            # Imported here to keep the start short.
             from companion.daemon.heading.attitude_service import AttitudeService
 
             self.attitude = AttitudeService(core, devices, arming.in_force, calibrating)
@@ -58,7 +58,7 @@ class Heading(Subsystem):
         gate = await firmware.find_gate_problem(self._core.parameters, self._core.vehicle.system_id, 0.0)
         sends = self._core.config.push.attitude != "off"
         todo = ", ".join(f"{one.parameter} {one.after:g}" for one in changes)
-        # Without a heading sent or expected the rest does not matter.
+        # If no heading is sent and none is expected, compass and risks do not matter.
         concerned = sends or not changes
         net = firmware.heading_net(found)
         missing = firmware.missing_compass(found) if concerned else None
@@ -113,7 +113,7 @@ class Heading(Subsystem):
 
 
 class PoseNow:
-    """The pose from gradienter and compass, or from `carried`, which holds in flight too, while that gives one."""
+    """The pose to show: from `carried` (also valid in flight) while it gives one, otherwise from the sensors."""
 
     def __init__(self, core: Core, alignment: ActiveAlignment, carried: Callable[[], Object | None] | None) -> None:
         self._core, self._alignment, self._carried = core, alignment, carried
@@ -145,7 +145,7 @@ class PoseNow:
         return self.now()
 
     def now(self) -> Object | None:
-        """Return the pose; None without a fresh tilt. The heading is magnetic while no declination is known."""
+        """Return the pose; None without a fresh tilt. The heading is magnetic while the declination is unknown."""
         if self._carried is not None and (carried := self._carried()) is not None:
             return carried
         tilt, heading = self._fresh()

@@ -1,1 +1,1 @@
-"""Control socket, own MAVLink parameters, and the child processes for page and MQTT."""
+"""Interfaces: control socket, headline, MAVLink component, and the child processes for page and MQTT."""

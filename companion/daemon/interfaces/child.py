@@ -1,6 +1,6 @@
 """One child process of the daemon: started, watched, and restarted when it ends or falls silent.
 
-The child side is `companion.links.system.process`.
+The code that runs in the child is `companion.links.system.process`.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from companion.messages import message
 logger = logging.getLogger(__name__)
 
 FIRST_REPORT_S: Final = 60.0
-"""A small board with a cold SD card takes this long to import the child's libraries."""
+"""Longest wait for the first report: a small board with a cold SD card imports the child's libraries slowly."""
 SILENT_S: Final = 5.0 * REPORT_EVERY_S
 END_WITHIN_S: Final = 3.0
-"""The MQTT process publishes the last state and "offline" before it ends."""
+"""Longest wait for a child to end: the MQTT process publishes the last state and "offline" first."""
 WORTH_S: Final = 30.0
 REPORT_LIMIT: Final = 256 * 1024
 
 
 class Child:
-    """Keeps `python -m MODULE` running; `run` it as a task."""
+    """Keeps `python -m MODULE` running; `run` is its task."""
 
     def __init__(self, name: str, module: str, settings: ChildSettings) -> None:
         self._name, self._module, self._settings = name, module, settings
@@ -59,7 +59,7 @@ class Child:
                 stdin=PIPE,
                 stdout=PIPE,
                 limit=REPORT_LIMIT,
-                # Ctrl-C in the terminal is the daemon's to handle.
+                # A session of its own keeps Ctrl-C in the terminal from the child: the daemon handles it.
                 start_new_session=True,
             )
         except OSError as error:
@@ -76,7 +76,7 @@ class Child:
             try:
                 await asyncio.shield(ending)
             except asyncio.CancelledError:
-                # The daemon stops while a failed child is being ended: a child half ended would live on.
+                # The daemon stops while it ends a failed child: finish that first, or the child would live on.
                 await ending
                 raise
 
@@ -86,7 +86,7 @@ class Child:
             silent_s, heard = 0.0, self._report
             while not reading.done():
                 await asyncio.wait([reading], timeout=REPORT_EVERY_S)
-                # Counted, not read from the clock: the daemon itself may have stood still.
+                # Count waits instead of reading the clock: the daemon itself may have been stopped.
                 silent_s, heard = (silent_s + REPORT_EVERY_S if heard is self._report else 0.0), self._report
                 if silent_s >= (SILENT_S if heard is not None else FIRST_REPORT_S):
                     _kill(process)
@@ -113,12 +113,12 @@ StartChild = Callable[[str, str, ChildSettings], Child]
 
 
 async def _end(process: Process) -> None:
-    # Unread data would keep the pipe open, and `wait` from returning.
+    # Read the output to its end: unread data would keep the pipe open and `wait` from returning.
     drained = asyncio.ensure_future(_drain(process))
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
-    # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4.
+    # asyncio.timeout will not do: before Python 3.11.4 it cannot expire in a cancelled task.
     ended = asyncio.ensure_future(process.wait())
     if not (await asyncio.wait([ended], timeout=END_WITHIN_S))[0]:
         _kill(process)

@@ -1,7 +1,7 @@
 """Control socket, for the command line and the child processes.
 
-A Unix stream socket of the daemon's user (mode 0600) or a group (0660). One request a connection, one JSON object a
-line: progress lines, then one of kind "result" or "error". A client that goes away stops nothing.
+A Unix stream socket for the daemon's user (mode 0600) or a group (0660). Each connection carries one request. Each line
+is a JSON object: progress lines, then one of kind "result" or "error". A job goes on when its client disconnects.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ REQUEST_LIMIT: Final = 64 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
 KERNEL_BYTES: Final = 16 * 1024
 MAX_CLIENTS: Final = 16
-"""Most connections of each kind: without a request yet, urgent commands, all others."""
+"""Most connections in each of three classes: no request yet, urgent commands, other commands."""
 URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
 
 
 class ControlServer:
-    """Serves the control socket; `async with` it."""
+    """Server of the control socket; use it with `async with`."""
 
     def __init__(self, path: Path, handler: Handler, *, group: str | None = None) -> None:
         self._path, self._group = path, group
@@ -50,14 +50,14 @@ class ControlServer:
         self._served: Counter[bool] = Counter()
 
     async def __aenter__(self) -> Self:
-        """Bind the socket, replacing a stale one; a LinkError where another daemon answers, or it cannot be bound."""
+        """Bind the socket, replacing a stale one; raise LinkError if that fails or another daemon answers on it."""
         listener = _bind(self._path)
         if self._group is not None:
             _open_to(self._path, self._group)
         self._server = await asyncio.start_unix_server(
             self._accept, sock=listener, limit=REQUEST_LIMIT, backlog=MAX_CLIENTS
         )
-        # asyncio accepts `backlog` clients before it closes one that was evicted; the kernel may queue more.
+        # asyncio accepts up to `backlog` clients before it closes an evicted one; the kernel may queue more.
         listener.listen()
         return self
 
@@ -72,18 +72,18 @@ class ControlServer:
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._silent) >= MAX_CLIENTS:
-            # Our clients send their request at once: the oldest silent one makes way.
+            # Our own clients send their request at once, so the oldest silent client is closed.
             oldest = next(iter(self._silent))
             oldest.cancel()
             del self._silent[oldest]
-        # Small buffers, so that a client that does not read is soon noticed.
+        # With small buffers, a client that does not read is noticed soon.
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
         writer.transport.set_write_buffer_limits(0)
         client = asyncio.get_running_loop().create_task(self._serve(reader, writer), name="control client")
         self._clients.add(client)
         self._silent[client] = None
         client.add_done_callback(self._forget)
-        # Not a `finally` of the task: one that is cancelled before its first step reaches none.
+        # A `finally` in the task will not do: a task cancelled before its first step never reaches it.
         client.add_done_callback(lambda _: writer.transport.abort())
 
     def _forget(self, client: asyncio.Task[None]) -> None:
@@ -142,7 +142,7 @@ def _bind(path: Path) -> socket.socket:
         path.parent.mkdir(exist_ok=True)
         _remove_stale(path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        # The mode must be right before anyone can connect: bind makes the file with the umask's mode.
+        # `bind` creates the file with the umask's mode, so that is right before anyone can connect.
         old_mask = os.umask(0o177)
         try:
             listener.bind(str(path))
@@ -167,7 +167,7 @@ def _open_to(path: Path, group: str) -> None:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the socket of a daemon that has ended; raise OSError where another file or daemon is there."""
+    """Remove the socket of a daemon that has ended; raise OSError if it belongs to a running one or is no socket."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -186,7 +186,7 @@ def _remove_stale(path: Path) -> None:
 
 
 def process_behind(path: Path) -> set[int]:
-    """Return the process that listens on a control socket; empty where there is none, or without access."""
+    """Return the process that listens on a control socket; empty: no process, or no access to it."""
     try:
         with socket.socket(socket.AF_UNIX) as asking:
             asking.settimeout(1.0)

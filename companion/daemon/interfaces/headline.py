@@ -1,4 +1,4 @@
-"""The state as one big word with its reason, which the page and the monitor show first."""
+"""Headline: the state in a word or two with its reason, which the page and the monitor show first."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from companion.messages import message
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
-"""good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
+"""good: ready to fly. wait: be patient, or hold still. busy: the companion is working. bad: somebody has to act."""
 
 
 Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, and the tone
 
 
 class Headlines:
-    """Works out the headline, for all interfaces alike."""
+    """Makes the headline for all interfaces."""
 
     def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
@@ -117,7 +117,7 @@ class Headlines:
             return "NOT READY", words, "bad"
         held_back, todo = self._readiness.in_force.held_back, self._automatic.why_not()
         if held_back is None and todo is None:
-            # The sensor's own trouble says what to do; that nothing comes from it is only what follows.
+            # Prefer the sensor's own trouble, which names a remedy, to its consequence that no samples arrive.
             return "NOT CALIBRATED", self._devices.watch.worst() or answer.words, "bad"
         words = words if held_back is not None or todo == words else f"{words}: {todo}"
         return self._failed() or ("NOT CALIBRATED", words, "bad")

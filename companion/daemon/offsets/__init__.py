@@ -1,1 +1,1 @@
-"""Writing to the autopilot: the plan, the ledger, what is put back, what else writes there."""
+"""Writes to the autopilot: plan, journal, check of the effect, recovery and undo, and other writers."""

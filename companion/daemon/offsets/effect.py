@@ -1,6 +1,6 @@
-"""Effect of a write: the telemetry before and after it, compared with the step that the new offsets must make.
+"""Check of a write's effect: compares the telemetry before and after it with the step that the new offsets must make.
 
-The windows' sigmas cover the last digit of integer telemetry; only the short look at far values uses plain means.
+The windows' sigmas include the rounding of integer telemetry; only the short check of far values uses plain means.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ from companion.samples import Triad, Vector
 
 VERIFY_MAX_S: Final = 60.0  # Longest wait for stillness after the write before its effect counts as not seen
 VERIFY_ON_DECK_S: Final = 180.0
-"""Longest wait on a deck, where it takes the better part of a minute to see a step."""
+"""Longest wait on a deck, where a step takes most of a minute to show."""
 LOOK_S: Final = 10.0
-"""Seconds that show a step, where a calibration must be still for longer."""
+"""Still time that shows a step, also if a calibration needs a longer one."""
 LOOK_LONGER_S: Final = 30.0
-"""The longest look at a change that a few seconds do not show; beyond it flicker hides more than averaging shows."""
+"""Longest observation of a change that a few seconds do not show; beyond it flicker outweighs more averaging."""
 TELEMETRY_S: Final = 2.0
 """Time after a write in which the telemetry may seem to be missing."""
 TELEMETRY: Final = "waiting for the telemetry"
-"""Progress text until the write has settled and `TELEMETRY_S` has passed: the offset step looks like movement."""
+"""Progress text until the write has settled and `TELEMETRY_S` has passed; until then a step looks like movement."""
 UNWATCHED: Final = "this IMU is not in the telemetry"
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[EffectVerdict]]  # Verdicts by IMU
 
-# Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
-# and 50 micro-g), not for the worst there is as over the minutes of sigma_use: else no step could ever be seen.
+# Flicker assumed of an unknown part between two windows of some ten seconds: an ordinary part's (floors of 8 deg/h and
+# 50 micro-g). With the worst part's, as in sigma_use over minutes, no step could ever be seen.
 ORDINARY_FLICKER: Final[Mapping[Triad, float]] = {"gyro": 8.0 / 0.664 * DEG_H, "accel": 0.05 / 0.664 * MG}
 TOLERANCE_SIGMAS: Final = 2.0
-"""Residual allowed besides noise, in sigma_use of the bias."""
+"""Residual allowed in addition to noise, in sigma_use of the bias."""
 
 
 async def watch_effect(
     core: Core, px4: Px4Writes, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
 ) -> tuple[Verdicts | None, str]:
-    """Wait for still telemetry after a write and judge it; a step that is nearly visible is watched longer.
+    """Wait for still telemetry after a write and judge it; observe longer if a step is nearly visible.
 
-    `go_on` is called with words now and then, and ends the watch by raising; `boots` counts the restarts seen before.
-    Returns verdicts by IMU, or the reason why there are none.
+    `go_on` is called regularly with a progress text, and ends the wait by raising. `boots`: restarts of the autopilot
+    before the write. Returns verdicts by IMU, and the reason if there are none or they are not final.
     """
     watched = [target for target in plan.targets if target.watched]
     if not watched:
@@ -100,14 +100,14 @@ def _in_the_way(core: Core, looked_s: float) -> str:
     status = core.collector.status(now_s)
     words = status.waiting_for or ""
     if words and status.still_s > 0.0:
-        # The time for which a calibration must be still says nothing about the time that a step takes to show.
+        # A step may show in less time than a calibration must be still for.
         moves = core.collector.glance(now_s).obstacle
         words = "" if moves is None else moves.words
         look_s = min(LOOK_S, core.config.calibration.min_still_s)
         if not words and status.still_s < look_s:
             words = f"hold still {look_s - status.still_s:.0f} s more"
     if words and looked_s < TELEMETRY_S:
-        return TELEMETRY  # telemetry during the write was left out
+        return TELEMETRY  # telemetry seems to be missing because samples during the write were left out
     return words
 
 
@@ -120,9 +120,9 @@ def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: W
 
 def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
     found = [verdict for each in verdicts.values() for verdict in each]
-    # The scatter of two seconds says little of their mean: nothing is called wrong on so little.
+    # Two seconds of scatter do not show the error of their mean: too little for the verdict that a write is wrong.
     hasty = looked_s < LOOK_S and not all(verdict.ok for verdict in found)
-    # A longer look can show a hidden step that has at least 3 of the 8 sigmas it needs.
+    # Longer observation can reveal a hidden step that already has at least 3 of the 8 sigmas it needs.
     nearly = any(
         verdict.ok and verdict.hidden and verdict.fraction_sigma is not None and verdict.fraction_sigma < 1 / 3
         for verdict in found
@@ -139,9 +139,9 @@ def judge_vectors(
     *,
     apart_s: float = 0.0,
 ) -> list[EffectVerdict]:
-    """Judge the written vectors by the telemetry before and after: accelerometers, gyros, or both.
+    """Judge the written vectors (accelerometers, gyros, or both) by the telemetry before and after.
 
-    Where the output followed a far value and then left it as it had to, the new value is in use, however small the
+    If the output followed a far value and then returned from it as expected, the new value is in use, however small the
     change as a whole. `apart_s`: time between the middles of both windows.
     """
     gyro_step, accel_step = output_step(target.calibration, target.changes, first.accel_m_s2)
@@ -160,7 +160,7 @@ def judge_vectors(
         mean_after, sigma_after, _ = _read(second, triad)
         before, after, warmed = _as_at_end(triad, (first.warming, second.warming), apart_s, mean, mean_after)
         model = noise.of(triad)
-        # The bias wanders between the windows (method 2.2, V less its white part).
+        # Bias drift between the windows (method 2.2, V without its white part).
         drift = np.sqrt(floor_variance(min(model.flicker, flicker.get(triad, math.inf)), model.walk, *spans_s))
         observation = Observation(
             parameters=parameters,
@@ -199,7 +199,7 @@ def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
 def _as_at_end(
     triad: Triad, warming: tuple[Warming | None, Warming | None], apart_s: float, before: Vector, after: Vector
 ) -> tuple[Vector, Vector, Array]:
-    """Convert both means to the temperature at the end of the first window; returns one sigma of that too, (3,)."""
+    """Convert both means to the temperature at the end of the first window; also return that step's sigma, (3,)."""
     first, second = warming
     if first is None:
         return before, after, np.zeros(3)
@@ -216,9 +216,9 @@ def _as_at_end(
 def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
     """Limit the sigmas of the later mean from below by the noise before the write.
 
-    A write changes no noise; but the scatter of a few seconds is, by chance, now and then a tenth of what it should be.
-    Where the seconds before are few as well, the three axes together count: simulated, 2 s against 2 s, each axis by
-    itself refuses 2 % of the writes that are in order, and the triad 0.1 %. From 5 s before on it is 0.2 % by itself.
+    A write does not change the noise, but the scatter of a few seconds can by chance be a tenth of the true one. If the
+    time before was short too, the limit uses all three axes. Simulated refusals of good writes, 2 s against 2 s: 2 %
+    with a limit for each axis, 0.1 % with the triad's. With 5 s or more before the write: 0.2 % for each axis.
     """
     longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
     triad = float(np.sqrt(np.mean(np.square(before)))) if spans_s[0] < MIN_BATCHES else 0.0

@@ -1,15 +1,16 @@
 """The firmware's own gyro calibration between the two halves of a write, so that its EKF is right afterwards.
 
-The order that leaves ArduPilot's EKF right (autopilots 9.3.1): accelerometer offsets, the firmware's gyro calibration,
-which alone resets the EKF's gyro bias, then our fine gyro offsets over its coarse ones. Ours are written before it as
-well: what the autopilot refuses is known while all can still be restored, and if the one command that is sent gets
-lost, nothing else is missing than the reset.
+The order that leaves ArduPilot's EKF right (autopilots 9.3.1): accelerometer offsets; the firmware's gyro calibration,
+which alone resets the EKF's gyro bias; then our fine gyro offsets over its coarse ones. The fine offsets are also
+written before the calibration: a refusal shows while all can still be restored, and if the one command is lost, only
+the reset is missing.
 
 The fine offsets are known beforehand: per sample the output is R (raw - offset), so the whole bias in board axes,
-offset + R^-1 residual, does not depend on the offset in force. With a temperature calibration it would: the firmware's
-calibration sets CALTEMP too, and with it what is taken off `raw`. There it is left out and the EKF settles by itself.
+offset + R^-1 residual, does not depend on the present offset. With a temperature calibration it would, as the gyro
+calibration also sets CALTEMP and so changes the correction of `raw`. Then the gyro calibration is left out, and the EKF
+settles by itself.
 
-The calibration also overwrites gyro offsets that nobody asked us to change. All of them are kept before, and restored
+The calibration also overwrites gyro offsets that are not part of the plan. All of them are saved before, and restored
 by every roll-back and undo.
 """
 
@@ -40,17 +41,17 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 WORTH_RAD_S: Final = 20.0 * DEG_H
-"""Step on any axis above which the calibration is worth the flash of all instances that it rewrites: a stale EKF bias
-turns the heading by the step times 17 to 25 s (autopilots 9.3.1), here 0.14 deg."""
+"""Step on any axis above which the calibration is worth rewriting the flash of all instances. A stale EKF bias turns
+the heading by the step times 17 to 25 s (autopilots 9.3.1), here 0.14 deg."""
 SETTLE_RESET_S: Final = 60.0
-"""Longest wait for the EKF after the reset: while the tilt error of the old accelerometer offsets fades, it takes a
-part of it for gyro bias (a step of 30 mg: 850 deg/h for a moment, settled after 26 s on the real firmware)."""
+"""Longest wait for the EKF after the reset: while the tilt error of the old accelerometer offsets fades, the EKF takes
+part of it for gyro bias. After a step of 30 mg: up to 850 deg/h, settled after 26 s on the real firmware."""
 SETTLE_ALONE_S: Final = 150.0
-"""Longest wait for the EKF by itself: EKF3 takes about two minutes (autopilots 9.3.1: 140 s)."""
+"""Longest wait for the EKF without a reset: EKF3 takes about two minutes (autopilots 9.3.1: 140 s)."""
 
 
 class FirmwareCalibration:
-    """Decides whether the firmware's gyro calibration is wanted, and writes around it."""
+    """Decides whether a write needs the firmware's gyro calibration, and writes offsets before and after it."""
 
     def __init__(self, core: Core, writer: ParameterWriter, ledger: Ledger) -> None:
         self._vehicle, self._parameters = core.vehicle, core.parameters
@@ -58,9 +59,9 @@ class FirmwareCalibration:
         self._writer, self._ledger, self._ekf = writer, ledger, EkfWatch(core.vehicle)
 
     async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> dict[str, float] | None:
-        """Read what it would overwrite; None when it is not worth it, or not allowed (then `warn` is called)."""
+        """Read the values that the calibration would overwrite; None: leave it out (`warn` is called if TCAL is on)."""
         if not self._vehicle.kind.gyro_calibration_resets_ekf or not gyros or self._on_deck:
-            # On a deck its mean of half a second is the deck's rate, and would be written to all its gyros.
+            # On a deck, the firmware's mean of half a second is the deck's rate: wrong offsets for all gyros.
             return None
         step = max(abs(change.after - change.before) for change in gyros)
         if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:
@@ -73,10 +74,10 @@ class FirmwareCalibration:
         return before
 
     async def write(self, plan: Plan, before: Mapping[str, float], log: WriteLog, go_on: Callable[[str], None]) -> Plan:
-        """Write all offsets, calibrate, write the gyro offsets again: all of it, or all the old values are restored.
+        """Write all offsets, calibrate, write the gyro offsets again; after a failure restore all old values.
 
-        Runs in a transaction, which grows with what the firmware changes besides. Returns the plan with those changes
-        and the outcome of the calibration; raises as `ParameterWriter.apply`.
+        Runs in a transaction, which also covers the firmware's further changes. Returns the plan with those changes and
+        the outcome of the calibration; raises the errors of `ParameterWriter.apply`.
         """
         boots, changes, system_id = self._vehicle.boots, plan.changes, self._vehicle.system_id
         written = await self._writer.apply(changes)
@@ -94,7 +95,7 @@ class FirmwareCalibration:
         except CompanionError as error:
             await self._restore(changes, before, boots, error)
             raise
-        # The record holds what was in force before all this, not the firmware's coarse value in between.
+        # The record holds the values from before the write, not the firmware's coarse values in between.
         written |= {c.parameter: msgspec.structs.replace(fine[c.parameter], before=c.before) for c in plan.gyros}
         plan.note(log, written)
         if warning:
@@ -105,7 +106,7 @@ class FirmwareCalibration:
         return dataclasses.replace(plan, collateral=collateral, firmware=outcome)
 
     async def settle(self, plan: Plan, go_on: Callable[[str], None]) -> str | None:
-        """After new gyro offsets, wait until the EKF agrees; returns what a pilot should know if it has not."""
+        """Wait until the EKF agrees with new gyro offsets; return a warning for the pilot if it does not."""
         if not self._vehicle.kind.gyro_calibration_resets_ekf or not plan.gyros:
             return None
         try:
@@ -116,7 +117,7 @@ class FirmwareCalibration:
     async def _restore(
         self, changes: Sequence[Change], before: Mapping[str, float], boots: int, error: CompanionError
     ) -> None:
-        """Restore our old values and all that the firmware may have changed; always ends in a WriteFailedError."""
+        """Restore our old values and all that the firmware may have changed; always raises a WriteFailedError."""
         logger.warning("%s", message("restoring_old_values", reason=error))
         reason = error.reason if isinstance(error, WriteFailedError) else str(error)
         back = [change for change in changes if change.parameter not in before]

@@ -1,6 +1,6 @@
-"""Journal of writes to the autopilot, in memory and on disk at once; recovery of interrupted ones, and undo.
+"""Journal of writes to the autopilot, kept in memory and on disk; recovery of interrupted writes, and undo.
 
-Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or not all old values could be
+Open: a write is in progress. Orphaned: a write was interrupted (the daemon died, or not all old values could be
 restored), and the recovery has to end it. Undoable: the last finished writes on each vehicle.
 """
 
@@ -39,21 +39,21 @@ class Ledger:
 
     def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
         self._log, self._offload, self.why_yield = log, offload, why_yield
-        """`why_yield`: reason not to write because another companion does; None without one."""
+        """Function that returns the reason not to write because another companion does; None: no reason."""
         self.fault: str | None = None
-        """Reason why nothing can be kept, so that nothing may be written; None while all is well."""
+        """Reason why old values cannot be saved, so nothing may be written; None: no fault."""
         self._open: ChangeSet | None = None
         self._orphaned = asyncio.Event()
         self._undoable: dict[int, Undoable] = {}
-        self.unusable: tuple[str, ...] = ()  # Damaged files that were set aside, each in a line
-        self.lost_write = False  # The journal was damaged, so an interrupted write stays as it is
+        self.unusable: tuple[str, ...] = ()  # Damaged files that were set aside, one line of text each
+        self.lost_write = False  # True: the journal was damaged, so an interrupted write cannot be restored
 
     @property
     def pending(self) -> bool:
         return self._orphaned.is_set()
 
     def load(self) -> None:
-        """Load the files, and check that they can be written; damaged ones are set aside. Blocking."""
+        """Load the files, set damaged ones aside, and check that files can be written. Blocking."""
         try:
             self._log.check_writable()
         except StorageError as error:
@@ -90,16 +90,16 @@ class Ledger:
 
     @contextlib.asynccontextmanager
     async def transaction(self, changes: ChangeSet) -> AsyncIterator[None]:
-        """Enclose a write; an unfinished write is handled here and nowhere else.
+        """Enclose a write, so that an unfinished one is always handled; this is the only place that does so.
 
         The old values are on disk before the block begins. The block reports its end by `done` or `undone`. A writer's
         error with nothing left changed means that the autopilot is as before the block. After anything else (a value
-        left changed, a cancellation, a fault of the program, no report) the state is unknown: the recovery looks.
-        `changes` are those of the block, as far as they are known beforehand.
+        left changed, a cancellation, a fault of the program, no report) the state is unknown: `Recovery` checks it.
+        `changes`: the changes of the block, if known beforehand; `update_pending` replaces them.
 
         Raises:
-            AutopilotError: an earlier write is open still, or another companion writes here; do not write.
-            StorageError: the changes could not be kept, or hold a name or a value that is never written; do not write.
+            AutopilotError: an earlier write is still open, or another companion writes here; do not write.
+            StorageError: the changes cannot be saved, or have a name or value that is never written; do not write.
         """
         if self._open is not None:
             raise AutopilotError(message("restoring_old_values", reason="an earlier write is still open"))
@@ -117,27 +117,27 @@ class Ledger:
             self._leave_to_recovery()
 
     def _leave_to_recovery(self) -> None:
-        """Keep the journal open: `Recovery` restores its values once the autopilot is disarmed."""
+        """Mark a journal that is still open for `Recovery`, which restores its values once disarmed."""
         if self._open is not None:
             self._orphaned.set()
 
     async def update_pending(self, changes: ChangeSet) -> None:
-        """Replace the kept changes before any new one is made; after a StorageError the earlier ones are still kept."""
+        """Replace the saved changes, before any new change is made; a StorageError leaves the earlier ones saved."""
         if self._open is not None:
             changes = msgspec.structs.replace(changes, origin=self._open.origin)
         await self._offload(self._log.journal.write, changes)
         self._open = changes
 
     async def done(self, changes: ChangeSet) -> None:
-        """End a transaction whose write stays; from now on it can be undone. After a StorageError it stays open."""
+        """End a transaction whose write stays and can be undone from now on. After a StorageError it stays open."""
         kept = self._undoable.get(changes.system_id, Undoable(changes.system_id))
         await self._keep(kept.and_then(changes))
         await self.unchanged()
 
     async def undone(self) -> None:
-        """End a transaction, an interrupted write or an undo with old values in force; StorageError: it stays open."""
+        """End a write or an undo after which the old values are active. After a StorageError it stays open."""
         if self._open is not None and (kept := self._undoable.get(self._open.system_id)) is not None:
-            # It was an undo, or a write that ended before the journal was cleared.
+            # The open entry is an undo, or a finished write whose journal was not cleared: drop its undo step.
             left = kept.without(self._open)
             if left is not kept:
                 await self._keep(left)
@@ -149,7 +149,7 @@ class Ledger:
         self._undoable[undoable.system_id] = undoable
 
     async def unchanged(self) -> None:
-        """End a transaction that left the autopilot as it was; all undo steps stay. StorageError: it stays open."""
+        """End a transaction without effect on the undo steps. After a StorageError it stays open."""
         await self._offload(self._log.journal.clear)
         self._open = None
         self._orphaned.clear()
@@ -170,7 +170,7 @@ class Recovery:
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self._offload, self._interruptions = core.offload, interruptions_in(core.config.storage.path)
         self.on_recovered: Callable[..., Awaitable[object]] | None = None
-        """Called with a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
+        """Called with a restored write, a text about it, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
         """List interrupted writes, the latest first; blocking."""
@@ -211,7 +211,7 @@ class Recovery:
             await asyncio.sleep(POLL_S)
         unknown = {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}
         if unknown:
-            # The firmware stores its result at its end, over whatever was restored before.
+            # Wait for the end of the firmware's calibration, which would overwrite values restored before it.
             await wait_until_over(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
@@ -235,11 +235,11 @@ class Recovery:
             logger.warning("%s", message("history_not_kept", what="interrupted write", reason=error))
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
-        """Restore the values from before the last step, all or none; returns the step and the restored parameters.
+        """Restore the values from before the last step, all or none; return the step and the restored parameters.
 
-        `force`: leave values that somebody else has changed since, and restore the rest; otherwise AutopilotError names
-        each, with the present value, ours and the old one. After another AutopilotError or a StorageError the step
-        stays in force, or, where some values could not be written again, the recovery ends the undo once disarmed.
+        `force`: leave values that somebody else has changed since, and restore the rest. Without it such values raise
+        an AutopilotError that lists each with the present value, ours and the old one. After another AutopilotError or
+        a StorageError the new values stay; if some could not be rewritten, `Recovery` ends the undo once disarmed.
         """
         if (why := self.why_no_undo()) is not None:
             raise AutopilotError(why)
@@ -259,7 +259,7 @@ class Recovery:
                 await self._owed.after(ours)
                 await self.ledger.undone()
         except (WriteFailedError, NothingWrittenError) as error:
-            # Not the error's own words: the writer's "old values" are those from before the undo.
+            # The error's own text would mislead: the writer's "old values" are those from before the undo.
             cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)
             if left := ", ".join(error.left_changed):
                 raise AutopilotError(message("undone_in_part", reason=cause, parameters=left)) from error
@@ -268,7 +268,7 @@ class Recovery:
         return step, written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:
-        """Sort into changes that are still ours, and words on values that others have replaced."""
+        """Split into changes that are still ours, and texts about values that others have replaced."""
         ours: list[Change] = []
         foreign: list[str] = []
         found = await self._read(changes.names)
@@ -289,7 +289,7 @@ class Recovery:
         return ours, foreign
 
     async def _read(self, names: Sequence[str]) -> dict[str, float]:
-        """Read parameters, without those that the autopilot refuses; silence is no refusal."""
+        """Read parameters, leaving out those that the autopilot refuses; raises if it does not answer."""
         with contextlib.suppress(ParameterRefusedError):
             return await self._parameters.read_many(names)
         found: dict[str, float] = {}

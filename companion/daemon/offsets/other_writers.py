@@ -1,10 +1,11 @@
 """Other writers of our parameters: companions on the same link, and the autopilot's own calibrations (rivals).
 
-Two companions write the same parameters and keep each other's values as "old" ones, so that no order of undos brings
-back the values from before both. So each announces itself, and all but one refuse to write. They usually share system
-and component id, and routers do not pass on a heartbeat to where its ids have been heard: each announces an instance
-number of its own in NAMED_VALUE_INT, which ArduPilot and PX4 do pass on. Rank by announced constants alone: a companion
-that has found itself alone goes before a new one, then the lower number. No clocks are compared, so both agree.
+Two companions would write the same parameters and save each other's values as "old" ones, so that no order of undos
+restores the values from before both. Therefore each announces itself, and all but one refuse to write. Companions
+usually share system and component id, and routers do not forward a heartbeat to links where its ids were heard. So each
+announces a random instance number in NAMED_VALUE_INT, which ArduPilot and PX4 forward. The rank uses announced
+constants only, no clocks, so that both agree: a companion that has found itself alone precedes a new one, then the
+lower number precedes the higher.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ logger = logging.getLogger(__name__)
 NAME: Final = "CMP_INST"
 BEAT_S: Final = 1.0
 SETTLE_S: Final = 6.0
-"""Time after the start in which a running companion makes itself heard."""
+"""Time after the start within which an already running companion is heard."""
 CONFIRM_S: Final = 0.5
-"""Least time between two announcements that make a companion count: leftovers of one that has ended come at once."""
+"""Least time between a companion's first and latest announcement: queued messages of an ended one arrive together."""
 EXPIRE_S: Final = 12.0
-"""Silence after which a companion is gone: its announcements come every second, and some are lost."""
+"""Silence after which a companion is gone: it announces itself every second, and some messages are lost."""
 MOST: Final = 8
-"""Companions remembered; instance numbers can be made up."""
+"""Most companions remembered, as instance numbers can be forged."""
 INSTANCE_BITS: Final = 30
 
 
@@ -63,7 +64,7 @@ class _Other(msgspec.Struct):
 
 
 class OtherCompanions:
-    """Announces this companion and listens for others; `run` until cancelled."""
+    """Announces this companion and listens for others; `run` is its task."""
 
     def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
         self._link, self._say, self._writes = link, say, writes
@@ -85,7 +86,7 @@ class OtherCompanions:
         loop = asyncio.get_running_loop()
         started_s = loop.time()
         while True:
-            await asyncio.sleep(BEAT_S)  # nothing may leave before the component's first heartbeat
+            await asyncio.sleep(BEAT_S)  # nothing may be sent before the component's first heartbeat
             now_s = loop.time()
             if self._is_new and now_s - started_s >= SETTLE_S and self.why_not() is None:
                 self._is_new = False
@@ -100,7 +101,7 @@ class OtherCompanions:
             self._told = words
 
     def _other(self) -> _Other | None:
-        """Return the first by rank of those that count; None: nobody does, or this companion writes nothing."""
+        """Return the highest-ranking other companion; None: there is none, or this companion writes nothing."""
         if not self._writes():
             return None
         now_s = asyncio.get_running_loop().time()
@@ -119,18 +120,18 @@ class OtherCompanions:
             if len(self._others) < MOST:
                 ids = message.get_srcSystem(), message.get_srcComponent()
                 self._others[instance] = _Other(*ids, is_new, instance, boot_ms, t_s, t_s)
-        elif boot_ms != known.boot_ms:  # a copy proves nothing: routers in a loop repeat one for ever
+        elif boot_ms != known.boot_ms:  # a copy is no sign of life: routers in a loop repeat messages for ever
             known.is_new, known.boot_ms, known.latest_s = is_new, boot_ms, t_s
 
 
 class Rivalry:
-    """Warns of rivals that will overwrite our offsets or did, and switches them off where that is configured."""
+    """Warns of rivals that will overwrite or have overwritten our offsets; switches them off if so configured."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._imus, self._say = imus, core.say
-        self.stop_rivals = core.config.push.stop_rivals  # The next write switches rivals off
+        self.stop_rivals = core.config.push.stop_rivals  # True: the next write switches rivals off
         self._told: set[str] = set()
-        """Rivals that the ground stations were told of since they were switched on; status shows them always."""
+        """Rivals reported to the ground stations since they were switched on; the status always lists all."""
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 

@@ -1,4 +1,4 @@
-"""Planned parameter changes of one write, and the log of what became of them."""
+"""Planned parameter changes of one write, and the log of their outcomes."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from companion.physics.units import MG
 from companion.samples import TRIADS, Triad, rows_of
 
 COARSE_ACCEL_MG: Final = 5.0
-"""Error of the autopilots' own calibrations on a level table; offsets with a larger sigma get a warning."""
+"""Error of the autopilots' own calibrations on a level table; offsets with a larger sigma cause a warning."""
 
 AS_GOOD: Final = 1.5
-"""Ratio of expected errors up to which old offsets are as good as new ones: a write would only wear the flash."""
+"""Ratio of expected errors, old to new, up to which old offsets stay: a write would only wear the flash."""
 
 
 @dataclasses.dataclass(slots=True)
 class WriteLog:
-    """Parameters written (by IMU and name) and warnings of one run; after a failure, what was known until then."""
+    """Parameters written (by IMU and name) and warnings of one run; after a failure, those up to then."""
 
     started_at: datetime.datetime = dataclasses.field(default_factory=lambda: datetime.datetime.now(tz=datetime.UTC))
     written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
     warnings: list[str] = dataclasses.field(default_factory=list)
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
-    notes: list[str] = dataclasses.field(default_factory=list)  # Additions to the result in words
+    notes: list[str] = dataclasses.field(default_factory=list)  # Texts added to the result
 
     @property
     def started(self) -> str:
@@ -56,7 +56,7 @@ class WriteLog:
 
 
 Residual = tuple[Array | None, Array | None]
-"""Output less truth, which a write takes out: gyro and accelerometer, rad/s and m/s^2, vehicle FRD; None: it stays."""
+"""Output minus truth, which a write removes: gyro (rad/s) and accelerometer (m/s^2), vehicle FRD; None: not written."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -68,9 +68,9 @@ class ImuPlan:
     changes: tuple[Change, ...]
     residual: Residual
     watched: bool
-    """The collector receives this IMU's output in the telemetry."""
+    """True: telemetry shows this IMU's output, so the effect can be checked."""
     unseen: tuple[Change, ...] = ()
-    """Changes that together leave the output as it is."""
+    """Changes that together do not change the output."""
 
     @property
     def all(self) -> tuple[Change, ...]:
@@ -85,8 +85,8 @@ class Plan:
     boots: int
     """Restarts of the autopilot seen when the plan was made."""
     collateral: tuple[Change, ...] = ()
-    """Other changes by the firmware's own gyro calibration: offsets, temperatures and ids of other gyros."""
-    firmware: GyroOutcome | None = None  # Outcome of the firmware's gyro calibration; None where it was not used
+    """Further changes by the firmware's own gyro calibration: offsets, temperatures and ids of other gyros."""
+    firmware: GyroOutcome | None = None  # Outcome of the firmware's gyro calibration; None: not used
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -122,7 +122,7 @@ def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
 
 
 def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
-    """Raise AutopilotError, and forget what was learned, where two IMUs seem to share one of PX4's parameter slots."""
+    """Raise AutopilotError, and forget the learned slots, if two IMUs seem to share one of PX4's parameter slots."""
     owners: dict[str, str] = {}
     for target in targets:
         for name in (*target.calibration.parameters.gyro_offset, *target.calibration.parameters.accel_offset):
@@ -138,8 +138,8 @@ def as_good(
 ) -> frozenset[Triad]:
     """Find the triads whose offsets are as good as new ones, so that a write would only add noise.
 
-    Two conditions hold for them: the last calibration wrote them, and the residual is small. Small means within the
-    errors of both estimates, or little beside what the next minutes do to old and new offsets alike.
+    Such offsets were written by the last calibration and leave a small residual: within the errors of both estimates,
+    or small compared with the drift of the next minutes, which affects old and new offsets alike.
     """
     if before is None:
         return frozenset()
@@ -148,12 +148,12 @@ def as_good(
     estimated = np.minimum(np.square(found.sigma_stat) + np.diag(shared.covariance), variance)
     for triad, residual, offsets in zip(TRIADS, found.biases, (names.gyro_offset, names.accel_offset), strict=True):
         then, averaged = before.sigma_in_force(triad), before.of(triad).sigma_stat
-        # An IMU without offsets counts as uncalibrated to the autopilot itself.
+        # The autopilot itself regards an IMU without offsets as uncalibrated, so write them.
         if residual is None or then is None or not any(calibration.offsets[name] for name in offsets):
             continue
         if triad == "accel" and calibration.accel_offset_may_be_unused:
             continue
-        # Replaced, for instance by the autopilot's own calibration at its start.
+        # The offsets were replaced, for instance by the autopilot's own calibration at its start.
         if calibration.contradicts({name: written[name] for name in offsets if name in written}):
             continue
         rows = rows_of(triad)
@@ -173,7 +173,7 @@ def without(found: ImuSolution, triads: Collection[Triad]) -> ImuSolution:
 
 
 def residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> Residual:
-    """Compute the residual of an autopilot that consumes our own IMU, from the IMU's whole bias."""
+    """Compute the residual in an autopilot that uses our own IMU, from the IMU's whole bias."""
     rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
     gyro = accel = None
     if found.gyro_rad_s is not None:

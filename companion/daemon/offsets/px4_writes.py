@@ -1,8 +1,8 @@
-"""Far steps of a write to PX4: whose output each moves, and which offsets are in use at all.
+"""Far steps of a write to PX4: they show which IMU's output each offset moves, and which offsets are in use.
 
-Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in use and seen in
-the telemetry of all IMUs. The far step is large beside noise and truncation, and only one sensor makes one at a time;
-the small change itself often could not be seen at all.
+The slot of each SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in use and its step shows in the
+telemetry of all IMUs. A far step is large compared with noise and truncation, and only one sensor makes one at a time.
+The small change itself would often be invisible.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 RATE_HZ: Final = 50.0
-"""Rate asked of IMUs that nobody listens to otherwise."""
+"""Rate requested for IMUs whose messages are not sent otherwise."""
 HEAR_S: Final = 0.4
 BEFORE_S: Final = 1.0
-"""Telemetry before a far value with which the telemetry after it is compared."""
+"""Time span of telemetry before a far value, for comparison with the telemetry after it."""
 MEAN_S: Final = 0.4
-"""Telemetry that shows the far value in use, without a reading from before."""
+"""Time span of telemetry that shows the far value in use, without samples from before it."""
 PATIENCE_S: Final = 2.5
-"""Longest wait for an effect: where somebody else writes too, PX4 reads ours up to 1 s later."""
+"""Longest wait for an effect: if somebody else writes too, PX4 applies our value up to 1 s later."""
 KEPT_S: Final = 4.0
 LEAST_SAMPLES: Final = 5
 MATCH: Final = 0.2
-"""Share of the expected step by which the output may miss it, besides what PX4 ignores."""
+"""Tolerance of the output's step, as a fraction of the expected one, in addition to steps that PX4 ignores."""
 CHECK_S: Final = 0.1
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ExpectedStep:
-    """Step of one IMU's output when a far value comes into force in the slot of one of its sensors."""
+    """Expected step of one IMU's output when PX4 applies a far value in the slot of one of its sensors."""
 
     instance: int
     sensor: Triad
@@ -67,9 +67,9 @@ class ExpectedStep:
     step: Array
     """(3,), rad/s or m/s^2, vehicle FRD."""
     rest: Array
-    """Step from there to all new values, likewise."""
+    """Further step from the far value to all new values, in the same units and frame."""
     unknown: float
-    """Share of the step by which the offsets in use may have differed from the parameters."""
+    """Fraction of the step by which the offsets in use may have differed from the parameters."""
 
     def moved(self, made: Array) -> bool:
         return bool(np.linalg.norm(made - self.step) < (self.unknown + MATCH) * np.linalg.norm(self.step))
@@ -81,11 +81,11 @@ class ExpectedStep:
 Mean = tuple[Array, Array]
 """Mean of an output and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
 OnTheWay = Mapping[Triad, tuple[Mean, Array]]
-"""Output under far values, as integer messages showed it, and the step from there to the new values."""
+"""Mean output under far values, from integer messages, and the step from there to the new values."""
 
 
 class Px4Writes:
-    """Watches the telemetry over a write by far values, and learns the slots; other firmwares need none."""
+    """Observes the telemetry during a write with far values, and learns the slots; only PX4 needs far values."""
 
     def __init__(
         self, link: MavlinkLink, vehicle: Vehicle, writer: ParameterWriter, ledger: Ledger, memory: SlotMemory, say: Say
@@ -94,8 +94,8 @@ class Px4Writes:
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
         self.on_the_way: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
-        """`OnTheWay` of the latest write by instance; only of outputs that moved as expected."""
-        self._learned = False  # The last verification learned something new of the slots
+        """`OnTheWay` of the latest write, by instance, for outputs that moved as expected."""
+        self._learned = False  # True: this write has corrected the slot of a sensor
         self._boots = 0
         self._samples: defaultdict[int, deque[ImuSample]] = defaultdict(deque)
         self._before: dict[int, Mean | None] = {}
@@ -105,7 +105,7 @@ class Px4Writes:
     async def standing_by(
         self, targets: Sequence[ImuPlan], before: Mapping[str, Vector]
     ) -> AsyncIterator[FarProbe | None]:
-        """Watch over a write; gives the probe of far values, None without; `before`: output of the accelerometers."""
+        """Observe a write; yield the probe of far values, or None without any. `before`: accelerometer outputs."""
         self._learned, self._steps = False, {}
         self.on_the_way.clear()
         for target in targets:
@@ -115,14 +115,14 @@ class Px4Writes:
                 yield self.watch if self._steps else None
         except WriteFailedError as error:
             if self._vehicle.arm_state is ArmState.ARMED:
-                # One offset may be wrong on purpose, and while it is armed nobody may mend that.
+                # A far value may be left in place, and while the aircraft is armed nothing may be written.
                 for name in self._writer.left_far:
                     self._say(Severity.CRITICAL, _danger(self._steps[name]), Weight.RESULT)
             if error.kind == "wrong slot, orientation or scale" and not self._learned:
-                # Nothing was learned: the same slot again, and not for ever.
+                # The slot was not corrected, so another attempt would use the same one: report it differently.
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
             raise
-        # Only a write that succeeded comes here.
+        # Reached only after a successful write.
         for target in targets:
             calibration, written = target.calibration, {change.parameter for change in target.all}
             names = calibration.parameters.accel_offset
@@ -130,9 +130,9 @@ class Px4Writes:
                 self._memory.brought_into_use(names, accel_offset_with(calibration, target.all), self._vehicle.boots)
 
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
-        """Bring offsets that may not be in use into use, unchanged; True when there were any.
+        """Make PX4 apply stored offsets that it may not use, without changing them; return whether there were any.
 
-        After an AutopilotError the recovery restores what may be left; after a StorageError nothing was written.
+        After an AutopilotError `Recovery` restores values left changed; after a StorageError nothing was written.
         """
         unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
         targets = [
@@ -151,13 +151,13 @@ class Px4Writes:
         except WriteFailedError as error:
             if error.kind != "wrong slot, orientation or scale" or error.left_changed:
                 raise
-            # Something was learned: the offsets are read again, from another slot.
+            # The slot was corrected: the caller reads the offsets again, from another slot.
         return True
 
     # --- the probe
 
     def watch(self, parameter: str) -> Callable[[], Awaitable[str | None]]:
-        """Keep the means until now, as a `FarProbe`."""
+        """Store the means before a far value; return the check of its effect (this method is a `FarProbe`)."""
         step = self._steps.get(parameter)
         if step is not None:
             now_s = asyncio.get_running_loop().time()
@@ -166,7 +166,7 @@ class Px4Writes:
         return functools.partial(self._verify, step)
 
     async def _verify(self, step: ExpectedStep | None) -> str | None:
-        """Learn whose output moved; returns why this is not as it was believed, or None."""
+        """Find the IMU whose output moved, and learn its slot; return the fault if it is not the expected one."""
         if step is None:
             return None
         since, loop = VehicleTimer(self._vehicle), asyncio.get_running_loop()
@@ -181,7 +181,7 @@ class Px4Writes:
         else:
             from_s = loop.time() - BEFORE_S
         if self._vehicle.boots != self._boots:
-            # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
+            # A restart applies other offsets too, so a moved output proves nothing.
             return None
         moved, still = self._moves(step, from_s, loop.time())
         if step.instance in moved and (now := self._mean(step.instance, step.sensor, from_s, loop.time())):
@@ -201,7 +201,7 @@ class Px4Writes:
             if self._memory.holds_strangers(step.sensor, len(self._samples.keys() | self._unheard)):
                 self._correct(step, NO_IMU)
             else:
-                # Each slot belongs to a known IMU: another slot would be wrong, so the reason is another one.
+                # Each slot belongs to a known IMU, so the slot is right and the cause is another one.
                 effect += ": PX4 does not use the stored values, or the aircraft moved"
         elif len(moved) > 1:
             effect = f"act on {len(moved)} IMUs at once: {', '.join(map(str, moved))}"
@@ -285,13 +285,13 @@ class Px4Writes:
 
 
 def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> dict[str, ExpectedStep]:
-    """Return the step of the output when each far value comes into use, by parameter; `accel_m_s2` is read before."""
+    """Return the expected step for each far value, by parameter; `accel_m_s2`: accelerometer output before."""
     names, found = calibration.parameters, dict[str, ExpectedStep]()
     new = {change.parameter: change.after for change in changes}
     in_use = {change.parameter: change.before for change in changes}
 
     def output(values: Mapping[str, float], triad: Triad) -> Array:
-        """Return the output less that before all changes, (3,)."""
+        """Return the output minus that before all changes, (3,)."""
         there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
         return np.array(output_step(calibration, there, accel_m_s2)[0 if triad == "gyro" else 1])
 
@@ -309,7 +309,7 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
             found[change.parameter] = ExpectedStep(
                 calibration.instance, triad, device_id, slot, step, output(new, triad) - far, unknown
             )
-        # The whole vector is in use before the next far value is written.
+        # PX4 uses the whole new vector before the next far value is written.
         for vector in (names.gyro_offset, names.accel_offset, names.accel_scale):
             if change.parameter in vector:
                 in_use |= {one: new[one] for one in vector if one in new}

@@ -1,8 +1,8 @@
-"""Restarts of the autopilot after a write: done on request, and owed to PX4 while its EKF2 keeps an old tilt.
+"""Restarts of the autopilot after a write: on request, and required ("owed") for PX4 while its EKF2 keeps an old tilt.
 
-The tilt is remembered over the companion's own restarts. A restart of PX4 while the companion was off shows in its time
-since boot: it is less than at the write, or began after the write, where the board has run on. A restart that shows in
-neither counts as none: one restart too many costs a minute.
+The tilt is saved across the companion's own restarts. A restart of PX4 while the companion was off shows in PX4's time
+since boot: it is less than at the write, or, if the board has kept running, PX4's boot is later than the write. Without
+either sign, a restart still counts as required: one too many costs a minute.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from companion.storage.state import StateFile
 logger = logging.getLogger(__name__)
 
 CLOCK_STEP_S: Final = 0.5
-"""Apparent step back of the autopilot's clock by late packets."""
+"""Largest apparent step back of the autopilot's clock that late packets cause."""
 OWED_POLL_S: Final = 1.0
 POLL_S: Final = 0.2
 STORED_AFTER_S: Final = 3.0
-"""PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots 8)."""
+"""Time for saving: PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots 8)."""
 ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
 
 
 class NotRebootedError(AutopilotError):
-    """The autopilot was not restarted; the written values are in force all the same."""
+    """The autopilot was not restarted; the written values are active nevertheless."""
 
 
 def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -> str | None:
-    """Say why a restart would replace the new offsets; None: it would not."""
+    """Return the reason why a restart would replace the new offsets; None: it would not."""
     after = {change.parameter: change.after for change in changes}
     gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
     for rival in (rival for calibration in calibrations for rival in calibration.rivals):
@@ -57,9 +57,9 @@ def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Cha
 
 
 async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
-    """Restart the autopilot, disarmed, once all is stored, and wait until it is back.
+    """Restart the disarmed autopilot once its parameters are stored, and wait until it is back.
 
-    Raises NotRebootedError where it was not restarted, another AutopilotError where it was and is not back.
+    Raises NotRebootedError if it was not restarted, another AutopilotError if it did not come back.
     """
     loop = asyncio.get_running_loop()
     stored_s = loop.time() + STORED_AFTER_S
@@ -77,7 +77,7 @@ async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
     if result not in (mavlink.MAV_RESULT_ACCEPTED, None):
         reason = f"{vehicle.name} refused ({result_name(result or 0)})"
         raise NotRebootedError(message("reboot_not_completed", reason=reason))
-    # No answer proves nothing: it may have gone down with it.
+    # A missing answer proves nothing: the autopilot may have restarted before it answered.
     back_s = loop.time() + BACK_WITHIN_S
     while vehicle.boots == boots or vehicle.arm_state is not ArmState.DISARMED:
         if loop.time() > back_s:
@@ -89,13 +89,13 @@ async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
 
 
 class _Owed(msgspec.Struct, frozen=True):
-    """Tilt kept by PX4: since when in the life of the autopilot and of the board (`host`, its boot; empty: unknown)."""
+    """Tilt kept by PX4's EKF2, with the time of the write; `host`: id of our board's boot (empty: unknown)."""
 
     system_id: int
     tilt_deg: float
-    boot_s: float  # Time since the boot of the autopilot
+    boot_s: float  # Time of the write since the autopilot's boot
     host: str
-    host_s: float  # Time on the clock of that boot
+    host_s: float  # Time of the write on our board's clock since its boot
 
 
 def owed_in(directory: Path) -> StateFile[_Owed]:
@@ -103,14 +103,14 @@ def owed_in(directory: Path) -> StateFile[_Owed]:
 
 
 class RebootOwed:
-    """Remembers that PX4 must be restarted; `run` forgets it when the restart was seen."""
+    """Remembers that PX4 must be restarted; `run` forgets it after the restart."""
 
     def __init__(self, core: Core) -> None:
         self._vehicle, self._offload, self._core = core.vehicle, core.offload, core
         self._file, self._host = owed_in(core.config.storage.path), this_boot()
         self._owed: _Owed | None = None
         self._boots = 0
-        """Restarts seen when the restart became owed, or was loaded."""
+        """Number of restarts seen when the restart became required, or was loaded from the file."""
         self._from_earlier_run = False
 
     def load(self) -> None:
@@ -130,11 +130,11 @@ class RebootOwed:
             self._core.say(Severity.WARNING, f"Before flight: {words}", Weight.RESULT)
 
     async def after(self, changes: Sequence[Change]) -> None:
-        """Judge changes that come into force; raises StorageError where an owed restart cannot be kept."""
+        """Decide whether written changes require a restart; raise StorageError if that cannot be saved."""
         stale_deg = self._vehicle.kind.stale_tilt_deg(changes)
         if stale_deg == 0.0:
             return
-        # A small step after a large one leaves what the large one has left.
+        # After a large step, a small one does not reduce the tilt that the EKF keeps.
         left_deg = self._owed.tilt_deg if self._owed is not None and self.words is not None else 0.0
         tilt_deg = max(left_deg, stale_deg)
         now_s, (boot_s, _) = asyncio.get_running_loop().time(), self._vehicle.boot.latest or (0.0, 0.0)

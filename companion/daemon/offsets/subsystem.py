@@ -1,7 +1,7 @@
-"""Writing to the autopilot: journal, write with read-back, effect in the telemetry; after any failure the old values.
+"""Writing to the autopilot: journal, write with read-back, check of the effect; a failure restores the old values.
 
-Calibrations, alignments and temperature curves write through `Offsets`. An undo and PX4's far values restore what they
-found, and use the journal's transaction alone.
+Calibrations, alignments and temperature curves write through `Offsets`. An undo, and `Px4Writes.make_sure`, use only
+the journal's transaction.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ from companion.storage.changes import ChangeLog, ChangeSet, Origin
 logger = logging.getLogger(__name__)
 
 DISARMED_WITHIN_S: Final = 10.0
-"""Longest wait for a heartbeat lost just before the write."""
+"""Longest wait for a heartbeat if none was heard just before the write."""
 WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 CONCLUDING_PERCENT: Final = 95.0
 READ_ATTEMPTS: Final = 3
 
 Note = Callable[[Mapping[str, WrittenParameter], Collection[str]], None]
-"""Takes parameters by their outcome, and the names of those that could not be restored."""
+"""Callback that gets restored parameters with their outcomes, and the names of those not restored."""
 
 
 class Offsets(Subsystem):
-    """Writes plans, each as a whole or not at all; wires what restores them and what else changes offsets."""
+    """Writes plans, each as a whole or not at all; wires journal, recovery, restarts and checks for other writers."""
 
     def __init__(self, core: Core, devices: Devices) -> None:
         vehicle, imus = core.vehicle, devices.imus
@@ -75,7 +75,7 @@ class Offsets(Subsystem):
         self.owed.load()
         self.ledger.load()
         if self.ledger.fault is not None:
-            # Stay and say so: a daemon that is gone is harder to understand from the field.
+            # Keep running and report the fault: a daemon that has ended is harder to diagnose in the field.
             logger.error("%s", self.ledger.fault)
 
     def status(self) -> Object:
@@ -99,7 +99,7 @@ class Offsets(Subsystem):
         ]
 
     async def offsets_still_hold(self) -> bool:
-        """Read the offsets again; False when they may differ from those under which was measured; see `make_sure`."""
+        """Read the offsets again; return False if they may differ from those during the measurement (`make_sure`)."""
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()
@@ -108,7 +108,7 @@ class Offsets(Subsystem):
     # --- any write
 
     async def begin(self, job: Job, parameters: int) -> None:
-        """Announce a write of so many parameters; raises NotDisarmedError unless it is surely disarmed in time."""
+        """Announce a write of `parameters` values; raise NotDisarmedError unless the autopilot is surely disarmed."""
         job.check_cancelled()
         self._machine.on(Event.WRITE)
         job.progress(MEASURED_PERCENT, message("write_in_progress", count=parameters, what="parameters"))
@@ -123,12 +123,12 @@ class Offsets(Subsystem):
         verify: Callable[[], Awaitable[None]],
         note: Note = lambda _written, _failed: None,
     ) -> None:
-        """Write in a journal transaction; keep the values only when `verify` passes and they can be undone later.
+        """Write in a journal transaction; keep the values only if `verify` passes and the undo step is saved.
 
-        The old values are on disk before `apply` starts, which returns all changes made in their order, the firmware's
-        own included. `verify` raises where the new values must not stay; `imus` are those whose output changes; `note`
-        is told of restored parameters. Raises CompanionError, or the JobCancelledError of `verify`: the cause, and what
-        became of the old values.
+        The old values are on disk before `apply` starts. `apply` returns all changes in order, including the firmware's
+        own. `verify` raises if the new values must not stay. `imus`: those whose output changes. `note` gets restored
+        parameters. Raises CompanionError, or the JobCancelledError of `verify`; the text has the cause and the outcome
+        of the roll-back.
         """
         system_id = self._vehicle.system_id
         async with self.ledger.transaction(ChangeSet.of(system_id, changes, origin=origin)):
@@ -144,11 +144,11 @@ class Offsets(Subsystem):
                 raise AutopilotError(await self._roll_back(made, imus, str(error), note)) from error
 
     async def _roll_back(self, made: Sequence[Change], imus: Collection[AutopilotImu], reason: str, note: Note) -> str:
-        """Restore the old values; return the reason and the outcome."""
+        """Restore the old values; return a text with the reason and the outcome."""
         left: Sequence[str] = ()
         outlook = "restored once disarmed"
         with contextlib.suppress(NotDisarmedError):
-            await self._wait_disarmed()  # after a restart the first heartbeat is still to come
+            await self._wait_disarmed()  # after a restart the first heartbeat may not have arrived yet
         with changing(imus):
             try:
                 note(await self.writer.restore(made), ())
@@ -182,10 +182,10 @@ class Offsets(Subsystem):
     # --- a write of offsets
 
     async def write(self, job: Job, plan: Plan, before: Window, log: WriteLog, go_on: GoOn | None = None) -> Plan:
-        """Write offsets, read them back, and watch the telemetry make the step that it must; errors as `commit`.
+        """Write offsets, read them back, and check that the telemetry makes the expected step.
 
-        `before` is the window measured under the old offsets. `log` is filled; `go_on` replaces the job's progress
-        while the telemetry is watched. Returns the plan with the firmware's own changes.
+        `before`: the window measured under the old offsets. `log` receives the outcomes. `go_on` replaces the job's
+        progress during the check. Returns the plan with the firmware's own changes; raises the errors of `commit`.
         """
         await self.begin(job, len(plan.changes))
         gyros = await self._firmware.prepare(plan.gyros, log.warnings.append)
@@ -224,7 +224,7 @@ class Offsets(Subsystem):
 
     async def _problems(self, plan: Plan, before: Window, log: WriteLog, go_on: GoOn) -> list[str]:
         verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, plan.boots)
-        # Somebody else's change explains what the telemetry shows, so it comes first.
+        # Check for another writer first: its changes would explain a wrong effect.
         problems: list[str] = []
         try:
             async for name, now in self._not_as_written(plan, attempts=1):
@@ -256,9 +256,9 @@ class Offsets(Subsystem):
     # --- after a write that stays
 
     async def settle(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> None:
-        """Restart the autopilot where that was asked for, else wait until its EKF agrees with the new offsets.
+        """Restart the autopilot if requested; otherwise wait until its EKF agrees with the new offsets.
 
-        Raises AutopilotError where the autopilot has not come back, or not with what was written.
+        Raises AutopilotError if the autopilot does not come back, or comes back with other values.
         """
         boots = self._vehicle.boots
         if not_rebooted := await self._restart(job, plan, before, log) if job.reboot else "":
@@ -291,7 +291,7 @@ class Offsets(Subsystem):
             raise AutopilotError(message("wrong_after_restart", problems=f"{', '.join(changed)} replaced"))
 
     async def _restart(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> str:
-        """Restart the autopilot and check that the new offsets are in force; returns why that was not seen, or ""."""
+        """Restart the autopilot and check that the new offsets are active; return why it was not restarted, or ""."""
         go_on = job.going_on(CONCLUDING_PERCENT, "watching the telemetry after the reboot")
         self._machine.on(Event.REBOOT)
         try:
@@ -321,13 +321,13 @@ class Offsets(Subsystem):
 
 
 def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict], log: WriteLog) -> list[str]:
-    """Enter the outcomes of one IMU's parameters; returns what is wrong, in words."""
+    """Log the outcomes of one IMU's parameters; return the faults as texts."""
     hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
     if hidden:
         log.warn(target.name, message("change_too_small_to_see", parameters=", ".join(hidden)))
     for verdict in verdicts:
         log.warn(target.name, *verdict.problems)
-        # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
+        # A vector is in use if its step as a whole was seen: an axis that hardly changed cannot show more.
         seen = verdict.ok and not verdict.hidden
         for name in verdict.axes:
             plan.mark(log, [name], "verified" if seen else verdict.outcome(name))

@@ -1,1 +1,1 @@
-"""The process: what runs, who watches it, and the check without running."""
+"""The daemon as a process: its tasks, the watchdog over them, and `companion check`."""

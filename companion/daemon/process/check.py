@@ -1,6 +1,6 @@
-"""`companion check`: whether everything in the configuration answers, faults of sensors, and what to type.
+"""`companion check`: checks that everything configured answers, and lists faults with the remedy to type.
 
-A running daemon, which holds the ports, is asked; otherwise every port is opened and read for a while.
+The check asks a running daemon, which holds the ports; without one it opens every port and reads for a while.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ ONLY_CHECKING: Final = "only a check is running: start companion run"
 LOST_S: Final = 5.0
 HEARTBEAT_WITHIN_S: Final = 4.0
 IMUS_MOST_S: Final = 30.0
-"""Longest wait for an autopilot to show which IMUs it has: a slow line and lost packets, with all retries."""
+"""Longest wait until it is known which IMUs an autopilot has: a slow line with lost packets, and all retries."""
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
 @dataclass(frozen=True, slots=True)
 class CheckLine:
-    """One line of the check; `remedy`: what to type, if anything."""
+    """One line of the check; `remedy`: the action to take, if any."""
 
     name: str
     good: bool
@@ -79,7 +79,7 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
 
 
 async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[CheckLine]:
-    """Explain from its bytes why a sensor gives no good samples; `may_listen`: no daemon holds the ports."""
+    """Explain, from the bytes received, why sensors give no good samples; `may_listen`: no daemon holds the ports."""
     devices = {device["name"]: device for device in status["devices"]}
     sick = [sensor for sensor in serial_devices(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED]
     tried: dict[str, Heard | str] = {}
@@ -100,7 +100,7 @@ def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *,
         return [CheckLine(sensor.name, good=False, words=said, remedy=remedy)]
 
     if isinstance(heard, str):
-        return []  # its device's own line has said so
+        return []  # the status line of the device reports it
     if heard is None:
         speaks = device.get("speaks")
         if isinstance(speaks, str):
@@ -151,7 +151,7 @@ async def run_check(
         async for reply in ask(config.control.path, {"command": "status"}):
             status = reply.get("status")
     except DaemonDeniedError:
-        raise  # the ports are in use by the daemon
+        raise  # a daemon runs and holds the ports
     except DaemonUnreachableError:
         pass
     is_running = status is not None
@@ -163,7 +163,7 @@ async def run_check(
         findings.append(CheckLine("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
-        # The status of a daemon after some seconds; nothing is written.
+        # Start a daemon that writes nothing, and take its status after some seconds.
         service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(lambda listened_s: listened_s < seconds)
     findings += [CheckLine("configuration", good=False, words=words) for words in cannot_work(config)]
@@ -194,7 +194,7 @@ async def run_check(
 
 
 async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str | None]:
-    """Return the parts of those autopilot IMUs that exist, by offsets and samples (None: part not known)."""
+    """Return the autopilot IMUs that exist (offsets and samples arrive), each with its part (None: unknown)."""
     alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
     service = Service(alone, only_listening=ONLY_CHECKING)
 

@@ -1,8 +1,8 @@
 """The daemon as a process: its subsystems on one event loop, its signals, and the watchdog of its long-lived tasks.
 
 SIGTERM and SIGINT end it in order, with old values restored and exit code 0. SIGHUP is ignored: a companion run by hand
-goes on when its terminal closes. The service manager's watchdog is fed while all tasks go on; one that does not is
-logged with the place where it waits, before the manager ends the process.
+continues when its terminal closes. The service manager's watchdog is fed while all tasks make progress. A task that
+hangs is logged with the place where it waits, before the manager ends the process.
 """
 
 from __future__ import annotations
@@ -51,24 +51,24 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SETTLED_WITHIN_S: Final = 20.0
-"""A small board takes seconds to start the MQTT process, and a silent broker 10 s to be given up."""
+"""Longest wait for MQTT: a small board takes seconds to start its process, and giving up a silent broker 10 s."""
 LISTEN_TURN_S: Final = 0.1
 SETTLED_AFTER_S: Final = 3.0
-"""Time after which lazily imported modules (recording, the child processes) are loaded."""
+"""Time after the start by which lazily imported modules (recording, the child processes) are loaded."""
 PERIOD_S: Final = 1.0
 FEEDS_PER_LIMIT: Final = 4.0
-"""Feeds of the watchdog within its limit, where that is short: one of them may be late."""
+"""Number of feeds of the watchdog within a short limit, so that one of them may be late."""
 MARGIN_S: Final = 2.0
 COMPONENT_S: Final = 5.0
 ESTIMATOR_S: Final = 10.0
 AUTOMATIC_S: Final = 180.0
-"""Deadline of a task that may read a dozen parameters over a bad radio link, each with all its retries."""
+"""Deadline of a task that may read a dozen parameters over a bad radio link, each with all retries."""
 
 
 class Service:
-    """The daemon, subsystem by subsystem; each knows only those above it here.
+    """The daemon, made of subsystems; each uses only those created before it in `__init__`.
 
-    `only_listening`: reason to start and change nothing; `link`, `offload` and `child` are for tests.
+    `only_listening`: in check mode, the reason why no job starts. `link`, `offload` and `child` are for tests.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Service:
         )
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Run until cancelled; `on_ready`: the control socket answers. Raise CompanionError where it cannot start."""
+        """Run until cancelled; call `on_ready` when the control socket answers. Raises CompanionError at the start."""
         for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
@@ -106,7 +106,7 @@ class Service:
                 await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
-        """Work until cancelled, then leave the autopilot in order; without `mavlink` or `ports` a test feeds bytes."""
+        """Run all tasks until cancelled, then leave the autopilot in order; tests replace `mavlink` and `ports`."""
         for subsystem in (self.devices, self.offsets, self.calibrating):
             subsystem.load()
         tasks = [
@@ -125,16 +125,16 @@ class Service:
                         group.create_task(run(), name=name)
                     await asyncio.get_running_loop().create_future()
                 finally:
-                    # While the links are up: the heading needs its fallback, a write under way its end.
+                    # Do this while the links are up: the heading selects its fallback, and a write finishes.
                     self.heading.close()
                     await self.calibrating.manager.close()
         finally:
             self.core.vehicle.close()
 
     async def listen(self, goes_on: Callable[[float], bool]) -> Object:
-        """Open everything, listen while `goes_on` (seconds), and return the status; writes nothing.
+        """Open everything, listen while `goes_on(seconds)` is true, and return the status; nothing is written.
 
-        Seconds are turns of the event loop: a slow process listens longer.
+        The seconds are counted in turns of the event loop, so a slow process listens longer.
         """
         self.devices.load()
         tasks = [self._transport, *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]
@@ -158,15 +158,15 @@ class Service:
 
 @dataclasses.dataclass(slots=True)
 class WatchedTask:
-    """A task that must go on, by its counted turns: an idle event loop proves nothing of a task that waits for ever."""
+    """A task that must make progress, shown by its count of turns: the event loop idles even if the task hangs."""
 
     name: str
     task: str
     within_s: float
-    who: Any  # Object that counts its `turns`
+    who: Any  # Object with the count `turns`
     seen: int = 0
     age_s: float = 0.0
-    """Age of the latest turn in calls of `overdue`: while the whole event loop stands still, no task ages."""
+    """Time since the latest turn, summed up by `overdue`: while the whole event loop is stopped, no task ages."""
 
     def overdue(self, passed_s: float) -> bool:
         before, self.seen = self.seen, self.who.turns
@@ -192,14 +192,14 @@ def watched_tasks(service: Service) -> list[WatchedTask]:
 
 
 def main(path: str, *verbose: str) -> int:
-    # The watchdog's SIGABRT may be the only witness of a process that hangs: let it print where.
+    # At the watchdog's SIGABRT, print the place where the process hangs: there may be no other trace of it.
     faulthandler.enable()
     set_up_logs("debug" if verbose else "info")
     try:
         wanted = configuration.load(Path(path), partial(saved_profile, forgiving=True))
         if not verbose:
             logging.getLogger().setLevel(wanted.log.level.upper())
-        messages.catalogue()  # now, and not in the middle of an update of the package
+        messages.catalogue()  # load it now: later the file may be replaced by an update of the package
         asyncio.run(run(wanted))
     except ConfigError as error:
         sys.stderr.write(printable(f"{error}") + "\n")
@@ -211,7 +211,7 @@ def main(path: str, *verbose: str) -> int:
 
 
 async def run(wanted: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
+    """Run the daemon until SIGTERM or SIGINT; raise CompanionError if it cannot start."""
     manager = ServiceManager.from_environment()
     try:
         await Supervisor(Service(wanted), manager).run()
@@ -232,7 +232,7 @@ def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
 
 
 class Supervisor:
-    """Runs a service until a signal or a fault, and feeds the watchdog meanwhile."""
+    """Runs a service until a signal or a fault, and feeds the watchdog."""
 
     def __init__(self, service: Service, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager
@@ -266,7 +266,7 @@ class Supervisor:
 
     def _stop(self, why: str) -> None:
         if self._work is None or self._stopping:
-            # A second signal must not cut off what the first one is putting in order.
+            # A second signal must not interrupt the orderly stop that the first one began.
             logger.warning("%s: %s", why, message("stops_already"))
             return
         logger.info("%s: stopping", why)
@@ -280,7 +280,7 @@ class Supervisor:
         period_s = PERIOD_S if limit_s is None else min(PERIOD_S, limit_s / FEEDS_PER_LIMIT)
         before_s = loop.time()
         while True:
-            # While the loop stood still no task could go on.
+            # Time for which the whole loop was stopped does not count against a task.
             passed_s = min(loop.time() - before_s, 2.0 * period_s)
             before_s = loop.time()
             overdue = [each for each in self.watched if each.overdue(passed_s) and not self._stopping]
@@ -315,7 +315,7 @@ class Supervisor:
                 parts.append(f"{', '.join(good)} good")
             return "; ".join([*notes, *parts])
         except Exception:
-            # A fault in the description must not end the work.
+            # A fault in the status text must not end the daemon.
             if not self._status_failed:
                 logger.exception("the status cannot be worked out")
             self._status_failed = True
@@ -335,7 +335,7 @@ def _where(task_name: str) -> str:
 
 
 def settle() -> None:
-    """Keep what exists by now, once everything is imported, out of all later garbage collections."""
+    """Exclude all present objects from later garbage collections; call it once everything is imported."""
     gc.collect()
     gc.freeze()
     gc.enable()

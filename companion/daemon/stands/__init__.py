@@ -1,1 +1,1 @@
-"""One still window; and what is made of several: alignments, accelerometers from faces, turns on the spot."""
+"""Measurement of still windows, and alignments from several: gradienter, six positions, turn on the spot."""

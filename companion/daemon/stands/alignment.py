@@ -1,4 +1,4 @@
-"""Results of alignments, on disk and in memory: the gradienter's zero, known accelerometers, and the history."""
+"""Stored results of alignments: the gradienter's zero, accelerometers measured on all sides, and the history."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 
 
 class ActiveAlignment:
-    """The gradienter's measured zero, and whether it still belongs to this configuration."""
+    """The gradienter's measured zero, and the check that it still fits the configuration."""
 
     def __init__(self, config: Config, offload: Offload) -> None:
         self._gradienter, self._offload = config.gradienter, offload
@@ -60,7 +60,7 @@ class ActiveAlignment:
             logger.warning("alignment not used: %s", self.unused)
 
     async def keep(self, record: AlignmentRecord) -> None:
-        """Save a new alignment and make it the active one; a StorageError leaves the one before active."""
+        """Save a new alignment and make it the active one; a StorageError leaves the previous one active."""
         await self._offload(self._store.write, record)
         self._take(record)
         self.on_change.tell()
@@ -108,7 +108,7 @@ class ActiveAlignment:
 
 
 class ActiveSixPosition:
-    """The accelerometers' errors known from all sides, for the offsets and scales that are active now."""
+    """Accelerometer errors from a measurement on all sides, converted to the present offsets and scales."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._store, self._offload = faces_in(core.config.storage.path), core.offload
@@ -156,7 +156,7 @@ class ActiveSixPosition:
         return None if calibration is None else self.known(name, calibration, temperature_degc)
 
     def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Sides | None:
-        """Return the errors left in one IMU's output, in its own axes; None if this sensor was never measured."""
+        """Return the errors left in one IMU's output, in its own axes; None: this sensor was never measured."""
         imus = () if self.record is None else self.record.imus
         kept = next((imu for imu in imus if imu.name == name), None)
         if kept is None or kept.accel_id != calibration.accel_id:
@@ -164,7 +164,7 @@ class ActiveSixPosition:
         names = calibration.parameters
         if not {*names.accel_offset, *names.accel_scale} <= kept.corrections.keys():
             return None
-        # Output = scale (raw - offset), then and now.
+        # Output = scale (raw - offset), both at the measurement and now.
         offset = np.array([kept.corrections[one] for one in names.accel_offset])
         x, y, z = (kept.corrections[one] for one in names.accel_scale)
         scale, now = calibration.in_use((x, y, z)), calibration.in_use()
@@ -239,7 +239,7 @@ class ByHand:
         return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]
 
     def _shown(self, done: Done) -> Object:
-        """Show an alignment; `in_force`: whether the autopilot holds all written values, None where it is not known."""
+        """Return an alignment as an object; `in_force`: the autopilot holds all written values (None: unknown)."""
         in_force: bool | None = None
         if done.undone_at is not None:
             in_force = False

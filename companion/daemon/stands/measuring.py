@@ -1,4 +1,4 @@
-"""Measuring one still window, and the biases in it."""
+"""Measurement of one still window, and the estimate of biases from it."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from companion.estimation.solution.truth import Otherwise
 from companion.links.system.events import Listeners
 
 POLL_S: Final = 0.2
-"""Interval of checks; a complete second is handled at once."""
+"""Longest interval between checks; each complete second of samples causes one at once."""
 SAY_WAITING_EVERY_S: Final = 10.0
 SAY_LEFT_EVERY_S: Final = 75.0
-"""Interval of messages while it measures; the first minute of a deck has none."""
+"""Interval of messages during a measurement; long enough for none in the first minute on a deck."""
 READ_ATTEMPTS: Final = 2
 MOST_UPSETS: Final = 5
 
@@ -51,9 +51,9 @@ class Measuring:
         self._upsets_before = {name: imu.upsets for name, imu in self._imus.items()}
 
     async def read_state(self, job: Job, if_armed: str | None) -> tuple[CollectorStatus, str | None, int | None]:
-        """Return the collector's status, the reason to wait, and the seconds to hold still where that is all.
+        """Return the collector's status, the reason to wait, and the seconds to hold still if nothing else is needed.
 
-        `if_armed`: error if it was armed since the job began; None: it goes on once disarmed.
+        `if_armed`: text of the error if the aircraft was armed since the job began; None: wait until it is disarmed.
         """
         vehicle = self._core.vehicle
         armed = vehicle.arm_state is ArmState.ARMED
@@ -129,12 +129,12 @@ class Measuring:
 
 
 class Estimator:
-    """Estimates biases with the alignment and the site in force."""
+    """Estimates biases with the active alignment and the present site."""
 
     def __init__(self, core: Core, alignment: ActiveAlignment, faces: ActiveSixPosition, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
         self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
-        """Listeners to estimates of a calibration: place, fallbacks, request, earlier biases."""
+        """Listeners to the inputs of a calibration's estimate: place, fallbacks, biases requested, earlier biases."""
 
     async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, Otherwise]:
         config = self._core.config
@@ -149,7 +149,7 @@ class Estimator:
     async def _otherwise(self, window: Window) -> Otherwise:
         core, heading = self._core, self._own.heading() if self._core.config.compass is None else None
         try:
-            # The autopilot's heading, where it has one of its own.
+            # Use the autopilot's heading only if it is its own and not ours.
             if heading is not None and not await core.vehicle.kind.yaw_is_its_own(core.parameters):
                 heading = None
         except AutopilotError:

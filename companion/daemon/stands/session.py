@@ -1,8 +1,8 @@
-"""One alignment from its first pose to its record: guide an operator, measure, estimate, write, keep.
+"""One alignment from its first pose to its record: guide an operator, measure, estimate, write, save.
 
-`PoseSession.run` reads top to bottom. A `PoseTask` says what distinguishes one alignment from another: the poses
-wanted, the acceptance test, the fit and the record. Nobody presses anything between the poses: a movement is seen, and
-the next pose begins when it has ended. So one person alone can follow the ground station's voice or the page.
+`PoseSession.run` has all steps in order. A `PoseTask` has the parts that differ between alignments: the wanted poses,
+the acceptance test, the fit and the record. No button is pressed between poses: a movement is detected, and the next
+pose begins when it has ended. So one person alone can follow the ground station's voice or the page.
 """
 
 from __future__ import annotations
@@ -40,44 +40,44 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 STAND_S: Final = 12.0
-"""Seconds of stillness for each stand: averaging beyond 10 s improves no accelerometer (method 2.3)."""
+"""Still time for each pose: averaging beyond 10 s improves no accelerometer (method 2.3)."""
 SETTLE_S: Final = 1.0
 STOP_WITHIN_DEG: Final = 5.0
 """Say *stop* when the next sample of the turn would be within this angle of the target."""
 TURNS_DEG: Final = 2.0
 """Least turn within a second that counts as turning."""
 EARLY_S: Final = 3.0
-"""A stand measured for so long that moves was moved too early; before, it is still being set down."""
+"""Still time after which a movement counts as too early; before, the aircraft is still being set down."""
 STILL_MOVING_S: Final = 20.0
-"""Movement after which the operator is told: a hand or the wind may still be on the aircraft."""
+"""Duration of movement after which the operator gets a message: a hand or the wind may move the aircraft."""
 LEANED_DEG: Final = 0.03
-"""Lean within a stand; half of it is in the mean: as much as an error of the marks."""
+"""Largest lean within a pose; half of it gets into the mean, as much as an error of the marks."""
 ARMED: Final = "armed during the alignment; the earlier one stays in force"
 
 
 @dataclasses.dataclass(slots=True, eq=False)
 class SessionState:
-    """All state of one alignment; it stays after its end, for a page that is opened then."""
+    """State of one alignment; kept after its end for pages that are opened later."""
 
     job: Job
     windows: list[Window] = dataclasses.field(default_factory=list)
     poses: list[HeldPose] = dataclasses.field(default_factory=list)
     ups: list[Vector] = dataclasses.field(default_factory=list)
-    """Up in the aircraft's axes, of each stand, as its accelerometers read it."""
+    """Direction of up in the aircraft's axes for each pose, from its accelerometers."""
     first_calibrations: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
     outcome: str | None = None  # None while it runs
 
-    # The present pose
+    # State of the present pose
     number: int = 1
     total: int = 1
     wish: Wish = dataclasses.field(default_factory=lambda: Wish(""))
     words: str = ""
-    objection: str = ""  # Fault of the latest stand, if it was not the one asked for
+    objection: str = ""  # Fault of the latest pose, if it was not the requested one
     share: float = 0.0
     since_s: float = 0.0
-    """Time since which it has not moved."""
+    """Time since which the aircraft has not moved."""
     moved: bool = False
-    """Moved since the stand before, or since the latest objection."""
+    """True: the aircraft has moved since the previous pose, or since the latest objection."""
     still_s: float = 0.0
     moving_since_s: float = math.inf
     hold_still_said: bool = False
@@ -113,41 +113,41 @@ class SessionState:
 
 
 class PoseTask(abc.ABC):
-    """Poses, acceptance test, fit and record of one alignment, with its estimate."""
+    """Parts that differ between alignments: poses, acceptance test, fit, record and estimate."""
 
     imus_alone: ClassVar[bool] = True
-    """Neither gradienter nor compass is waited for: turned over, either may fall silent."""
+    """True: do not wait for gradienter or compass, as either may fall silent when turned over."""
     if_armed: ClassVar[str | None] = None
-    """Why it fails when the aircraft arms; None: it goes on once disarmed."""
+    """Text of the error if the aircraft arms; None: the alignment goes on once disarmed."""
     request: AlignmentRequest
     total: int
     fit_from: int
-    """Number of poses from which the estimate is made, after each."""
-    board: Mounting | None = None  # Tilt of the board, where it can be known
+    """Number of poses for the first estimate; each further pose gives another one."""
+    board: Mounting | None = None  # Tilt of the board, if it can be known
     shortfall: str | None = None
-    """Figure that is still unknown after the last pose; then nothing is written or kept."""
+    """Figure that is still unknown after the last pose; then nothing is written or saved."""
 
     @abc.abstractmethod
     def wish(self, state: SessionState) -> Wish | None:
-        """Return the pose wanted next; None: there are enough."""
+        """Return the next wanted pose; None: there are enough poses."""
 
     @abc.abstractmethod
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
-        """Return the pose of a new window, and why it is not the one asked for, if so."""
+        """Return the pose in a new window, and the objection if it is not the requested one."""
 
     @abc.abstractmethod
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
-        """Estimate from all stands, in a thread; returns what the operator should hear. Refuse what does not fit."""
+        """Estimate from all poses; return messages for the operator. Raises if they do not fit. Runs in a thread."""
 
     @abc.abstractmethod
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> HandRecord:
-        """Build the record of the measurement, before anything is written; add warnings to `log`."""
+        """Build the record of the measurement, before any write; add warnings to `log`."""
 
     def changes(self) -> dict[str, list[Change]]:
         return {}
 
     async def keep(self, record: HandRecord) -> None:
-        """Make the result the active one; a `StorageError` leaves the one before active."""
+        """Save the result and make it the active one; a StorageError leaves the previous one active."""
         del record
 
     @abc.abstractmethod
@@ -166,7 +166,7 @@ class PoseSession:
         self.state: SessionState | None = None
 
     async def run(self, job: Job, task: PoseTask) -> str:
-        """Measure all poses, estimate, write and keep; returns the result in one line.
+        """Measure all poses, estimate, write and save; return the result in one line.
 
         After an error or a cancel the old values are restored, or the error names those that are not.
         """
@@ -181,7 +181,7 @@ class PoseSession:
                 try:
                     heard = await self._core.offload(task.fit, state, local)
                 except CalibrationRefusedError:
-                    # Offsets that somebody else has changed meanwhile would explain it.
+                    # If somebody else has changed the offsets meanwhile, report that as the cause.
                     await self._check_offsets(state)
                     raise
                 for words in heard:
@@ -238,7 +238,7 @@ class PoseSession:
             self._check_known(state)
             moving = self._watch_movement(state, now_s)
             state.still_s = min(status.still_s, now_s - state.since_s - SETTLE_S)
-            # A stand that only has to go on is measured, and shown so, from its first second on.
+            # If only more still time is needed, show the pose as measuring from its first second on.
             standing = state.moved and (waiting_for is None or hold_still_s is not None)
             state.share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
             turned = self._turned(state, now_s) if moving or standing else ""
@@ -264,7 +264,7 @@ class PoseSession:
         window = await self._core.window(since_s=state.since_s + SETTLE_S)
         pose, objection = task.examine(state, window)
         forces = self._collector.imus[window.imus[0].name].forces_m_s2(window.start_s, window.end_s)
-        # A hand that is taken off too slowly for a movement, or soft ground.
+        # A lean without a detected movement comes from a hand removed slowly, or from soft ground.
         if (leaned := leaned_deg(np.array(forces))) >= LEANED_DEG:
             state.since_s = now_s
             self._object(state, f"it leaned by {leaned:.2g} degrees: hands off, firm ground")
@@ -317,7 +317,7 @@ class PoseSession:
         return True
 
     def _object(self, state: SessionState, objection: str) -> None:
-        """Tell the operator; an objection too long to be heard whole is followed by the request."""
+        """Report an objection to the operator; if it is too long to be spoken whole, repeat the request."""
         state.objection, state.hold_still_said = objection, False
         self._core.prompt(Tune.WRONG, objection)
         if len(objection) > LINE_BYTES:

@@ -1,4 +1,4 @@
-"""Kinds of alignment: on one spot the gradienter's zero, or level without one; on all sides the accelerometers."""
+"""Kinds of alignment: on one spot, the gradienter's zero or level accelerometers; on all sides, accelerometers."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ READING_SIGMA_DEG: Final = 0.005
 """Noise of one mean of a gradienter (table in method 3.4)."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
-EXPECTED: Final = 12  # Usual number of stands
+EXPECTED: Final = 12  # Usual number of stands on all sides
 MOST: Final = 24
-"""Stands on all sides; usually there are `EXPECTED`."""
+"""Largest number of stands on all sides."""
 _FIRST: Final = Wish("any side down, propped up, hands off")
 LOOSE_M_S2: Final = 0.5 * MG
-"""Sigma of the level above which the angle of the turn, not the marks, limits it."""
+"""Sigma of the level bias above which its main error is the angle of the turn, not the marks."""
 
 
 class SpotTask(PoseTask):
-    """An alignment on one spot, with its estimate."""
+    """Base class of alignments on one spot, with the estimate."""
 
     result: Alignment
     stands: Sequence[StandMeans] = ()
@@ -82,9 +82,9 @@ class SpotTask(PoseTask):
         )
 
     def _make_stands(self, state: SessionState, names: Sequence[str], north_deg: float = 0.0) -> None:
-        """Build the stands of the named IMUs.
+        """Build the means of each stand for the named IMUs.
 
-        `north_deg`: from the poses' north to true north, added to each heading.
+        `north_deg`: correction from the poses' north to true north, added to each heading.
         """
         stands = []
         for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
@@ -111,7 +111,7 @@ class SpotTask(PoseTask):
 
 
 class ZeroTask(SpotTask):
-    """The gradienter's zero, and with tilts how it sits against each IMU."""
+    """Measures the gradienter's zero; with tilts also its mounting relative to each IMU."""
 
     imus_alone: ClassVar[bool] = False
     if_armed: ClassVar[str | None] = ARMED
@@ -190,7 +190,7 @@ class ZeroTask(SpotTask):
 
 
 class TurnTask(SpotTask):
-    """Level accelerometers and the slope, without a gradienter; the board's tilt, where all sides are known."""
+    """Measures level biases of accelerometers and the slope, without a gradienter; the board's tilt after all sides."""
 
     def __init__(
         self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: ActiveSixPosition
@@ -252,7 +252,7 @@ class TurnTask(SpotTask):
 
 
 def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None = None) -> list[str]:
-    """Return the IMUs (of `among`) whose accelerometers can be read in all stands; refuse where there is none."""
+    """Return the IMUs (of `among`) whose accelerometers can be read in all stands; raise if there is none."""
     read = [{imu.name for imu in window.imus if not imu.refused("accel")} for window in windows]
     names = [imu.name for imu in windows[0].imus if all(imu.name in each for each in read)]
     names = [name for name in names if among is None or name in among]
@@ -262,7 +262,7 @@ def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None
 
 
 def ground(local: LocalEarth, compass: CompassModel | None) -> Ground:
-    """Return gravity and the Earth's rate; without a compass headings count from the first stand, of any direction."""
+    """Return gravity and the Earth's rate; without a compass, heading 0 is the first stand's, in any direction."""
     rate, of_rate = local.rate_in_body(np.eye(3), heading_known=compass is not None)
     covariance = of_rate.copy()
     if compass is not None and compass.magnetic:
@@ -280,7 +280,7 @@ def _temperatures(window: Window) -> dict[str, float | None]:
 
 
 class SidesTask(PoseTask):
-    """Bias and scale of accelerometers by stands in any orientation; ends by itself when nothing is unknown."""
+    """Measures bias and scale of accelerometers in stands of any orientation, until every figure is known."""
 
     total = EXPECTED
     fit_from = 1
@@ -310,7 +310,7 @@ class SidesTask(PoseTask):
                 continue
             means = [imu for window in state.windows for imu in window.imus if imu.name == name]
             sigmas = np.array([(imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2) for imu in means])
-            # One sigma of the change of the bias in the next minutes.
+            # One sigma of the bias change in the next minutes.
             wander = np.median(np.sqrt(np.maximum(sigmas[:, 0] ** 2 - sigmas[:, 1] ** 2, 0.0)), axis=0)
             found = faces([self._face(one) for one in means], local.gravity_m_s2, local.gravity_sigma_m_s2, wander)
             self._by_imu[name] = found
@@ -347,7 +347,7 @@ class SidesTask(PoseTask):
                     corrections=calibration.corrections,
                     temperature_degc=degrees.get(name),
                     running=self._kept.running(name),
-                    # Bias without any offset, in the sensor's own scale, as an offset corrects it.
+                    # Bias before any offset, in the sensor's own scale, which is the scale of offsets.
                     whole_m_s2=np.asarray(calibration.accel_offset_m_s2) + found.figures[BIAS] / calibration.in_use(),
                 )
                 for name, found in self._by_imu.items()
@@ -374,7 +374,7 @@ class SidesTask(PoseTask):
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:
-        """Return a mean in the sensor's own axes, in which firmwares scale."""
+        """Return mean and sigma in the sensor's own axes, in which firmwares apply the scale."""
         turn = self._imus[imu.name].in_force.orientation.T
         return turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2))
 

@@ -1,7 +1,7 @@
 """Writes of alignments to the autopilot: accelerometer offsets and scales, and the level of the board.
 
 The level is ArduPilot's AHRS_TRIM, which rotates the reported attitude only, or PX4's SENS_BOARD_X/Y_OFF, which rotates
-the output of the IMUs: telemetry shows it within a second, but EKF2 learns the new tilt slowly, or at a restart.
+the output of the IMUs. PX4's telemetry shows it within a second, but EKF2 learns the new tilt slowly, or at a restart.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from companion.storage.changes import Origin
 
 MOST_DEG: Final = 10.0
 SEEN_DEG: Final = 0.1
-"""Least step that shows in an attitude that wanders by hundredths of a degree."""
+"""Least step that is visible in an attitude, which wanders by hundredths of a degree."""
 SEEN_SHARE: Final = 0.2
 WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5
-"""Both firmwares read their parameters once a second."""
+"""Time until new parameters are in use: both firmwares read them once a second."""
 LATEST_S: Final = 4.0
-"""Age of the attitude that counts: on a busy link it comes seconds late, and an estimator wanders."""
+"""Time span of attitudes that count: on a busy link they come seconds late, but an estimator wanders."""
 POLL_S: Final = 0.25
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
@@ -74,7 +74,7 @@ class AlignmentWrites:
         for target in targets:
             kept, names = log.written.get(target.name, {}), target.calibration.parameters
             if {kept[name].outcome for name in names.accel_offset if name in kept} == {"verified"}:
-                # One step of the output showed offsets and scales together.
+                # One verified step of the output confirms offsets and scales together.
                 plan.mark(log, names.accel_scale, "verified")
         await self.path.settle(job, plan, last, log)
 
@@ -113,7 +113,7 @@ class AlignmentWrites:
     async def _verify_level(
         self, job: Job, turn: Matrix, before: Array | None, last: Window
     ) -> tuple[Outcome, str | None]:
-        """Watch the attitude turn; return the outcome and a warning, or raise AutopilotError where it did not."""
+        """Wait until the attitude has turned as expected; return outcome and warning, or raise AutopilotError."""
         loop, vehicle = asyncio.get_running_loop(), self._vehicle
         job.progress(WRITTEN_PERCENT, "watching the attitude take the new level")
         since_s, boots = loop.time() + USED_AFTER_S, vehicle.boots

@@ -1,1 +1,1 @@
-"""Gradienter and accelerometers against the aircraft, from several stands."""
+"""Alignment of gradienter and accelerometers with the aircraft, from several stands."""

@@ -6,13 +6,13 @@ unknowns are estimated together by Gauss-Newton with priors: an unknown that the
 prior sigma.
 
 Without a gradienter (`turned`) the same turn gives the *effective* bias of the level aircraft: the bias proper and the
-board's tilt in one. The slope of the spot changes its sign in the aircraft after half a turn, a bias does not. Its
-sigma depends on how well the marks are met (`Priors.placement_deg`) and, on a slope, on the angle of the turn:
+board's tilt in one. In the aircraft, the slope of the spot changes its sign after half a turn; a bias does not. The
+sigma depends on the placement on the marks (`Priors.placement_deg`) and, on a slope, on the error of the turn's angle:
 g sin(slope) / 2 for each radian of a half turn, 0.76 mg for each degree on 5 deg of slope. Quarter turns determine
-their angles themselves, for their readings lie on a circle.
+their own angles, because their readings lie on a circle.
 
-Readings that do not fit together are refused: every residual is compared with its own sigma (Baarda's w-test), which
-names the stand that is off, and finds a spot that moved before any sum of squares does.
+Inconsistent readings are refused: every residual is compared with its own sigma (Baarda's w-test). That names the
+wrong stand, and detects a spot that moved before a sum of squares would.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ from companion.physics.units import DEG, MG
 W_LIMIT: Final = 4.5
 """Threshold for |w| of one residual: exceeded by chance once in some thousand alignments of a hundred readings."""
 SPOT_W_LIMIT: Final = 3.9
-"""Threshold for |w| of a placement, of which there are few: once in some thousand alignments."""
+"""Threshold for |w| of a placement: as there are few, exceeded by chance once in some thousand alignments."""
 DETERMINED: Final = 0.2
-"""A figure counts as determined where its sigma is below this share of its prior sigma."""
+"""A figure counts as determined if its sigma is below this share of its prior sigma."""
 _LEAST_REDUNDANCY: Final = 1e-3
-_NINETY_NINE: Final = 2.326  # Sigmas that a normal variable exceeds in one case of a hundred
+_NINETY_NINE: Final = 2.326  # Sigmas of the one-sided 1 % point of a normal variable
 MOST_TURNED_DEG: Final = 30.0
-"""Largest turn of an IMU against the base: more is another orientation than the one configured."""
+"""Largest rotation of an IMU against the base: a larger one means a wrong configured orientation."""
 ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
 """Priors of uncalibrated accelerometers on a board put in by eye."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Figures:
-    """Three figures, their sigmas, and whether the stands determine each; shapes (3,)."""
+    """Three figures, their sigmas, and flags of those that the stands determine; shapes (3,)."""
 
     value: Array
     sigma: Array
@@ -74,16 +74,16 @@ class Figures:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuAlignment:
-    """Estimate of one IMU, vehicle FRD, without the offsets that an autopilot has subtracted already.
+    """Estimate of one IMU's remaining errors, after the offsets that an autopilot subtracts; vehicle FRD.
 
     The level bias (3,) is the effective one, scale and misalignment included, as a calibration of the level aircraft
-    finds it; `accel_bias_m_s2` is the bias proper. Shear: xy, xz, yz. `misalignment_rad`: rotation vector from the axes
-    of gradienter and base to those of this IMU.
+    measures it; `accel_bias_m_s2` is the bias alone. Shear: xy, xz, yz. `misalignment_rad`: rotation vector from the
+    axes of gradienter and base to those of this IMU.
     """
 
     name: str
     level_bias_m_s2: Array
-    """Effective bias when level, scale and misalignment included, as a calibration there finds it; (3,)."""
+    """Effective bias (3,) when level, with scale and misalignment, as a level calibration measures it."""
     level_covariance_m2_s4: Matrix
     accel_bias_m_s2: Figures
     scale: Figures
@@ -93,7 +93,7 @@ class ImuAlignment:
 
 
 class Complaint(NamedTuple):
-    """The residual that fits worst: in its own sigmas, and in SI units."""
+    """Worst residual, in its own sigmas and in SI units."""
 
     label: ResidualLabel
     sigmas: float
@@ -102,9 +102,9 @@ class Complaint(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The gradienter's zero (2,), on top of the configured offset, and all IMUs.
+    """Result of an alignment: the gradienter's zero (2,), on top of the configured offset, and all IMUs.
 
-    `checked`: a spot that moved between two stands would have been noticed.
+    `checked`: the stands would have revealed a spot that moved between them.
     """
 
     offset_deg: Array  # Zero of the gradienter on top of the configured offset; (2,)
@@ -128,7 +128,7 @@ def align(
     """Estimate all unknowns from all stands, at least one; `vehicle_from_sensor` is the gradienter's mounting.
 
     Raises:
-        CalibrationRefusedError: the equations cannot be solved: readings that cannot belong together.
+        CalibrationRefusedError: the equations cannot be solved, because the readings are inconsistent.
     """
     mounting = law, vehicle_from_sensor
     try:
@@ -146,7 +146,7 @@ def align(
         ) from None
     chi_square = float(found.residual @ found.residual)
     freedom = int((found.residual.size - np.count_nonzero(model.sigma)) - sum(model.sigma[model.damped] > 0.0))
-    # A stand's placement is checked where the other stands predict it: the rest is its redundancy.
+    # A placement is checked if the other stands predict it, which its redundancy shows.
     checked = any(
         group == "spot" and share > 0.1 for (group, *_), share in zip(model.labels, found.redundancy, strict=True)
     )
@@ -168,7 +168,7 @@ def turned(stands: Sequence[StandMeans], ground: Ground) -> Alignment:
     """Estimate level bias and slope from two or four headings on one spot, without a gradienter.
 
     Raises:
-        CalibrationRefusedError: the readings cannot belong together.
+        CalibrationRefusedError: the readings are inconsistent.
     """
     try:
         return align("slope", np.eye(3), stands, ground, ALONE)
@@ -193,7 +193,7 @@ _UNKNOWN: Final = "the stands do not fit what is known of the sensors ({by}): be
 
 
 def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
-    """Say why the stands do not fit together, and what to do, in one line; `gradienter`: whether there was one."""
+    """Explain in one line why the stands are inconsistent, and what to do; `gradienter`: whether there was one."""
     (group, stand, name), sigmas, size = complaint
     words = _COMPLAINTS.get(group, _UNKNOWN)
     if group == "accelerometer" and not gradienter:
@@ -203,7 +203,7 @@ def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
-    """Return the variance of the residuals over that of their sigmas where it exceeds its 99 % point, else 1."""
+    """Return the ratio of actual to stated residual variance if it exceeds its 99 % point, else 1."""
     if freedom <= 0:
         return 1.0
     ratio = chi_square / freedom
@@ -247,7 +247,7 @@ def _imu(model: Model, at: Array, covariance: Matrix, ground: Ground, k: int) ->
     by = (level[1:] - level[0]).T / step
     return ImuAlignment(
         name=model.names[k],
-        # With the place's gravity, as in a calibration.
+        # Uses the local gravity, as a calibration does.
         level_bias_m_s2=level[0] - ground.gravity_m_s2 * LEVEL,
         level_covariance_m2_s4=by @ covariance @ by.T,
         accel_bias_m_s2=figures(ACCEL_BIAS),

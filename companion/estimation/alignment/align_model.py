@@ -11,11 +11,11 @@ turned about the vertical):
     accelerometer  f = (I + S) exp(-[m x]) g u + b                      S: scale on the diagonal, shear beside it
     gyro           w = C_k W + b_w
     compass        heading of C_k
-    turn           of C_k since the stand before, about the vehicle's z axis, (1 + s) times      s: a gyro's scale
+    turn           (1 + s) times the turn of C_k since the last stand, about the vehicle's z     s: a gyro's scale
     spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
 
-The last line is the level reversal (method 3.4): the spot's true tilt is the same in the ground's frame, however the
-aircraft is turned on it. "Level" is parallel to the plane on which it is turned. An attitude error eps is
+The last line is the level reversal (method 3.4): the spot's true tilt is the same in the ground frame, however the
+aircraft is turned on it. "Level" means parallel to the plane of the spot. An attitude error eps gives
 C = exp(-[eps x]) C_0, with C_0 the first guess.
 """
 
@@ -39,7 +39,7 @@ ResidualLabel = tuple[Group, int, str]
 """Group of a residual, its stand (from 1; 0: none), and its IMU, if any."""
 
 _ANYHOW_RAD: Final = 1.0
-"""Damping of unknowns that only the readings determine: keeps the equations solvable."""
+"""Damping sigma of unknowns that have no prior: keeps the equations solvable."""
 PRIOR_BIAS_M_S2: Final = 100.0 * MG
 PRIOR_SCALE: Final = 0.03
 PRIOR_SHEAR: Final = 0.01
@@ -47,15 +47,15 @@ PRIOR_SHEAR: Final = 0.01
 _MAX_ROUNDS: Final = 30
 _CONVERGED: Final = 1e-5
 _STEP: Final = 1e-5
-"""Step of the numerical derivatives. Both are shares of the prior sigma of each unknown."""
+"""Step of the numerical derivatives. `_CONVERGED` and `_STEP` are shares of the prior sigma of each unknown."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class LeastSquares:
-    """Result of `fit`: unknowns, and their covariance by the sigmas of readings and priors.
+    """Result of `fit`: unknowns, and their covariance from the sigmas of readings and priors.
 
-    The covariance is zero where an unknown is not estimated. Residuals are over their sigmas: readings, then the prior
-    of every unknown that is estimated. `redundancy`: share of the variance of each that the other rows leave in it.
+    The covariance of an unknown that is not estimated is zero. Residuals are divided by their sigmas: readings, then
+    the prior of each estimated unknown. `redundancy`: share of each residual's variance that the fit leaves in it.
     """
 
     values: Array
@@ -107,10 +107,10 @@ def fit(
 class StandMeans:
     """Means of one still window.
 
-    `tilt_deg`: the gradienter's readings less the configured offset; None out of its range, or without one. The heading
-    is from a north common to all stands, which need not be the true one. `counted`: it is that of the stand before plus
-    the turn that the gyros counted since (`seconds.counting`), not wrapped; its sigma is that of this turn, without the
-    gyros' scale (`Priors.turn_scale`).
+    `tilt_deg`: gradienter readings minus the configured offset; None out of range or without a gradienter. The heading
+    counts from a north common to all stands, which need not be the true one. `counted`: the heading is that of the last
+    stand plus the turn that the gyros counted since (`seconds.counting`), not wrapped. Its sigma is then that of the
+    turn, without the gyros' scale (`Priors.turn_scale`).
     """
 
     imus: tuple[ImuWindow, ...]
@@ -118,7 +118,7 @@ class StandMeans:
     tilt_sigma_deg: tuple[float, float]
     heading_rad: float  # Heading from a north common to all stands, which need not be the true one
     heading_sigma_rad: float
-    on_spot: bool  # On the one spot on which the aircraft is turned
+    on_spot: bool  # True on the spot on which the aircraft is turned
     counted: bool = False
 
 
@@ -129,7 +129,7 @@ class Ground:
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     rate_rad_s: Array
-    """Shape (3,), in the frame from whose x axis headings count."""
+    """Shape (3,), in the ground frame: headings count from its x axis."""
     rate_covariance: Matrix
 
 
@@ -199,7 +199,7 @@ class Model:
         if self._on_spot:
             self.start[self.spot] = self._first_guess[self._on_spot, 2, :2].mean(axis=0)
         self.damped = [*range(2, 4), *range(self.turn.stop, self._first_imu)]
-        """Unknowns that only the readings determine."""
+        """Unknowns without a prior."""
 
         self.labels: list[ResidualLabel] = []  # Labels of the residuals, in their order, and of the priors
         sigmas: list[float] = []
@@ -237,7 +237,7 @@ class Model:
         return np.asarray(rotations(-errors.reshape(*at.shape[:-1], -1, 3)) @ self._first_guess)
 
     def reading(self, at: Floats, up: Floats) -> Floats:
-        """Predict every IMU's accelerometers, (..., stands, imus, 3), from up in the vehicle, (..., stands, 3)."""
+        """Predict accelerometer readings (..., stands, imus, 3) from up in the vehicle, (..., stands, 3)."""
         imus = self._imus(at)
         turned = rotations(-imus[..., MISALIGNMENT, :])
         matrices = response(imus[..., PART_SCALE, :], imus[..., PART_SHEAR, :]) @ turned

@@ -6,8 +6,8 @@ and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u of length 1, up in the
     f = (I + S) g u + b           S symmetric: scale on its diagonal, shear beside it
 
 so that |(I + S)^-1 (f - b)| = g in every stand. A common rotation of the axes changes no length: `mounting` finds it,
-from a turn on a spot. Unlike the triangular matrix of that paper, a symmetric one prefers no axis, and its diagonal is
-the scale of a firmware that knows no shear.
+from a turn on a spot. Unlike the triangular matrix of that paper, a symmetric one prefers no axis. Its diagonal is the
+scale that a firmware without shear correction uses.
 
 Each stand is weighted by the noise of its mean, gravity by the uncertainty of the place, so every figure has a sigma
 from the first stand on. A stand that does not fit is found by leaving out one after another.
@@ -37,16 +37,16 @@ SHEAR: Final = slice(6, 9)
 W_LIMIT: Final = 3.9
 """Threshold for |w| of a stand (Baarda): exceeded by chance once in ten thousand."""
 LEAST_SPARE: Final = 2
-"""Stands beyond the number of figures that it takes to name a wrong one."""
+"""Surplus of stands over figures that is needed to identify a wrong stand."""
 _LEAST_REDUNDANCY: Final = 1e-3
 
 ENOUGH_BIAS_M_S2: Final = 0.15 * MG
 ENOUGH_SCALE: Final = 2e-4
 ENOUGH_WANDER: Final = 0.8
-"""Share of a bias' wander that may be open: beyond it a dozen stands make a bad sensor no better."""
+"""Bias sigma that is good enough, as a share of the bias' wander: a dozen more stands do not improve a bad sensor."""
 SAME_DEG: Final = 20.0
-"""Two stands within this angle tell hardly more than one."""
-FACE_DEG: Final = 30.0  # A stand within this angle of a face has seen it
+"""Two stands within this angle add hardly more information than one."""
+FACE_DEG: Final = 30.0  # A stand within this angle of a face covers it
 _STAND_SIGMA_M_S2: Final = 0.03 * MG  # Predicted sigma of the mean of a coming stand
 _AXES: Final = "xyz"
 _SIDES: Final = {
@@ -61,13 +61,13 @@ _SIDES: Final = {
 
 
 Face = tuple[Array, Array]
-"""The mean of one still stand in the sensor's axes, and one sigma per axis; m/s^2, shapes (3,)."""
+"""Mean of one still stand in the sensor's axes, and one sigma per axis; m/s^2, shapes (3,)."""
 
 
 class Sides(msgspec.Struct, frozen=True):
-    """Errors of one IMU's accelerometers, known from all sides, under the offsets and scales that are active.
+    """Errors of one IMU's accelerometers, measured on all sides, with the active offsets and scales applied.
 
-    Figures (9,) as in `FacesEstimate`, one sigma of each: time and temperature have widened those of the biases.
+    Figures (9,) as in `FacesEstimate`, with one sigma each; time and temperature widen the sigmas of the biases.
     """
 
     figures: Array  # (9,), as in `FacesEstimate`, in the sensor's axes; m/s^2 and no unit
@@ -79,10 +79,10 @@ class Sides(msgspec.Struct, frozen=True):
 class FacesEstimate:
     """Estimate from all stands: figures (9,), bias x y z, scale x y z, shear xy xz yz.
 
-    `by_stands` (9, 9): their covariance during the stands. `wander_m_s2` (3,): one sigma of the change of the biases
-    until they are used. `up` (stands, 3): in the sensor's axes, corrected. `off_m_s2` (stands,): length of each
-    corrected reading less gravity. Stands, counted from 0: those `left_out` do not fit the others; of those `in_doubt`
-    one does not, and the next stand will tell which.
+    `by_stands` (9, 9): covariance of the figures during the stands. `wander_m_s2` (3,): one sigma of the change of the
+    biases until they are used. `up` (stands, 3): in the sensor's axes, corrected. `off_m_s2` (stands,): length of each
+    corrected reading minus gravity. Stands count from 0: those `left_out` do not fit the others. One of those
+    `in_doubt` does not fit either; the next stand shows which.
     """
 
     figures: Array
@@ -97,7 +97,7 @@ class FacesEstimate:
 
     @property
     def covariance(self) -> Matrix:
-        """Covariance of the figures until they are used, (9, 9)."""
+        """Covariance (9, 9) of the figures at the time of their use."""
         both = self.by_stands.copy()
         both[BIAS, BIAS] += np.diag(self.wander_m_s2**2)
         return both
@@ -110,7 +110,7 @@ class FacesEstimate:
 def faces(
     stands: Sequence[Face], gravity_m_s2: float, gravity_sigma_m_s2: float, wander_m_s2: Array | None = None
 ) -> FacesEstimate:
-    """Estimate from all stands, at least one; a figure that they do not determine keeps its prior sigma.
+    """Estimate the figures from at least one stand; a figure that is not determined keeps its prior sigma.
 
     `wander_m_s2` as in `FacesEstimate`; None: zero.
 
@@ -154,7 +154,7 @@ def faces(
 def _fit(
     stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]
 ) -> tuple[Array, Matrix, float, bool]:
-    """Estimate the figures and gravity: figures, covariance, chi-square, and whether every stand fits."""
+    """Estimate figures and gravity; return figures, covariance, chi-square, and whether every stand fits."""
     force, sigmas = (np.array([stands[k][part] for k in which]) for part in (0, 1))
     prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
 
@@ -176,19 +176,19 @@ def _fit(
     residual, freedom = found.residual[:count], count - FIGURES
     chi_square = float(residual @ residual)
     w = residual / np.sqrt(np.maximum(found.redundancy[:count], _LEAST_REDUNDANCY))
-    # Compared with the scatter of the other stands, where that exceeds their sigmas.
+    # Compare each stand with the scatter of the others if that exceeds their sigmas.
     others = np.maximum((chi_square - w**2) / (freedom - 1), 1.0) if freedom > 1 else np.ones(count)
     covariance = widened_by(chi_square, freedom) * found.covariance[:FIGURES, :FIGURES]
     return found.values[:FIGURES], covariance, chi_square, bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all())
 
 
 def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
-    """Return the next pose; None where bias and scale of all axes are known well enough, and checked.
+    """Return the next pose to ask for; None once bias and scale of all axes are precise enough and checked.
 
     `vehicle_from_sensor`: 3x3, the mounting of the accelerometers in `found`.
     """
     wander, gravity = ENOUGH_WANDER * found.wander_m_s2, found.gravity_m_s2
-    # No stand tells an error of the place's gravity: that much of the scale stays open.
+    # Stands cannot show an error of the local gravity: the scale keeps that uncertainty.
     scale = np.hypot(np.maximum(ENOUGH_SCALE, wander / gravity), found.gravity_sigma_m_s2 / gravity)
     sigma = np.sqrt(np.diag(found.by_stands))[: SCALE.stop]
     share = sigma / np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale])
@@ -196,7 +196,7 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
     unchecked = len(found.up) - len(found.left_out) < FIGURES + LEAST_SPARE
     if not worst_first and not unchecked and not found.in_doubt:
         return None
-    # Where all have been seen, the one that tells most is held once more.
+    # Once all sides were seen, ask again for the most informative one.
     sides = _not_seen(found, vehicle_from_sensor) or _all_sides(vehicle_from_sensor)
     weight = np.where(share > 1.0, share, 0.0) if worst_first else np.ones(SCALE.stop)
     told = [_told(found, up)[: SCALE.stop] * weight for _, up in sides]
@@ -211,7 +211,7 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
 
 
 def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:
-    """Return the stand, counted from 0, that was held like this one; None for a new one, or if all sides were seen.
+    """Return the index of an earlier stand in this pose; None for a new pose, or if all sides were seen.
 
     `up` is in the sensor's axes, (3,), of length 1; `found` is from the stands before.
     """
@@ -270,9 +270,9 @@ class Mounting:
 
 
 def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting:
-    """Return the tilt of the board from its level bias and the bias and scale of its accelerometers, both uncorrected.
+    """Return the tilt of the board from its level bias and its accelerometers' bias and scale, all uncorrected.
 
-    Shear is not corrected, as no firmware does it; so the attitude that is corrected by this tilt is right when level.
+    Shear is not corrected, because no firmware does. The attitude corrected by this tilt is right when level.
     """
     vehicle_from_sensor = known.vehicle_from_sensor
     read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)

@@ -1,6 +1,6 @@
-"""The poses that an alignment asks for, in words and as a picture, and whether a pose is the one asked for.
+"""Poses that an alignment asks for, as text and picture, and the check of a pose against the requested one.
 
-A *pose* is one way in which the aircraft is put down or held; a *stand* is the still window measured in it.
+A *pose* is one way to put down or hold the aircraft; a *stand* is the still window measured in it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from companion.samples import Vector
 TURN_TOLERANCE_DEG: Final = 30.0
 QUARTER_DEG: Final = 90.0
 LEAST_TILT_DEG: Final = 15.0
-"""Least tilt that separates scale and misalignment from bias: they differ by the tilt's cosine."""
+"""Least tilt that separates scale and misalignment from bias: their effects differ by the tilt's cosine."""
 APART_DEG: Final = 45.0  # The least angle between two tilts to different sides
 MOST_ASKEW_DEG: Final = 30.0
-"""Largest tilt on the base: a slope, an aircraft that sits on its tail, and a board put in by eye."""
+"""Largest tilt on the base: a slope, plus an aircraft that sits on its tail, plus a board mounted by eye."""
 TILTS: Final = 4
 LEVEL: Final = (0.0, 0.0, -1.0)
 _SIN, _COS = math.sin(24.0 * DEG), math.cos(24.0 * DEG)
@@ -36,7 +36,7 @@ HEADINGS: Final = 4
 LEAST_SECONDS: Final = 6
 LEANED_SIGMAS: Final = 5.0
 BY_EYE_SIGMA_DEG: Final = 10.0
-"""Sigma of a turn that nobody counted and that was made as asked."""
+"""Sigma of a turn by hand that no sensor measured."""
 
 
 class AlignmentRequest(NamedTuple):
@@ -44,13 +44,13 @@ class AlignmentRequest(NamedTuple):
 
     action: Literal["zero", "tilts", "turn", "faces"]
     headings: int = 2
-    """2: there, turned by 180 degrees, and on the same way to the first marks; 4: every quarter turn."""
-    write: bool = False  # Write offsets (and scales, where all sides tell them) to the autopilot
-    level: bool = False  # Write how the board sits as the autopilot's level
+    """2: start, half a turn, and on in the same direction to the start; 4: every quarter turn."""
+    write: bool = False  # Write offsets (and scales, if all sides determine them) to the autopilot
+    level: bool = False  # Write the tilt of the board as the autopilot's level
 
     @property
     def on_spot(self) -> int:
-        """Number of stands on the one spot; a turn by quarters ends on the first marks again, as a check."""
+        """Number of stands on the one spot; a "turn", or two headings, ends with a check on the first marks."""
         if self.headings == 2 and self.action != "tilts":
             return 3
         return HEADINGS + (self.action == "turn")
@@ -61,10 +61,9 @@ class AlignmentRequest(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """The pose that is asked for next: `up` (length 1) in the aircraft's axes, forward, right, down.
+    """Pose to ask for next: `up` (length 1) in the aircraft's axes, forward, right, down.
 
-    `words` are spoken up to a colon; the rest need not be heard. `unknown`: figures that are still open, the worst
-    first.
+    `words` are spoken up to the first colon. `unknown`: figures that are not yet precise enough, worst first.
     """
 
     words: str
@@ -76,13 +75,13 @@ class Wish(NamedTuple):
 class HeldPose(NamedTuple):
     """Attitude of the aircraft in one stand: `up` (3,) in its axes.
 
-    The heading is from the compass' own north, else from the first stand; not wrapped where the gyros counted it.
-    `counted`: the sigma is that of the turn since the stand before.
+    The heading counts from the compass' own north, else from the first stand; not wrapped if the gyros counted it.
+    `counted`: the sigma is that of the turn since the last stand.
     """
 
     up: Array
     heading_deg: float = 0.0
-    """Heading from the compass' own north, else from the first stand; not wrapped where the gyros counted it."""
+    """Heading from the compass' own north, else from the first stand; not wrapped if the gyros counted it."""
     heading_sigma_deg: float = 0.0
     counted: bool = False
 
@@ -110,7 +109,7 @@ def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> floa
 
 
 def objection(request: AlignmentRequest, poses: Sequence[HeldPose], now: HeldPose) -> str | None:
-    """Say why this is not the pose that was asked for, and what to do; None when it is."""
+    """Explain why this is not the requested pose, and what to do; None if it is."""
     if not poses:
         askew_deg = _apart_deg(now.up, np.array(LEVEL))
         return f"tilted by {askew_deg:.0f} degrees: stand it on its base" if askew_deg > MOST_ASKEW_DEG else None
@@ -172,14 +171,14 @@ def _side(level: Array, up: Array) -> str:
 
 
 def leaned_deg(forces_m_s2: Array) -> float:
-    """Return how far up moved in the aircraft between the thirds of a stand; 0 where it may be noise.
+    """Return the largest angle of up between the thirds of a stand; 0 if it may be noise.
 
     Args:
         forces_m_s2: (seconds, 3), means of an accelerometer.
     """
     if len(forces_m_s2) < LEAST_SECONDS:
         return 0.0
-    # Second differences are blind to a steady lean; of white noise they have six times the variance.
+    # Second differences cancel a steady lean; for white noise they have six times its variance.
     noise = math.sqrt(np.square(np.diff(forces_m_s2, 2, axis=0)).mean() / 6.0)
     thirds = np.array([third.mean(axis=0) for third in np.array_split(forces_m_s2, 3)])
     ups = thirds / np.linalg.norm(thirds, axis=1)[:, None]

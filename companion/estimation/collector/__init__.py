@@ -1,1 +1,1 @@
-"""The rolling collector: what comes in, what it waits for, when it has enough."""
+"""Rolling collector: input streams, wait conditions, and the decision that a window is enough."""

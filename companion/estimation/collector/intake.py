@@ -1,9 +1,9 @@
-"""Streams into the collector, each with its seconds, gate and verdict; and the types of the collector's state.
+"""Input streams of the collector, each with its seconds, gate and verdict; and the types of the collector's state.
 
-A gradienter, or a compass that averages, goes on moving after the aircraft has stopped: both follow the truth with a
-time constant; the fluid of a field gradienter keeps a tenth of its error after every second (BEI INC manual; sensors
-2.2 and 2.7). The gate sees only the steep beginning of that. So after every second that was not still by the IMUs, its
-seconds count again once the largest error has died away to a tenth of its sigma. Those of the IMUs count meanwhile.
+The readings of a gradienter, or of a compass that averages, go on changing after the aircraft has stopped: they follow
+the truth with a time constant. A field gradienter's fluid keeps a tenth of its error after every second (BEI INC
+manual; sensors 2.2 and 2.7). The gate sees only the steep beginning of that. After a second that was not still by the
+IMUs, a pose sensor's seconds count again once its largest error is a tenth of its sigma; the IMUs' count meanwhile.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ Kind = Literal["imu", "gradienter", "compass"]
 PoseKind = Literal["gradienter", "compass"]
 
 _SILENT_S: Final = 2.5
-_LONGEST_UP_S: Final = 3e8  # A longer time since power-up counts from somewhere else, such as UTC
+_LONGEST_UP_S: Final = 3e8  # A longer "time since power-up" has another origin, such as UTC
 LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
 _LIMITS_TILT: Final = (180.0,) * 2
 _LIMITS_HEADING: Final = (1e3,)
-OFF_DEG: Final = 5.0  # Largest error that a movement leaves in a pose sensor
+OFF_DEG: Final = 5.0  # Largest error of a pose sensor right after a movement
 _SHARE: Final = 0.1
 
 LOWEST_DEGC: Final = -40.0
-HIGHEST_DEGC: Final = 105.0  # Widest range of IMUs' data sheets
+HIGHEST_DEGC: Final = 105.0  # Widest range in data sheets of IMUs
 _NONE_AFTER_S: Final = 10
 _ADJACENT_S: Final = 3
-JUMP_K: Final = 5.0  # Change within a second that no board makes
+JUMP_K: Final = 5.0  # Change within a second that is too fast for any board
 _JUMPS: Final = 2
 _WITHIN_S: Final = 600
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """Lengths and targets of a calibration; a target that is not wanted is `math.inf`."""
+    """Lengths and targets of a calibration; `math.inf`: no target."""
 
     min_still_s: float
     max_s: float
@@ -62,18 +62,18 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CollectorObstacle(msgspec.Struct, frozen=True):
-    """Reason why nothing can be measured now: a movement, which a hand can end, or a fault."""
+    """Reason why nothing can be measured now: a movement, which the operator can end, or a fault."""
 
     words: str
-    moving: bool = False  # True for a movement, which a hand can end; False for a fault
+    moving: bool = False  # True for a movement, which the operator can end; False for a fault
     hold_still_s: int | None = None
-    """Seconds to stand still yet, where nothing else is missing."""
+    """Remaining seconds to hold still, if nothing else is missing."""
 
 
 class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one source; `words` say why it is not still.
+    """State of one source; `words` give the reason why it is not still.
 
-    `rate_hz` is the number of samples in its last whole second; `lost` those that never came, by the device's counter
+    `rate_hz` is the number of samples in its last whole second; `lost` counts missing samples, by the device's counter
     or clock.
     """
 
@@ -87,12 +87,12 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of the collector; a glance leaves out what an estimate tells.
+    """State of the collector; `glance` leaves out the fields that need an estimate.
 
-    `still_s` counts the good seconds, common to all sources, of the stretch under way, and `steady_s` those without a
-    bad one until now; a window is possible after `hold_still_s` more. `enough`: more seconds would not better the
-    result; `progress` (0..1) leads there. `measuring`: words for a measurement under way; `left`: their part on how
-    much longer it takes, where that is minutes.
+    `still_s`: good seconds, common to all sources, of the current stretch; `steady_s`: good seconds in a row until now.
+    A window is possible after `hold_still_s` more. `enough`: more seconds would not improve the result; `progress`
+    (0..1) towards that. `measuring`: text on a measurement in progress; `left`: its part on the remaining time, if that
+    is minutes.
     """
 
     still_s: float
@@ -100,7 +100,7 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
     good_now: bool  # True if the latest second counts
     hold_still_s: int = 0
     obstacle: CollectorObstacle | None = None
-    """A movement now, or a source that is silent or stuck; by an estimate, too, what it still waits for."""
+    """Current movement, or a silent or stuck source; with an estimate, also the reason why it waits."""
     enough: bool = False
     progress: float = 0.0
     sources: tuple[SourceStatus, ...] = ()
@@ -117,7 +117,7 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def moves(self) -> str | None:
-        """Words for a movement at this moment; None where nothing moves."""
+        """Text on a movement at this moment; None if nothing moves."""
         found = self.obstacle
         return found.words if found is not None and found.moving and found.hold_still_s is None else None
 
@@ -125,8 +125,8 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
 class Thermometer:
     """Checks an IMU's thermometer, second by second.
 
-    One that is in another unit or jumps is not believed: then the IMU counts as one without a thermometer. A constant
-    reading is no fault: a board comes to rest at some temperature, and a heater holds its IMU warm.
+    A thermometer in a wrong unit, or with jumps, is ignored: the IMU then counts as having none. A constant reading is
+    no fault: a board reaches a steady temperature, and a heater keeps its IMU warm.
     """
 
     def __init__(self) -> None:
@@ -135,7 +135,7 @@ class Thermometer:
     def _begin(self, slot: float) -> None:
         self.none = False  # True for an IMU whose messages carry no temperature
         self.wrong = ""
-        """Reason in one line why it is not believed; empty: it is, or there is none."""
+        """Reason in one line why it is ignored; empty: it is used, or there is none."""
         self._slot = slot  # Second of the latest reading, or the first second
         self._degc: float | None = None
         self._jumps: deque[float] = deque(maxlen=_JUMPS)
@@ -160,19 +160,19 @@ class Thermometer:
 
 
 class Settling:
-    """Knows which seconds of a pose sensor are still the tail of a movement.
+    """Detects the seconds in which a pose sensor still settles after a movement.
 
-    The sensor follows the truth with the time constant `lag_s`, 0 for none; a tenth of `sigma_deg` may remain.
+    The sensor follows the truth with the time constant `lag_s`, 0 for none. It has settled to a tenth of `sigma_deg`.
     """
 
     def __init__(self, lag_s: float, sigma_deg: float) -> None:
         self.left_s = 0  # Seconds until its readings count again, as of the last second judged
-        # Without a lag nothing follows, however exact the sensor is said to be.
+        # Without a lag nothing settles, however small the stated sigma is.
         self._tail_s = math.ceil(lag_s * math.log(max(OFF_DEG / (_SHARE * sigma_deg), 1.0))) if lag_s > 0.0 else 0
         self._moved: int | None = None  # Last second in which the aircraft moved
 
     def judge(self, slot: int, *, moved: bool) -> bool:
-        """Judge whether the second counts, seconds ascending; `moved`: the IMUs were not still."""
+        """Return whether a second counts; seconds must ascend. `moved`: the IMUs were not still."""
         if moved:
             self._moved = slot
         self.left_s = 0 if self._moved is None else max(self._moved + 1 + self._tail_s - slot, 0)
@@ -180,9 +180,9 @@ class Settling:
 
 
 class Source:
-    """One stream: its batches, its gate, its last verdict."""
+    """Input stream with its batches, gate and last verdict."""
 
-    carry = 0  # Seconds for which the last reading stands
+    carry = 0  # Seconds for which the last reading stays valid
 
     def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
         self.kind, self.name, self.batches, self.gate = kind, name, batches, gate
@@ -198,14 +198,14 @@ class Source:
         return next(reversed(self.batches.batches.values()), None)
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
-        """Return whether this source was still in a second in which, by the IMUs, the aircraft `moved`.
+        """Return whether this source was still in a second; `moved`: the IMUs saw a movement in it.
 
-        `may_move`: only a fault of the source counts against it.
+        `may_move`: only a fault of the source counts, not a movement.
         """
         batches = self.batches.batches
         batch = next((batches[at] for at in range(slot, slot - self.carry - 1, -1) if at in batches), None)
         if batch is None:
-            # Before the first whole second there is nothing to complain about.
+            # Before the first whole second, silence is no fault.
             words = f"{self.label} was silent for a second" if batches else ""
             self.verdict = GateVerdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
@@ -214,7 +214,7 @@ class Source:
         return self.verdict.still
 
     def accept(self, slot: int) -> None:
-        """Let the gate learn from a second in which every source was still."""
+        """Update the gate with a second in which every source was still."""
         if (batch := self.batches.batches.get(slot)) is not None:
             self.gate.accept(batch)
 
@@ -244,7 +244,7 @@ class Source:
 
 
 class ImuSource(Source):
-    """The stream of one IMU, with what is known of its device."""
+    """Input stream of one IMU, with its thermometer, raw means and turn counter."""
 
     gate: ImuGate
 
@@ -252,13 +252,13 @@ class ImuSource(Source):
         super().__init__("imu", imu.name, BatchSource(LIMITS_IMU, keep, steps=imu.steps), _gate(imu))
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
-        """Means that come beside a stream of integers, in floats."""
+        """Means in floats that arrive beside a stream of integers."""
         self._raw_count = 0
         self.counter: TurnCounter | None = None  # Set while turns on a spot are counted
         self._breaks = 0
         self._restarted_s = -math.inf
         self._up: tuple[float, float] | None = None
-        """A time, and the time since power-up by then, where the device tells."""
+        """Host time and the time since power-up then, if the device reports it."""
 
     def replace(self, imu: ImuInput) -> None:
         self.imu, self.gate, self.batches.steps = imu, _gate(imu), imu.steps
@@ -319,7 +319,7 @@ def _gate(imu: ImuInput) -> ImuGate:
 
 
 class PoseSource(Source):
-    """The two channels of a gradienter, or the heading of a compass, in degrees."""
+    """Input stream of a gradienter (two channels) or of a compass (heading), in degrees."""
 
     carry = 2  # a slow gradienter or compass
 
@@ -329,7 +329,7 @@ class PoseSource(Source):
         super().__init__(kind, kind, batches, PoseGate(kind))
         self._settling = Settling(0.0, 1.0) if model is None else Settling(model.lag_s, model.sigma_deg)
         self._unsettled: deque[int] = deque(maxlen=keep)
-        """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
+        """Seconds in which it still settled; they count for other sources, but not for its own mean."""
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
         if not self._settling.judge(slot, moved=moved):
@@ -345,7 +345,7 @@ class PoseSource(Source):
         return [batches[slot] for slot in slots if slot in batches and slot not in unsettled]
 
     def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
-        """Say how long its mean over these seconds and the next `left_s` has to wait after a movement, if at all."""
+        """Describe the wait until its mean over these and the next `left_s` seconds has settled; None: no wait."""
         unsettled = sum(slot in self._unsettled for slot in slots)
         needed -= len(slots) - unsettled
         wait_s = self._settling.left_s + needed

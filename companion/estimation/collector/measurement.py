@@ -1,10 +1,10 @@
-"""Seconds from which windows are made, and the newest estimates of them: the interface, and that of the ground.
+"""Seconds of a window and the newest estimates of them: the interface, and its version for the ground.
 
-A stretch begins with `min_still_s` good seconds in a row. From then on up to 20 % of the seconds of a window may be
-rejected (a gust, a knock), for which the mean is robust. More than three in a row end it: the aircraft was moved.
+A stretch begins with `min_still_s` good seconds in a row. From then on, up to 20 % of a window's seconds may be
+rejected (a gust, a knock): the mean is robust. More than three in a row end it: the aircraft was moved.
 
-Choosing the seconds of a window costs a small part of working it out. Estimates are kept while they are of use; one
-that is due can be packed up and worked out in another thread.
+Choosing the seconds of a window costs far less than the estimate. Estimates are cached; `Work` computes a new one in
+another thread.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Floats
 
 MIN_BATCHES: Final = 5
-"""Seconds of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
+"""Least seconds of a window requested with `since_s`: fewer do not show their own scatter."""
 MAX_REJECTED: Final = 0.20
 MAX_REJECTED_RUN: Final = 3
 _NO_ROOM: Final = 1e-300
 
 
 class Work(NamedTuple):
-    """An estimate that is due, of ascending slots, none before `since_s` where that was asked for.
+    """Estimate to compute over ascending `slots`, none before `since_s` if that is given.
 
-    `run` returns the estimate, or the refusal that says why there is none; another thread may call it.
+    `run` returns the estimate, or a refusal with the reason; another thread may call it.
     """
 
     slots: Sequence[int]
@@ -46,11 +46,11 @@ class Work(NamedTuple):
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """Parts of a window; nothing in it changes later.
+    """Input of a window; immutable.
 
-    `slots` are good seconds, ascending, at least one; those of the gradienter and the compass that count are `tilt` and
-    `heading`, None without the sensor. `begun_s`: time of power-up by IMU, where it is known. `estimate` returns the
-    estimates of the IMUs, or the whole window, or a `CalibrationRefusedError`.
+    `slots`: good seconds, ascending, at least one. `tilt` and `heading`: seconds that count of gradienter and compass,
+    None without the sensor. `begun_s`: time of power-up by IMU, if known. `estimate` returns the estimates of the IMUs,
+    or the whole window, or a `CalibrationRefusedError`.
     """
 
     slots: Sequence[int]
@@ -65,7 +65,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     turn: Turn = Turn()
 
     def window(self) -> Window:
-        """Work it out; takes milliseconds.
+        """Compute the window; takes milliseconds.
 
         Raises:
             CalibrationRefusedError: a source fails its checks.
@@ -95,18 +95,18 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WindowSource(ABC):
-    """The seconds that count, and the newest estimates: of all of them, and of one other window."""
+    """Chooses the seconds that count, and caches the newest estimates: of all of them, and of one other window."""
 
     may_move = False
-    """True: only faults of a source count against a second, no movement."""
+    """True: a second is rejected for faults of a source only, not for a movement."""
 
     def __init__(self) -> None:
         self._kept: dict[float | None, tuple[int, Any]] = {}
-        self.generation = 0  # Number of the stretch that is under way
+        self.generation = 0  # Number of the current stretch
 
     @abstractmethod
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
-        """Add an IMU with its seconds and those of means beside it, or begin anew: its stream is another now."""
+        """Add an IMU with its seconds and those of its raw means, or restart it when its stream changes."""
 
     def set_pose(self, kind: str, batches: BatchSource) -> None:  # noqa: B027 - not every source of windows needs it
         """Add the seconds of a pose sensor."""
@@ -126,7 +126,7 @@ class WindowSource(ABC):
     def stillness(self) -> CollectorStatus: ...
 
     def good_slots(self, since_s: float | None) -> list[int]:
-        """Return the seconds that count of those that wait for a pose sensor to settle."""
+        """Return the good seconds; the check whether a pose sensor has settled uses them."""
         return []
 
     @abstractmethod
@@ -134,7 +134,7 @@ class WindowSource(ABC):
         """Return the seconds of a window.
 
         Raises:
-            CalibrationRefusedError: too few.
+            CalibrationRefusedError: too few seconds.
         """
 
     @abstractmethod
@@ -142,14 +142,14 @@ class WindowSource(ABC):
 
     @abstractmethod
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
-        """Return the progress of the newest estimate towards good enough; `waits`: something is in the way."""
+        """Return the progress of the newest estimate towards its targets; `waits`: an obstacle exists."""
 
     def clear(self) -> None:
         self._kept.clear()
         self.generation += 1
 
     def known(self, last: int, since_s: float | None) -> Any:
-        """Return the estimate of a window that ends with that second or a later one; None if there is none yet."""
+        """Return the cached estimate if its window ends with second `last` or later; None: not yet."""
         kept = self._kept.get(since_s)
         return kept[1] if kept is not None and kept[0] >= last else None
 
@@ -161,7 +161,7 @@ class WindowSource(ABC):
         return None if self.known(slots[-1], since_s) is not None else self.work(slots, since_s)
 
     def accept(self, work: Work, found: Any) -> bool:
-        """Keep what the work has found; return False if it comes too late."""
+        """Cache the result `found` of the work; return False if it comes too late."""
         if work.generation != self.generation:
             return False
         self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
@@ -169,12 +169,12 @@ class WindowSource(ABC):
         return True
 
     def measurement(self, since_s: float | None) -> Measurement:
-        """Return what a window is made of, without the pose; raises as `slots`."""
+        """Return the input of a window, without the pose; raises as `slots`."""
         slots = self.slots(since_s)
         return Measurement(slots=slots, estimate=self.estimate_later(slots, since_s))
 
     def estimate_later(self, slots: Sequence[int], since_s: float | None, late: int = 0) -> Callable[[], Any]:
-        """Return a call that works out the estimate of what is known now, unless one at most `late` s old is known."""
+        """Return a call that computes the estimate over `slots`, or gives a cached one that is at most `late` s old."""
         found = self.known(slots[-1] - late, since_s)
         if found is not None:
             return lambda: found
@@ -189,7 +189,7 @@ class WindowSource(ABC):
 
 
 class Stretch:
-    """Counts good and rejected seconds, and knows where the still stretch begins."""
+    """Counts good and rejected seconds, and finds the start of the still stretch."""
 
     def __init__(self, min_good: int, max_slots: int) -> None:
         self._min_good = min_good
@@ -205,7 +205,7 @@ class Stretch:
         self._steady = 0
 
     def add(self, slot: int, *, good: bool) -> bool:
-        """Add the next second; False when the stretch ends with it."""
+        """Add the next second; return False if the stretch ends with it."""
         self._steady = self._steady + 1 if good else 0
         self.flags.append(good)
         if good:
@@ -268,14 +268,14 @@ class GroundWindows(WindowSource):
         )
 
     def good_slots(self, since_s: float | None) -> list[int]:
-        """Return the good seconds of the stretch under way that lie wholly after `since_s`."""
+        """Return the good seconds of the current stretch that lie wholly after `since_s`."""
         first = -math.inf if since_s is None else since_s
         flags = self._stretch.flags
         return [slot for slot, good in enumerate(flags, self._next - len(flags)) if good and slot >= first]
 
     def slots(self, since_s: float | None) -> list[int]:
         slots = self.good_slots(since_s)
-        # A stretch that has begun may have had up to a fifth rejected since.
+        # Up to a fifth of a stretch may have been rejected since it began.
         needed = self._least if since_s is not None else 1 if self._stretch.begun else self._min_good
         if len(slots) < needed:
             needed = self._min_good if since_s is None else self._least
@@ -283,7 +283,7 @@ class GroundWindows(WindowSource):
         return slots
 
     def work(self, slots: Sequence[int], since_s: float | None) -> Work:
-        # A window since some time shows whether new offsets are in use: raw readings would not.
+        # A window with `since_s` verifies that new offsets are in use, which raw readings do not show.
         with_raw = slots if since_s is None else ()
         streams = [
             (
@@ -304,7 +304,7 @@ class GroundWindows(WindowSource):
         return Work(slots, since_s, self.generation, run)
 
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
-        """Return the progress of the stretch, by an estimate that may be a second old."""
+        """Return the progress of the stretch, from an estimate that may be a second old."""
         stretch = self._stretch
         share = 0.0 if stretch.start is None else stretch.good / self._max_slots
         status = msgspec.structs.replace(self.stillness, progress=share, measuring=f"still for {stretch.good} s")
@@ -319,19 +319,19 @@ class GroundWindows(WindowSource):
 
 
 def is_enough(settings: Settings, found: Sequence[Estimate]) -> bool:
-    """Tell whether every axis meets its target, or its white part is below 30 % of the part that stays (method 3.2)."""
+    """Return whether every axis meets its target, or its white part is below 30 % of the rest (method 3.2)."""
     return all(bool((each.white_variance <= _room(settings, each)).all()) for each in found)
 
 
 def expected_s(settings: Settings, found: Sequence[Estimate]) -> int:
-    """Return the good seconds after which it is expected to be enough, the noise staying as seen so far."""
+    """Predict the number of good seconds that is enough, if the noise stays as seen so far."""
     needed = [np.square(each.white) / np.maximum(_room(settings, each), _NO_ROOM) for each in found]
     longest = max((float(each.max()) for each in needed), default=0.0)
     return min(max(math.ceil(min(longest, settings.max_s)), settings.min_slots), settings.max_slots)
 
 
 def _room(settings: Settings, own: Estimate) -> Floats:
-    """Return the variance that white noise may leave in each axis; below zero for integers that are waited for."""
+    """Return the allowed white variance of each axis; negative for integers that need more seconds."""
     target = np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
     stays = own.use_variance - own.white_variance
     room = np.maximum(np.square(target) - stays, WHITE_SHARE * stays)

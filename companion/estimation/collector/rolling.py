@@ -1,7 +1,7 @@
-"""The rolling collector: every stream in, one window out.
+"""Rolling collector: combines all streams into one window.
 
-It knows no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
-when every source was still in it. Method 2.4, 3.1 and 3.2.
+It has no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
+if every source was still in it. Method 2.4, 3.1 and 3.2.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from companion.estimation.turning.watch import TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 _GRACE_S: Final = 1.0
-"""Time for which a second waits after its end for a silent source: the latency of a busy telemetry link."""
+"""Time to wait after the end of a second for a silent source: the latency of a busy telemetry link."""
 _CLOSE_S: Final = 0.25
 _MARGIN: Final = 8
 
@@ -43,9 +43,9 @@ _MARGIN: Final = 8
 class RollingCollector:
     """Collects batches of all sources, judges stillness, and gives means of the seconds that count.
 
-    Nothing that a sample holds makes it raise; samples that are dropped are counted by reason. Memory is bounded:
-    `max_s` and a margin of one-second batches a source. A model that is None: no such sensor. `windows`: which seconds
-    count; None: those of the still stretch.
+    No sample value raises an exception; dropped samples are counted by reason. Memory is bounded to `max_s` one-second
+    batches per source, plus a margin. A model of None: no such sensor. `windows` chooses the seconds that count; None:
+    those of the still stretch.
 
     Raises:
         ValueError: two IMUs of one name.
@@ -75,7 +75,7 @@ class RollingCollector:
         self._now_s = -math.inf
         self._restarts = 0
         self.on_second: list[Callable[[], object]] = []
-        """Callbacks for every second closed by all sources; they run inside that call, so they only take note."""
+        """Callbacks after each second closed by all sources; called while samples are added, so they must be quick."""
         for imu in imus:
             self.set_imu(imu)
 
@@ -93,7 +93,7 @@ class RollingCollector:
     def add_raw(self, name: str, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
         """Add a mean in floats (gyro in rad/s, accelerometer in m/s^2) of an IMU whose stream is integers.
 
-        Stillness is judged by the stream alone. Of a window the means count where they know the gyros better.
+        Stillness is judged by the stream alone. A window uses these means if they determine the gyros better.
         """
         if name in self.imus:
             self.imus[name].add_raw(t_s, row, temperature_degc)
@@ -106,14 +106,14 @@ class RollingCollector:
             self._evaluate()
 
     def add_compass(self, sample: CompassSample) -> bool:
-        """Add one heading of the device's own; return whether it counts (else that from its field does)."""
+        """Add a heading that the device computed; return whether it is used (else the one from its field)."""
         counts = self._field is None or self._field.takes_own(sample)
         if counts:
             self._add_heading(sample)
         return counts
 
     def add_field(self, sample: MagSample) -> CompassSample | None:
-        """Add the compass' field; return the heading from it, where that is the one that counts."""
+        """Add the compass' field; return the heading computed from it if that one is used."""
         if self._heading is None or self._field is None:
             return None
         heading = self._field.add(sample)
@@ -127,9 +127,9 @@ class RollingCollector:
             self._evaluate()
 
     def tick(self, now_s: float) -> None:
-        """End the seconds that are over at `now_s` (the samples' clock), also of silent sources.
+        """Close the seconds that ended before `now_s` (the samples' clock), also for silent sources.
 
-        The feeder calls it a few times a second.
+        The caller does this a few times a second.
         """
         if math.isfinite(now_s):
             self._now_s = now_s
@@ -144,14 +144,14 @@ class RollingCollector:
     # --- what changes
 
     def set_imu(self, imu: ImuInput) -> None:
-        """Add an IMU, or replace it when its stream changes kind: all that was learned of it is forgotten."""
+        """Add an IMU, or replace it when its stream changes kind; all learned data of it is dropped."""
         name, known = imu.name, self.imus.get(imu.name)
         self._turns.set_imu(name, imu.rotation, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         if known is None:
             self.imus[name] = source = ImuSource(imu, self._keep)
             source.batches.believed = self.thermometers[name].believed
             self._windows.set_imu(imu, source.batches, source.raw)
-            # It has no share in the seconds so far.
+            # The seconds so far lack its samples.
             self._break()
         else:
             known.replace(imu)
@@ -159,7 +159,7 @@ class RollingCollector:
             self.reset("another stream", name)
 
     def expect(self, *, gradienter: bool, compass: bool) -> None:
-        """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
+        """Choose the pose sensors to wait for, for example after one failed; keep the IMUs' history."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)
         if gradienter != (self._tilt is not None):
             self._tilt = self._pose_source("gradienter") if gradienter else None
@@ -182,9 +182,9 @@ class RollingCollector:
         )
 
     def reset(self, why: str, imu: str | None = None) -> None:
-        """Forget what was measured, of one IMU or of everything: armed, offsets written, restarted.
+        """Drop the readings of one IMU, or all: after arming, a write of offsets, or a restart.
 
-        The second under way is forgotten too. The stretch begins again; learned noise stays.
+        The current second is dropped too. The stretch begins again; learned noise stays.
         """
         self._windows.forget(imu)
         for source in self._sources():
@@ -221,18 +221,18 @@ class RollingCollector:
         return None if self._tilt is None else self._tilt.newest
 
     def glance(self, now_s: float) -> CollectorStatus:
-        """Return the stillness without an estimate; costs a small part of what `status` does."""
+        """Return the status without an estimate, at a fraction of the cost of `status`."""
         return msgspec.structs.replace(self._windows.stillness, obstacle=self._obstacle(now_s))
 
     def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
-        """Return what `window` would have to work out now, for another thread; None when there is nothing."""
+        """Return the estimate that `window` would compute now, for another thread; None if it has none to compute."""
         return None if self._obstacle(now_s) is not None else self._windows.pending(since_s)
 
     def accept(self, work: Work, found: Any) -> None:
         self._windows.accept(work, found)
 
     def status(self, now_s: float) -> CollectorStatus:
-        """Return the state; its figures may be those of the second before."""
+        """Return the state; its figures may be one second old."""
         waits = self._waiting_for(now_s)
         found = self._windows.status(self._settings, waits=waits is not None)
         obstacle = waits or found.obstacle
@@ -248,8 +248,8 @@ class RollingCollector:
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
         """Return means over the seconds that count up to the latest complete one, at most `max_s` long.
 
-        Of seconds that lie wholly after `since_s`, for the effect of a write, 5 good ones are enough; `duration_s`
-        says how many there were.
+        With `since_s` (to verify a write), only seconds that lie wholly after it count, and 5 good ones are enough;
+        `duration_s` is their number.
 
         Raises:
             CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
@@ -257,7 +257,7 @@ class RollingCollector:
         return self.measurement(now_s, since_s=since_s).window()
 
     def measurement(self, now_s: float, *, since_s: float | None = None) -> Measurement:
-        """Return what `window` is made of, not worked out yet; costs a small part of it.
+        """Return the input of `window` before the estimate, at a fraction of its cost.
 
         Raises:
             CalibrationRefusedError: not still, or not still for long enough.
@@ -294,11 +294,11 @@ class RollingCollector:
             source.gate.new_stretch()
 
     def _evaluate(self) -> None:
-        """Judge every second that all sources have closed, or that has waited long enough for the missing ones."""
+        """Judge every second that all sources have closed, or whose wait for missing sources is over."""
         sources = self._sources()
         restarts = sum(source.batches.restarts for source in sources)
         if restarts > self._restarts:
-            # Seconds that were good have lost a share.
+            # A part of the good seconds has been dropped.
             self._break()
         self._restarts = restarts
         known = [slot for source in sources if (slot := source.batches.closed_through) is not None]
@@ -311,11 +311,11 @@ class RollingCollector:
             return
         last = int(ready)
         if self._next is None or max(known) < self._next - self._keep:
-            # The beginning, or every clock went back.
+            # Start, or all clocks went back.
             self._break()
             self._next = min(last, *known)
         if last - self._next > self._keep:
-            # Nobody closed anything for so long that no second is left.
+            # No source closed a second for so long that no second is left.
             self._break()
             self._next = last - 1
         if last < self._next:
@@ -327,9 +327,9 @@ class RollingCollector:
             notify()
 
     def _judge(self, slot: int, sources: list[Source]) -> None:
-        # Every gate sees every second: one that is skipped learns nothing.
+        # Show every second to every gate: a skipped gate learns nothing.
         good, moved = True, False
-        for source in sources:  # the IMUs first: they say whether it moved
+        for source in sources:  # the IMUs first: they detect a movement
             good = source.judge(slot, moved=moved, may_move=self._windows.may_move) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
         if not self._windows.add(slot, good=good):
@@ -341,7 +341,7 @@ class RollingCollector:
                 source.accept(slot)
 
     def _watch_turn(self, slot: int, *, good: bool) -> bool:
-        """Look for a turn in a judged second; False where the still stretch ends with it."""
+        """Check a judged second for a turn; return False if the still stretch ends with it."""
         others = self._others()
         if self._windows.may_move or any(verdict.fault for verdict in others):
             return True

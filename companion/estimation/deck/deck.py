@@ -1,7 +1,6 @@
-"""The seconds of an aircraft on a deck, which sways and turns, beside those of the ground.
+"""Source of windows for an aircraft on a deck, which sways and turns (`collector.measurement` has that for the ground).
 
-The seconds of an IMU must follow one another without a gap: a gyro that was silent for a while has turned by an unknown
-angle.
+The seconds of an IMU must follow one another without a gap: during a gap, the gyro turns by an unknown angle.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS
 
 EVERY_S: Final = {180: 10, 600: 30, MAX_S: 60}
-"""Interval at which windows end, by their length up to which it holds: long estimates cost more and change less."""
+"""Interval between ends of windows, by the largest window length, s: long estimates cost more and change less."""
 KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
-"""Seconds kept: a window that is the latest until the next one may begin with the first of them."""
+"""Seconds kept: enough for the longest window until the next one replaces it."""
 LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
-_KEPT_SHOWN: Final = 4  # Seconds that wait for the gradienter's readings
+_KEPT_SHOWN: Final = 4  # Seconds kept to wait for the gradienter's readings
 _FALLS: Final = 2.5
-"""Assumed exponent of the white part's decay with the length of a window, to predict the length that suffices.
+"""Assumed exponent of the white part's decay with window length, to predict the length that is enough.
 
 A compromise: 3 for a slope through waves, 1 for a sensor's white noise.
 """
@@ -52,7 +51,7 @@ _IN_MINUTES_S: Final = 90.0
 
 
 class Stream:
-    """One IMU's seconds without a gap, beside the gradienter."""
+    """Seconds of one IMU without a gap, compared with the gradienter."""
 
     def __init__(self, imu: ImuInput, gradienter: GradienterModel | None) -> None:
         self.imu, self._gradienter = imu, gradienter
@@ -101,13 +100,13 @@ class Stream:
     def _in_vehicle(self, rows: Floats) -> Floats:
         imu = self.imu
         if imu.steps is not None:
-            # Toward zero: on a platform that moves by more than a step, half a step was cut off.
+            # Truncation toward zero: with motion of more than a step, half a step is lost on average.
             rows = rows + np.sign(rows) * imu.steps / 2.0
         return np.hstack([rows[:, :3] @ imu.rotation.T, rows[:, 3:] @ imu.rotation.T])
 
 
 class Deck(WindowSource):
-    """Collects what `DeckWindow` needs. Pure: time comes in with the samples."""
+    """Collects the input of `DeckWindow`. Pure: time comes in with the samples."""
 
     may_move = True
 
@@ -120,7 +119,7 @@ class Deck(WindowSource):
         self._headings: dict[int, float] = {}
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
         self._reference_deg: tuple[float, float] | None = None
-        """Tilt at which the last accelerometer means were given, to compare those after a write with."""
+        """Tilt of the last accelerometer means, to which those after a write are converted for comparison."""
         self._is_good = True
 
     def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
@@ -141,7 +140,7 @@ class Deck(WindowSource):
         self.clear()
 
     def new_stretch(self) -> None:
-        """Do nothing: a movement ends nothing here."""
+        """Do nothing: a movement does not end a window on a deck."""
 
     def add(self, slot: int, *, good: bool) -> bool:
         self._is_good = good
@@ -177,7 +176,7 @@ class Deck(WindowSource):
         return CollectorStatus(still_s=seconds, steady_s=seconds, good_now=self._is_good)
 
     def common(self, since_s: float | None = None) -> range:
-        """Return the seconds of all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
+        """Return the seconds common to all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
         ends = [(one.seconds[0][0].slot, one.seconds[-1][0].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)
@@ -256,7 +255,7 @@ class Deck(WindowSource):
 def aim(span_s: float, known: TriadVariances, target: float) -> tuple[float, float, float]:
     """Return sigma, goal and the predicted length of the window that reaches the goal, s.
 
-    The goal is the target, or all that more time can give. `known` is from a window of `span_s` seconds.
+    The goal is the target, or the best that more time can reach. `known` is from a window of `span_s` seconds.
     """
     use, white = known
     floor = use - white

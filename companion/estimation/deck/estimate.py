@@ -1,6 +1,6 @@
-"""Estimate of a window on a deck: the same `Window` as on the ground, so that everything after it is one path.
+"""Estimate of a window on a deck, as the `Window` type of the ground, so that later steps need no distinction.
 
-An IMU's means are those it would have at rest: at the gradienter's mean tilt, under the Earth's rate alone.
+The means of an IMU are converted to rest: at the gradienter's mean tilt, under the Earth's rate alone.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
 
 MIN_S: Final = 60
-"""Some waves: a shorter window is never enough."""
+"""Length of some waves: a shorter window is never enough."""
 MIN_LOOK_S: Final = 40
-"""Shortest window after a write; its sigma says how little that tells."""
+"""Shortest window to verify a write; its sigma reflects the short time."""
 MAX_S: Final = 1200
 SCALE_SIGMA: Final = 0.003
-"""Scale and cross-axis errors of common gyros (0.5 % at the most): so much of a steady turn may pass for a bias."""
+"""Scale and cross-axis errors of common gyros (at most 0.5 %): this share of a steady turn looks like a bias."""
 COMPASS_SHARE: Final = math.sqrt(0.5)
-"""Part of a compass' sigma that changes with the heading; the rest is the same on all headings."""
+"""Share of a compass' sigma that changes with the heading; the rest is the same on all headings."""
 FROZEN_S: Final = 20
-"""A sensor that is swayed does not repeat one reading for so long."""
+"""Time after which a repeated reading of a swaying sensor is a fault."""
 _SWAYS_RAD_S: Final = 0.3 * DEG  # Least scatter of the rates of roll and pitch in that time
 _SAME: Final = 1e-9
 _SPREAD: Final = 1.5
-"""Integers spread over so many steps by the swaying hide nothing."""
+"""Standard deviation, in steps, beyond which swaying spreads integers enough to hide no bias."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
-"""Sigma of the comparison with the gradienter; the error of its zero turns everything alike and comes in `solve`."""
+"""Sigma of the comparison with the gradienter; `solve` adds the error of its zero, which is common to all IMUs."""
 _MIDDLE: Final = 0.37  # Share of K^2 T
 _FLICKER_TO_COME: Final = 0.75
-"""Share of B^2: flicker of the next minutes that its past does not tell. Together with the flicker in the window, a
-random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
+"""Share of B^2 for the flicker of the next minutes, which its past does not predict. Added to the flicker within the
+window (a random walk of B / sqrt(T)), it makes the flicker's part of V(T, H)."""
 _GRAVITY_M_S2: Final = 9.8
 
 
@@ -55,7 +55,7 @@ TriadVariances = tuple[float, float]
 
 
 DeckFound = tuple[Window, Sequence[TriadVariances]]
-"""A window, and how far it is: gyros and accelerometers of one IMU after another."""
+"""A window, and the variances of gyros and accelerometers, IMU by IMU."""
 ImuSecond = tuple[Batch, Passage]
 """One second of one IMU; the batch is in the sensor's axes."""
 
@@ -73,10 +73,10 @@ class DeckWindow:
     compass: CompassModel | None
     horizon_s: float
     reference_deg: tuple[float, float] | None
-    """The tilt to give the accelerometers' means at, as the gradienter reads it; None: the mean of the window."""
+    """Tilt, in gradienter readings, to which accelerometer means are converted; None: the mean of the window."""
 
     def run(self) -> DeckFound | CalibrationRefusedError:
-        """Work it out: a third of a second for ten minutes of one IMU on a desktop."""
+        """Compute the estimate: a third of a second for ten minutes of one IMU on a desktop."""
         try:
             return self._run()
         except (CalibrationRefusedError, np.linalg.LinAlgError) as error:
@@ -115,10 +115,10 @@ class DeckWindow:
         return window, [known for _, triads, _ in found for known in triads]
 
     def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
-        """Return the seconds in which a sensor repeated one reading while it was swayed.
+        """Return the seconds in which a sensor repeated one reading while the aircraft swayed.
 
         Raises:
-            CalibrationRefusedError: it still does.
+            CalibrationRefusedError: it still repeats that reading.
         """
         if not readings:
             return set()
@@ -156,7 +156,7 @@ class DeckWindow:
         going_on = np.square(found.ramp_rad_s2 * self.horizon_s / 2.0) / 3.0
         gyro, accel = imu.profile.gyro, imu.profile.accel
         to_come = _FLICKER_TO_COME * gyro.flicker**2 + gyro.walk**2 * self.horizon_s / 3.0
-        # A random walk can be followed and flicker cannot: never better than a mean at rest.
+        # The smoother follows a random walk, but not flicker: never claim more than a mean at rest.
         at_rest = float(floor_variance(gyro.flicker, gyro.walk, span_s, self.horizon_s))
         gyro_floor = np.maximum(to_come, at_rest - np.diag(gyro_own))
         gyro_floor = gyro_floor + steps[:3] + going_on + (SCALE_SIGMA * mean_rate) ** 2
@@ -182,10 +182,10 @@ class DeckWindow:
             drifting=drifting(imu.name, np.append(found.ramp_rad_s2, np.zeros(3)), temperatures),
             named=imu.profile.is_named,
             covariance=covariance,
-            # Of its level axes: along the heading, to the right of it, and down.
+            # Columns in level axes: along the heading, to the right of it, and down.
             by_earth=found.by_earth @ body_from_ned(0.0, 0.0, heading_rad).T,
         )
-        # A slope, weighed most in its middle, misses some of a bias that walks: no averaging takes that away.
+        # A slope weighs the middle most and misses part of a walking bias: averaging does not reduce that.
         walked = _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
         gyros = float(use[:3].max() ** 2), max(float(np.diag(gyro_own).max()) - walked, 0.0)
         return window, (gyros, (float(use[3:].max() ** 2), float(np.diag(own).max()))), found
@@ -229,7 +229,7 @@ class DeckWindow:
 
 
 def followed_walk(gyro: AllanModel, span_s: float) -> float:
-    """K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)."""
+    """Return K of a random walk that wanders as much as the bias in a window of `span_s`, rad/s / sqrt(s)."""
     return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
 
 
@@ -239,7 +239,7 @@ def _felt(
     reference: tuple[float, float] | None,
     compared: tuple[Array, Matrix] | None,
 ) -> tuple[Array, Matrix]:
-    """Return the accelerometers' mean at rest at the reference's tilt, (3,), and its covariance (3, 3)."""
+    """Return the accelerometers' mean (3,) at rest at the reference tilt, and its covariance (3, 3)."""
     size = found.force_m_s2
     if gradienter is None or reference is None or compared is None:
         up = -found.body_to_ned[:, 2].mean(axis=0)
@@ -253,7 +253,7 @@ def _felt(
 
 
 def _hidden_steps(imu: ImuInput, batches: Sequence[Batch]) -> Array:
-    """Return the variance (6,) that integers hide where the swaying does not spread them, and that of shared errors."""
+    """Return the variance (6,) of quantisation that swaying does not spread, plus that of shared errors."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
     means = np.array([batch.mean for batch in batches])
     spread = np.sqrt(means.var(axis=0) + np.mean([batch.variance for batch in batches], axis=0))

@@ -1,14 +1,14 @@
-"""Minutes of a swaying, turning IMU against what is known of its surroundings: gyro biases and the mean of "up".
+"""Smoother: gyro biases and the mean of "up" from minutes of a swaying, turning IMU.
 
-The gyros, integrated from second to second, carry the attitude along. In the axes of the Earth the mean specific force
-is gravity: what waves do to it comes and goes (`waves`), so a level that drifts away is a bias of the horizontal gyros.
-The compass does the same for the vertical one. Everything is linear in what is unknown once the attitude is near, so it
-is weighted least squares, repeated until it is: that gives for constants what a Kalman smoother gives.
+The gyros, integrated from second to second, propagate the attitude. In the axes of the Earth, the mean specific force
+is gravity: the effect of waves averages out (`waves`), so a drifting level shows a bias of the horizontal gyros. The
+compass does the same for the vertical one. Near the true attitude everything is linear in the unknowns, so weighted
+least squares is iterated. For constant unknowns the result equals that of a Kalman smoother.
 
-Unknown: the attitude at the start (3), the gyro bias (3) and the error of the accelerometers' bias (3). Also the sine
-and cosine of the heading in the compass' error (2): iron carried along makes them. And a ramp of the gyro bias where
-one is plain to see (3). The Earth's rotation is taken off later, where the latitude is known;
-`by_earth` says what it has done to the bias.
+Unknowns: the attitude at the start (3), the gyro bias (3) and the error of the accelerometers' bias (3); the parts of
+the compass' error with the sine and cosine of the heading (2), which iron on the aircraft causes; and, if significant,
+a ramp of the gyro bias (3). The Earth's rotation is subtracted later, once the latitude is known; `by_earth` is its
+effect on the bias.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from companion.physics.frames import (
 )
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
-"""W cos L halfway between the equator and 65 degrees: the rest, once the latitude is known, is linear."""
+"""W cos L halfway between the equator and 65 degrees latitude: the remainder is small enough to be linear."""
 RAMP_T: Final = 5.0
-"""Sigmas from which on a ramp is believed, as at rest (`noise.lines`)."""
+"""Threshold in sigmas for a ramp, as at rest (`noise.lines`)."""
 _ROUNDS: Final = 7
-_NEAR: Final = 0.1  # Change of the biases in the last round, in sigmas
+_NEAR: Final = 0.1  # Convergence limit: change of the biases in the last round, in sigmas
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
 _UNKNOWNS: Final = 14
 _NO_RAMP: Final = 11
@@ -45,33 +45,33 @@ _NO_RAMP: Final = 11
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Believed:
-    """Priors, one sigma each; noise of the worst axis: N in SI * sqrt(s), K in rad/s / sqrt(s)."""
+    """Prior sigmas and noise of the worst axis: N in SI * sqrt(s), K in rad/s / sqrt(s)."""
 
-    accel_m_s2: Array  # (3,) of the accelerometers' bias, from the comparison with the gradienter
+    accel_m_s2: Array  # Accelerometer bias (3,), from the comparison with the gradienter
     accel_sigma_m_s2: float
     compass_sigma_rad: float  # Part of the compass' error that changes with the heading
     gyro_white: float  # N of the gyros, rad/s * sqrt(s): the largest of the axes
-    gyro_walk: float  # K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)
+    gyro_walk: float  # K of a random walk that wanders as much as the bias in the window, rad/s / sqrt(s)
     gyro_slope: float
-    """One sigma of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
+    """One sigma of the slope that flicker and random walk of the bias cause without a ramp; rad/s^2."""
     compass_lag_s: float
     accel_white: float  # N of the accelerometers, m/s^2 * sqrt(s)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Means over the window and attitudes; rates (3,) in the body's axes (FRD).
+    """Result of the smoother: means over the window and attitudes; rates (3,) in the body's axes (FRD).
 
-    `gyro_rad_s`: bias at the end of the window, were there no rotation of the Earth; with it, it is the bias and
-    `by_earth` (3, 3) times the Earth's rate (NED). `body_to_ned` (n + 1, 3, 3): at the knots; north is the compass'.
-    `heading_sigma_rad`: at the end, by averaging alone.
+    `gyro_rad_s`: bias at the end of the window, plus `by_earth` (3, 3) times the Earth's rate (NED). `body_to_ned`
+    (n + 1, 3, 3): attitudes at the knots, from the compass' north. `heading_sigma_rad`: at the end of the window, from
+    averaging alone.
     """
 
     gyro_rad_s: Array
-    gyro_covariance: Matrix  # (3, 3) of that
+    gyro_covariance: Matrix  # (3, 3) of `gyro_rad_s`
     by_earth: Matrix
-    ramp_rad_s2: Array  # (3,) zero where none is plain
-    turn_rad_s: Array  # (3,) how fast it turned on the mean
+    ramp_rad_s2: Array  # (3,) slope of the gyro bias; zero if not significant
+    turn_rad_s: Array  # (3,) mean rate of the platform
     force_m_s2: float  # Mean specific force along the vertical, up
     force_sigma_m_s2: float
     body_to_ned: Floats
@@ -89,7 +89,7 @@ class _Stretch:
 
     @property
     def rate(self) -> Array:
-        """(3,) the mean by the gyros, with their bias: swaying comes back."""
+        """Mean gyro rate (3,), bias included; swaying averages out."""
         whole = self.turn.sum(axis=0)
         turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
         return np.asarray(turned / self.spans.sum())
@@ -100,18 +100,18 @@ class _Stretch:
         return np.asarray(earth @ running_products(np.concatenate([start[None], steps])))
 
     def forces(self, attitudes: Floats, gyro: Array, accel: Array) -> Floats:
-        """(n, 3) mean specific force of every passage, NED."""
-        # The second order in the bias of gravity's own part: 0.6 mg at 3 deg/s.
+        """Return the mean specific force (n, 3) of every passage, NED."""
+        # Second-order effect of the bias on gravity: 0.6 mg at 3 deg/s.
         bent = np.cross(gyro, np.cross(gyro, self.velocity)) * np.square(self.spans[:, None]) / 6.0
         felt = self.velocity + self.by_bias @ gyro + bent - self.turned @ accel
         return np.asarray(np.einsum("nij,nj->ni", attitudes[:-1], felt) / self.spans[:, None])
 
 
 def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
-    """Work it out, of at least ten passages, one after another without a gap.
+    """Estimate biases and attitudes from at least ten consecutive passages without a gap.
 
-    `headings_rad` (n,) are the compass' over the middle of each, NaN where there is none; `compass_forward` (3,) is its
-    forward axis in the vehicle's.
+    `headings_rad` (n,): compass heading in the middle of each passage, NaN if missing. `compass_forward` (3,): forward
+    axis of the compass in the vehicle's axes.
     """
     stretch = _Stretch(passages)
     known = headings_rad[np.isfinite(headings_rad)]
@@ -136,7 +136,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         values, covariance, by_earth = system.solve(system.noise(ramping[0]), believed, _UNKNOWNS)
         bias, ramp = bias + values[_GYRO], values[_RAMP]
     force, force_sigma = _mean_up(-forces[:, 2], stretch.spans, believed.accel_white)
-    # What the Earth was taken to do beforehand is put back: `by_earth` is of all of it.
+    # Add back the assumed Earth rate: `by_earth` is the effect of the whole rate.
     bias = bias + by_earth[_GYRO] @ np.array([EARTH_RATE_NORTH_RAD_S, 0.0, 0.0])
     return Found(
         gyro_rad_s=bias,
@@ -152,9 +152,9 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
 
 
 def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Array:
-    """(3,) near enough for what is linear only near by: swaying comes back, and how far it turns the compass says.
+    """Return a coarse bias (3,), close enough to linearise: swaying averages out, and the compass gives the turn.
 
-    A firmware's own calibration on a boat leaves degrees a second.
+    A firmware's own calibration on a boat can leave a bias of several deg/s.
     """
     known = np.isfinite(headings_rad)
     if known.sum() < 2:
@@ -200,7 +200,7 @@ class _System:
     def solve(
         self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int
     ) -> tuple[Array, Matrix, Matrix]:
-        """Solve by least squares, weighted by the noise, without it by a guess; return values, covariance, by Earth."""
+        """Solve by least squares, weighted by `noise` (None: a guess); return values, covariance, effect of Earth."""
         wander = believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3
         level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
         # (3, n, unknowns + 4): the readings are the last column.
@@ -215,12 +215,12 @@ class _System:
         priors[_ACCEL] = believed.accel_sigma_m_s2**-2
         priors[_COMPASS] = max(believed.compass_sigma_rad, 1e-6) ** -2
         information[diagonal] += priors[:unknowns]
-        # Units from rad/s^2 to rad: scaled, so that nothing is lost.
+        # Units range from rad/s^2 to rad: scale them to keep precision.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
         covariance = np.linalg.inv(information * np.outer(scale, scale) + 1e-12 * np.eye(unknowns)) * np.outer(
             scale, scale
         )
-        # The waves' own terms are fitted too: what few rows leave is widened by what was spent on them.
+        # The wave model's terms are fitted too: widen the covariance by the degrees of freedom they use.
         spent = unknowns + len(level.terms) + len(heading.terms)
         covariance_found = covariance * (len(rows) / max(len(rows) - spent, len(rows) / 4.0))
         values = np.zeros(_UNKNOWNS)
@@ -236,11 +236,10 @@ class _System:
 
 
 def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
-    """The mean of a force that waves go through, and its sigma.
+    """Return the mean of a vertical force with waves in it, and its sigma.
 
-    What goes up comes down: not the acceleration of the waves but their height is a stationary series, and the mean
-    force is the bend of a parabola through it. Taken by itself the acceleration would have a power at zero frequency
-    that no sea has.
+    The height of waves is a stationary series, their acceleration is not modelled as one: that would give it a power at
+    zero frequency that no sea has. The mean force is the curvature of a parabola fitted to the height.
     """
     step, ends = float(spans.mean()), np.cumsum(spans) - spans.sum()
     height = np.cumsum(np.cumsum(up * spans)) * step
@@ -252,11 +251,11 @@ def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
 
 
 class Passage(NamedTuple):
-    """A second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning.
+    """One second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning.
 
-    `turn` (3, 3): from the body's axes at the end to those at the start, by the gyros. `turned` (3, 3): its integral
-    over the time, in s; a bias b turns the start by -turned @ b. `velocity_m_s` (3,): integral of the specific force in
-    the axes of the start, and `velocity_by_bias` (3, 3) its derivative by the gyro bias, m/s per rad/s. `white2`: N^2
+    `turn` (3, 3): from the body's axes at the end to those at the start, by the gyros. `turned` (3, 3): integral of
+    `turn` over time, in s; a bias b turns the start by -turned @ b. `velocity_m_s` (3,): integral of the specific force
+    in the axes of the start; `velocity_by_bias` (3, 3): its derivative by the gyro bias, m/s per rad/s. `white2`: N^2
     of the gyros from second differences of neighbouring samples, mean of the axes.
     """
 
@@ -269,11 +268,11 @@ class Passage(NamedTuple):
 
 
 def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
-    """Integrate n + 1 samples, of which the first was the last one of the passage before (trapezoids).
+    """Integrate n + 1 samples by trapezoids; the first sample is the last one of the previous passage.
 
     Times (n + 1,) ascend, n is at least 1; rates and forces are (n + 1, 3) in the body's axes. Rates are integrated as
-    rotations, so that coning and sculling are in the result and not in its error (Forster, Carlone, Dellaert,
-    Scaramuzza, IEEE Trans. Robotics 33(1), 2017, section VI).
+    rotations, so that the result includes coning and sculling (Forster, Carlone, Dellaert, Scaramuzza, IEEE Trans.
+    Robotics 33(1), 2017, section VI).
     """
     steps = np.diff(times_s)
     rates = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0

@@ -1,12 +1,12 @@
 """Noise of waves: its autoregressive model, whitening of a series by it, and the comparison with the gradienter.
 
-Waves are narrow in frequency and average out far faster than white noise. A line through them is judged by what remains
-after prediction from the past. Burg's method as in Kay, Modern Spectral Estimation, 1988, section 7.3; whitening by a
-Kalman filter, which allows for gaps and the gyros' random walk of angle.
+Waves are narrow in frequency and average out far faster than white noise. The noise of a line through them is the
+residual of their prediction from the past. Burg's method as in Kay, Modern Spectral Estimation, 1988, section 7.3;
+whitening by a Kalman filter, which allows for gaps and the gyros' random walk of angle.
 
-The comparison of accelerometer and gradienter is by the gradienter's law and with the lag of its fluid. Both feel the
-same specific force, surge included: to first order their difference is the accelerometers' bias and the gradienter's
-zero. A wrong lag shows as a difference that goes with the slope of the tilt: one unknown more.
+The comparison of accelerometer and gradienter uses the gradienter's law and the lag of its fluid. Both measure the
+same specific force, surge included: to first order they differ by the accelerometers' bias and the gradienter's zero.
+A wrong lag causes a difference proportional to the slope of the tilt; it is estimated as one more unknown.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from companion.physics.gradienter import readings_from_up
 
 MOST_TERMS: Final = 12
 _LEAST_LEFT: Final = 1e-6
-"""Share of the variance below which a series is a line of the spectrum, beyond numerical precision."""
+"""Least share of the variance that prediction may leave; below it numerical precision ends (a pure spectral line)."""
 _DOUBLINGS: Final = 24
 
 
 class Waves(NamedTuple):
-    """x[k] = sum(terms[i] x[k - 1 - i]) + noise of that variance."""
+    """Autoregressive model: x[k] = sum(terms[i] x[k - 1 - i]) + noise of variance `variance`."""
 
     terms: Floats
     variance: float
 
 
 def fit_waves(series: list[Floats]) -> Waves:
-    """Fit one or more series of one spectrum (without means), the order by Akaike's corrected criterion."""
+    """Fit one model to series of the same spectrum, without means; Akaike's corrected criterion gives the order."""
     forward, backward = [s.copy() for s in series], [s.copy() for s in series]
     points = sum(len(s) for s in series)
     variance = sum(float(s @ s) for s in series) / max(points, 1)
@@ -98,7 +98,7 @@ def whitened(columns: Floats, waves: Waves, wander: tuple[float, float] = (0.0, 
             covariance -= gain * spread
         state = move @ state
         covariance = move @ covariance @ turned
-        # Covariances of narrow waves are near the numerical limit: an asymmetry would grow.
+        # Covariances of narrow-band waves are near the numerical limit: an asymmetry would grow.
         covariance = (covariance + covariance.T) / 2.0 + kick
     return found
 
@@ -112,16 +112,16 @@ def _stationary(move: Matrix, kick: Matrix) -> Matrix:
 
 
 class Level(msgspec.Struct, frozen=True):
-    """One second of gradienter and accelerometer; (2,) x and y in degrees, in the gradienter's axes."""
+    """One second of gradienter and accelerometer; x and y (2,) in degrees, in the gradienter's axes."""
 
     reading: Floats
     difference: Floats
-    """Gradienter minus what it would show by the accelerometer."""
-    slope: Floats  # Slope of what it would show, degrees a second
+    """Gradienter reading minus its prediction from the accelerometer."""
+    slope: Floats  # Slope of the predicted reading, deg/s
 
 
 class Fluid:
-    """Model of the gradienter's lag: the reading that it would show for the specific force at one IMU."""
+    """Model of the gradienter's lag: predicts its reading from the specific force at one IMU."""
 
     def __init__(self, model: GradienterModel) -> None:
         self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
@@ -129,7 +129,7 @@ class Fluid:
         self._shown = (0.0, 0.0)
 
     def follow(self, times_s: Floats, forces_m_s2: Floats) -> Floats:
-        """Return lagged readings (n, 2) for specific forces (n, 3), vehicle FRD; exact if these change linearly."""
+        """Return lagged readings (n, 2) for specific forces (n, 3), vehicle FRD; exact for forces linear in time."""
         felt = readings_from_up(self._law, forces_m_s2 @ self._turn)
         if self.lag_s <= 0.0:
             return felt
@@ -154,7 +154,7 @@ class Fluid:
 
 
 def level(times_s: Floats, shown_deg: Floats, tilt_times_s: Floats, tilts_deg: Floats) -> Level | None:
-    """Compare a second of what it would show (n, 2) and shows (m, 2); None where they do not overlap."""
+    """Compare a second of predicted (n, 2) and actual readings (m, 2); None if they do not overlap."""
     inside = (tilt_times_s >= times_s[0]) & (tilt_times_s <= times_s[-1])
     if not inside.any():
         return None
@@ -168,9 +168,9 @@ def level(times_s: Floats, shown_deg: Floats, tilt_times_s: Floats, tilts_deg: F
 
 
 def compare(levels: Sequence[Level]) -> tuple[Array, Matrix]:
-    """Return gradienter minus what it would show by the accelerometers over a window, and its covariance; degrees.
+    """Return the mean of gradienter minus prediction from the accelerometers, and its covariance; degrees.
 
-    Weighted by the waves that are left in it.
+    The residual waves determine the weights.
     """
     difference = np.array([one.difference for one in levels])
     slope = np.array([one.slope for one in levels])
@@ -184,7 +184,7 @@ def compare(levels: Sequence[Level]) -> tuple[Array, Matrix]:
             ]
         )
         regressors = rows[:, :3]
-        # A lag may be off by a second, not by more: that keeps it out of what stands still.
+        # The lag has a prior sigma of 1 s, so that it stays out of readings without motion.
         information = regressors.T @ regressors + np.diag([0.0, 0.0, 1.0])
         covariance = np.linalg.inv(information)
         x, y, lag = covariance @ (regressors.T @ rows[:, 3])

@@ -1,14 +1,14 @@
-"""Means of readings that were cut to integers toward zero, by maximum likelihood; in LSB, one column an axis.
+"""Means of readings truncated to integers toward zero, by maximum likelihood; in LSB, one column per axis.
 
-A truncated stream shows n for every value of [n, n + 1) LSB, -n for (-n - 1, -n], and 0 for all of (-1, +1). The mean
-of the integers is off by up to half a step, and by up to a whole one around zero, however long it is averaged; the
-share of every integer still shows mean and sigma of the Gaussian noise underneath (autopilots 9.3.1 "Integer
+A truncated stream shows n for every value in [n, n + 1) LSB, -n for (-n - 1, -n], and 0 for all of (-1, +1). The mean
+of the integers is wrong by up to half a step, and by up to a whole one around zero, however long it is averaged. But
+the frequencies of the integers show mean and sigma of the underlying Gaussian noise (autopilots 9.3.1 "Integer
 messages": 102 deg/h against 3.5). The log-likelihood of grouped normal data is concave in h = 1 / sigma and
 a = mean / sigma (Burridge, Biometrika 68 (1981) 41-45). Scoring with shortened steps therefore finds the one maximum.
 
-The fit uses the counts of all good seconds together. The influence of each integer on the fitted mean then turns the
-counts of one second into the mean of that second, to first order. Robust means, ramps and Allan deviations work on
-those as on the means of a stream of floats, and their scatter includes noise that is correlated between readings.
+The fit uses the counts of all good seconds together. The influence of each integer on the fitted mean then converts the
+counts of one second to the mean of that second, to first order. Robust means, ramps and Allan deviations use these
+means like those of a stream of floats; their scatter includes noise that is correlated between readings.
 """
 
 from __future__ import annotations
@@ -28,26 +28,25 @@ from companion.physics.statistics import MAD_TO_SIGMA
 Integers = NDArray[np.int64]
 
 MIN_BEYOND_TWO: Final = 5.0
-"""Readings that must lie outside the two commonest integers for both mean and sigma to be known. With two integers
-alone every sigma has a mean that fits. Simulated over 0.2 to 0.5 LSB, means of -2 to 2 and a minute: with five or more
-the error is within 15 deg/h and its rms 0.93 to 1.05 of the stated one. That holds behind a 20 Hz filter, too, which
-makes readings of 250 Hz come in clumps. With one to four the rms is 0.9 to 1.3 of it, the error up to 17 deg/h."""
+"""Readings outside the two most frequent integers that are needed to determine both mean and sigma. With two integers
+alone, every sigma has a mean that fits. Simulated for sigmas of 0.2 to 0.5 LSB, means of -2 to 2 and one minute: with
+five or more the error is within 15 deg/h and its rms 0.93 to 1.05 times sigma. That holds behind a 20 Hz filter, too,
+which correlates readings of 250 Hz. With one to four the rms is 0.9 to 1.3 times sigma, the error up to 17 deg/h."""
 EDGE_RMS: Final = 0.05
-"""LSB by which the integers' edges may be displaced unseen: by a sensor's own steps (2000 deg/s in 16 bits are 1.07
-mrad/s), by a filter and by noise that is not quite Gaussian."""
+"""Unseen displacement of the integers' edges, rms in LSB: from a sensor's own steps (2000 deg/s in 16 bits are 1.07
+mrad/s), from a filter, and from noise that is not quite Gaussian."""
 HUBER_C: Final = 4.0
-"""Limit in scales of a second for these streams: rare integers make the seconds' means skew, and 1.345 would cut off
-the rare ones, which show the mean."""
+"""Huber limit, in scales, for seconds of these streams: rare integers skew the seconds' means, and a limit of 1.345
+would cut off these integers, which determine the mean."""
 BORROWED_RMS: Final = 0.1  # Relative difference between the noise of the three axes of one gyro or accelerometer
-# Sigmas in LSB of a mean that the readings do not show: anywhere, and within a step of zero.
-HALF_STEP: Final = 0.5  # Sigma in LSB of a mean that the readings do not show
-NEAR_ZERO: Final = 1.0  # Sigma in LSB of such a mean within a step of zero, on either side
+HALF_STEP: Final = 0.5  # Sigma, LSB, of a mean that the readings do not determine
+NEAR_ZERO: Final = 1.0  # Sigma, LSB, of an undetermined mean within a step of zero, on either side
 
 _ROUNDS: Final = 60
 _HALVINGS: Final = 30
 _CONVERGED: Final = 1e-7
 _LEAST_PROBABILITY: Final = 1e-300
-_LEAST_SIGMA: Final = 1e-3  # LSB; less noise shows no more of the mean
+_LEAST_SIGMA: Final = 1e-3  # Lower bound of sigma, LSB; less noise does not determine the mean better
 _OUTLIER: Final = 6.0
 _CORE_SIGMAS: Final = 8.0
 _LEAST_SPREAD: Final = 0.3
@@ -58,10 +57,10 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """Gaussian noise of one reading under truncation; arrays are (c,) unless said otherwise, in LSB.
+    """Fit of Gaussian noise to truncated readings; arrays are (c,) unless stated otherwise, in LSB.
 
-    `variance` is that of `mean` by the Fisher information, for independent readings.
-    Nothing here is NaN; where `identified` is false the figures are no estimate and must not be used.
+    `variance` is that of `mean` from the Fisher information, for independent readings.
+    No value is NaN; figures with `identified` false are no estimate and must not be used.
     """
 
     mean: Floats
@@ -69,23 +68,23 @@ class Fit(msgspec.Struct, frozen=True):
     variance: Floats
     identified: NDArray[np.bool_]
     influence: Floats
-    """(k, c): change of the mean by one reading in that cell, times the number of readings. The mean over a part of
-    the readings of (mean + influence) estimates that part's mean to first order."""
+    """Change of the mean by one reading in each cell, times the number of readings, (k, c). Averaging
+    (mean + influence) over a part of the readings estimates that part's mean to first order."""
     density: Floats
-    """(k + 1, c) probability density at the edges of the cells."""
+    """Probability density at the edges of the cells, (k + 1, c)."""
 
 
 def truncation_edges(lowest: Integers, cells: int) -> Floats:
-    """Return the edges (cells + 1, c) in LSB of neighbouring integers from `lowest` (c,) on; 0 spans two LSB."""
+    """Return the edges (cells + 1, c), LSB, of consecutive integers from `lowest` (c,) on; 0 spans two LSB."""
     first = lowest + np.arange(cells + 1, dtype=np.int64)[:, None]
     return np.asarray(first - (first <= 0), dtype=np.float64)
 
 
 def fit(edges: Floats, counts: Floats, sigma: Floats | None = None) -> Fit:
-    """Estimate mean and sigma from how often, (k, c), readings fell between ascending edges, (k + 1, c).
+    """Estimate mean and sigma from the counts (k, c) of readings between ascending edges (k + 1, c).
 
-    `sigma` (c,) of the noise where it is known from elsewhere, NaN in a column where it is not; a wrong one is worse
-    than none (0.33 instead of 0.386 LSB makes 14 deg/h, autopilots 9.3.2).
+    `sigma` (c,): noise known from elsewhere, NaN in a column without; a wrong value is worse than none (0.33 instead
+    of 0.386 LSB causes an error of 14 deg/h, autopilots 9.3.2).
     """
     given = np.full(counts.shape[1], np.nan) if sigma is None else sigma
     known = given > 0.0
@@ -103,7 +102,7 @@ def fit(edges: Floats, counts: Floats, sigma: Floats | None = None) -> Fit:
     for _ in range(_ROUNDS):
         aa, ah, hh = state.inverse
         step_a, step_h = aa * state.by_a + ah * state.by_h, ah * state.by_a + hh * state.by_h
-        # The likelihood is concave, so a short enough step is one upwards; h stays positive.
+        # The likelihood is concave, so a short enough step increases it; h stays positive.
         size = np.where(step_h < 0.0, np.minimum(1.0, 0.9 * h / np.maximum(-step_h, 1e-300)), 1.0)
         better = _State(at, counts, a + size * step_a, h + size * step_h, known)
         for _ in range(_HALVINGS):
@@ -150,13 +149,13 @@ class _State:
         ah = (expected * self.slope_a * self.slope_h).sum(axis=0)
         hh = np.maximum((expected * np.square(self.slope_h)).sum(axis=0), 1e-12)
         determinant = np.maximum(aa * hh - np.square(ah), 1e-12 * aa * hh)
-        # Where sigma is known the mean is all there is to solve.
+        # With a known sigma, only the mean is unknown.
         inverse = np.stack([hh / determinant, -ah / determinant, aa / determinant])
         self.inverse = np.where(known, np.stack([1.0 / aa, np.zeros_like(aa), np.zeros_like(aa)]), inverse)
 
 
 def shape_variance(found: Fit) -> Floats:
-    """Variance (c,) of the mean, LSB^2, by edges that are displaced by `EDGE_RMS`."""
+    """Return the variance (c,) of the mean, LSB^2, for edges displaced by `EDGE_RMS`."""
     sensitivity = np.square(np.diff(found.influence, axis=0) * found.density[1:-1]).sum(axis=0)
     return np.asarray(EDGE_RMS**2 * sensitivity)
 
@@ -169,9 +168,9 @@ def integer_columns(
     Returns, in the unit of `steps`:
         (m, c) mean of every second;
         (c,) sigma of one second's mean, from the Fisher information;
-        (c,) sigma that no averaging reduces: of a mean that is not identified, or by the shape of the noise;
-        (c,) whether the mean is not identified by its own readings, but by the triad's other axes, or not at all;
-        (c,) whether zero is among the readings, too: the mean could be anything within a step of it.
+        (c,) sigma that averaging does not reduce: of a mean that is not identified, or from the shape of the noise;
+        (c,) whether the mean's own readings do not identify it; then the triad's other axes do, or nothing does;
+        (c,) whether, in addition, zero is among the readings: the mean can be anywhere within a step of zero.
     """
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
@@ -192,7 +191,7 @@ def integer_columns(
         outside = (off > _OUTLIER * np.maximum(second, MAD_TO_SIGMA * np.median(off, axis=0))) & found.identified
         if not outside.any():
             break
-        # A knock does not count in the common fit.
+        # Exclude knocks from the common fit.
         weight = np.where(outside, 0.0, 1.0)
     by_sigma = np.zeros(len(sigma))
     if borrows:
@@ -214,7 +213,7 @@ def integer_columns(
 
 
 def _borrowed(own: Fit, pooled: Floats) -> Floats:
-    """Return the usual sigma of a triad's other axes for axes that show two integers only; NaN for the others."""
+    """Return, for axes with two integers only, the usual sigma of the triad's other axes; NaN for other axes."""
     result = np.full(len(own.mean), np.nan)
     enough = ~own.identified & (pooled.sum(axis=0) - pooled.max(axis=0) >= MIN_BEYOND_TWO)
     for triad in (slice(start, start + 3) for start in range(0, len(result), 3)):
@@ -225,9 +224,9 @@ def _borrowed(own: Fit, pooled: Floats) -> Floats:
 
 
 def _aligned(batches: Sequence[Batch], plain: Floats, steps: Floats) -> tuple[Integers, Floats]:
-    """Put the counts of every second on one grid of integers: (c,) lowest, (m, k, c) counts.
+    """Convert the counts of every second to one grid of integers: (c,) lowest, (m, k, c) counts.
 
-    The grid reaches as far as noise does; a reading beyond is a fault of the line and is left out.
+    The grid covers the range of the noise; a reading outside is a transmission fault and is dropped.
     """
     centre = np.median(plain, axis=0)
     noise = np.sqrt(np.median([batch.variance for batch in batches], axis=0)) / steps

@@ -1,8 +1,8 @@
-"""Gradienter and compass: how readings become up and a heading of the vehicle, and their means (method 1.2 and 3.5).
+"""Gradienter and compass: conversion of readings to up and heading of the vehicle, and means (method 1.2 and 3.5).
 
-The compass' own heading is used where it sends one, unless it is set to be worked out here, from its field vector and
-the gradienter's tilt. A field alone, without a gradienter, gives none: nothing else at hand tells tilt well enough
-(tan I times its error, 2.5 times at 68 degrees).
+The compass' own heading is used if it sends one, unless the configuration prefers the heading computed from its field
+vector and the gradienter's tilt. A field without a gradienter gives no heading: no other sensor measures the tilt well
+enough (tan I times its error, 2.5 times at 68 degrees).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample
 
 LEVEL_COSINE: Final = math.cos(2.0 * DEG)
-"""Data sheets give a compass' error "level" and "tilted" without a border: only what a table is counts as level."""
+"""Cosine of the largest tilt that counts as level. Data sheets state errors "level" and "tilted", but no border."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -39,10 +39,10 @@ class GradienterModel:
     lag_s: float = 0.0  # Time constant of the device
 
     def up(self, x_deg: float, y_deg: float) -> Array:
-        """Return up in the vehicle's axes, (3,), from readings without an offset.
+        """Return up in the vehicle's axes, (3,), from readings minus the offset.
 
         Raises:
-            ValueError: the readings cannot belong together.
+            ValueError: the readings are inconsistent.
         """
         return self.vehicle_from_sensor @ up_in_sensor(self.law, x_deg, y_deg)
 
@@ -56,14 +56,14 @@ class CompassModel:
     offset_deg: float
     sigma_deg: float
     counts_per_gauss: float | None = None
-    """None: only the direction of a field in counts is known."""
-    prefers_field: bool = False  # The heading is worked out from the field even where the device gives one of its own
+    """Unit of a field in counts; None: only its direction is known."""
+    prefers_field: bool = False  # True: compute the heading from the field even if the device sends its own
     tilted_sigma_deg: float | None = None
-    """Sigma where the compass is not level; None: `sigma_deg`."""
+    """Sigma while the compass is not level; None: `sigma_deg`."""
     lag_s: float = 0.0  # Time constant of the device
 
     def sigma_at(self, up: Array) -> float:
-        """Return sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
+        """Return sigma, degrees, at a tilt; `up` (3,) is in the vehicle's axes."""
         upright = float(-(self.vehicle_from_sensor.T @ up)[2])
         if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
             return self.sigma_deg
@@ -78,8 +78,8 @@ def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
 def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
     """Return the heading of the vehicle from the compass' own north (magnetic or true), not wrapped.
 
-    A compass gives the azimuth of its own forward axis. The mounting adds the azimuth that this axis has, at the
-    present tilt, when the vehicle heads north.
+    A compass gives the azimuth of its own forward axis. The mounting adds the azimuth of that axis, at the present
+    tilt, while the vehicle heads north.
     """
     gamma, theta = roll_pitch_from_up(up)
     forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
@@ -88,7 +88,7 @@ def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) ->
 
 
 class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of the gradienter in its own axes; the sigmas of this and the next windows are statistical."""
+    """Means of the gradienter in its own axes; sigmas are statistical."""
 
     x_deg: float
     y_deg: float
@@ -102,9 +102,9 @@ class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
 
     heading_deg: float
     sigma_deg: float
-    from_field: bool = False  # Worked out from the device's field and the gradienter's tilt; else the device's own
+    from_field: bool = False  # True: computed from the device's field and the gradienter's tilt
     wander_deg: float | None = None
-    """Change while no other sensor showed a turn; None: not watched long enough."""
+    """Change of the heading while no other sensor showed a turn; None: not watched long enough."""
 
 
 FieldUnit = Literal["gauss", "counts"]
@@ -149,21 +149,21 @@ def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats
 
 
 def _resolution(batches: Sequence[Batch]) -> Floats:
-    """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
+    """Return the step of a reading with fewer than 3 values: their distance, or the last printed decimal; else 0."""
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
     few = few_distinct(np.array([batch.distinct for batch in batches]))
     return np.where(few, np.where(high > low, high - low, decimal(low, high)), 0.0)
 
 
-OLDEST_TILT_S: Final = 1.0  # A tilt older than this is none; the slowest gradienters send five readings in that time
+OLDEST_TILT_S: Final = 1.0  # Maximum age of a tilt; the slowest gradienters send five readings in that time
 OWN_HEADING_S: Final = 2.0
-"""After so long without a heading of its own a compass is taken for one that sends its field only."""
+"""Time without an own heading after which a compass counts as sending its field only."""
 _LIMITS: Final = (1e6,) * 3
 
 
 class FieldHeading:
-    """Headings of the compass' own forward axis from magnetic north, worked out from tilts and fields."""
+    """Computes headings of the compass' own forward axis from magnetic north, from tilts and fields."""
 
     def __init__(self, compass: CompassModel, gradienter: GradienterModel | None, keep: int) -> None:
         self._compass, self._gradienter = compass, gradienter
@@ -173,22 +173,22 @@ class FieldHeading:
         self._begun_s: float | None = None
         self.unit: FieldUnit = "gauss"
         self.batches = BatchSource(_LIMITS, keep)
-        self.from_field = False  # True: the latest heading that counts was worked out here
+        self.from_field = False  # True: the latest heading in use was computed from the field
         self.hint = ""
-        """Why there is none from the field although one is needed; empty while there is."""
+        """Reason why a needed heading cannot be computed from the field; empty if it can."""
 
     def take_tilt(self, sample: TiltSample) -> None:
         self._tilt = sample
 
     def takes_own(self, sample: CompassSample) -> bool:
-        """Add a heading of the device's own; return whether it is the one that counts."""
+        """Add a heading that the device computed; return whether it is used."""
         if self._compass.prefers_field:
             return False
         self._own_s, self.from_field, self.hint = sample.t_s, False, ""
         return True
 
     def add(self, sample: MagSample) -> CompassSample | None:
-        """Add a field; return the heading that it gives, where that is the one that counts."""
+        """Add a field; return the heading computed from it if that one is used."""
         field = self._in_unit(sample)
         if field is None:
             return None
@@ -227,12 +227,12 @@ class FieldHeading:
         if not np.isfinite(field).all():
             return None
         if unit != self.unit:
-            # Means over both would be neither.
+            # Means over both units would be meaningless.
             self.unit, self.batches = unit, BatchSource(_LIMITS, self._keep)
         return field
 
     def _up(self, t_s: float) -> Array | None:
-        """Return up in the vehicle's axes now; without one, `hint` says why."""
+        """Return the present up in the vehicle's axes; None: `hint` gets the reason."""
         if not self._compass.magnetic:
             self.hint = 'compass sends its field only, and that shows magnetic north, not reference = "true"'
         elif self._gradienter is None:

@@ -1,9 +1,8 @@
-"""Allowance for a warm-up that one window is too short to show, and the drift that it does show.
+"""Allowance for a warm-up too slow to see within one window, and the drift that the window does show.
 
 A slope s moves the mean of the next minute by s (T + 60 s) / 2 from the mean over T. The allowance is the slope
-of the window with its standard error, times that lever. The age of the part bounds it: a box that was switched on
-rises by `WARM_UP_K` with an unknown time constant, so at the age t it warms by at most WARM_UP_K / (e t). A thermometer
-bounds it better.
+of the window with its standard error, times that lever. The time t since power-up bounds it: a box warms by `WARM_UP_K`
+with an unknown time constant, so its rate is at most WARM_UP_K / (e t). A thermometer bounds it better.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, rows_of
 
 QUICKEST_S: Final = 60.0  # Shortest time constant of a warm-up; boards take 1 to 20 min
-NEXT_S: Final = 60.0  # Time for which an unseen slope is believed to continue
+NEXT_S: Final = 60.0  # Assumed duration of an unseen slope after the window
 _LATER_S: Final = (120.0, 600.0, 3600.0)
-_WORTH_WAITING: Final = 2.0 / 3.0  # Share of the present sigma below which a later one is worth waiting for
+_WORTH_WAITING: Final = 2.0 / 3.0  # A later sigma is worth waiting for below this share of the present one
 _TEMPERATURE_WARNING_K: Final = 3.0
 UNKNOWN: Final = 1.0
-"""Variance of a slope that the window does not tell, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
+"""Variance of a slope that the window does not show, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
 _TINY: Final = float(np.finfo(float).tiny)
-_BENT_SIGMAS: Final = 3.0  # Curvature over its sigma from which the temperature is taken for a parabola
+_BENT_SIGMAS: Final = 3.0  # Curvature over its sigma above which the temperature is fitted by a parabola
 _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)  # Resolutions of thermometers
 
 
@@ -54,11 +53,11 @@ class Path(msgspec.Struct, frozen=True, kw_only=True):
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
     """Straight lines through the readings of gyro and accelerometer over one window; (6,), rad/s^2 and m/s^3.
 
-    `ramp` has the slopes that are significant, else zero: the reported mean is the end of that line. `variance` is that
-    of the slope, with the part's flicker and walk, `UNKNOWN` where the window is too short for a line; `level_variance`
-    that of the mean over the window as a prediction of the next minutes, without any ramp. `warm_up`: bias change of
-    gyro and accelerometer by `WARM_UP_K`, rad/s and m/s^2. `rate`: of the thermometer, K/s, and its variance, None
-    without one; `path` is None without a significant change.
+    `ramp`: significant slopes, else zero; the reported mean is then the end of that line. `variance`: of the slope,
+    with the part's flicker and walk; `UNKNOWN` if the window is too short for a line. `level_variance`: of the mean
+    as a prediction of the next minutes, without a ramp. `warm_up`: bias change of gyro and accelerometer by
+    `WARM_UP_K`, rad/s and m/s^2. `rate`: rate of the temperature, K/s, and its variance, None without a thermometer;
+    `path`: None without a significant change.
     """
 
     slope: Floats
@@ -82,24 +81,24 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def rate_k_s(self) -> float:
-        """Significant rate of the temperature; zero where it may be chance or there is no thermometer."""
+        """Significant rate of the temperature, K/s; zero if it may be chance or there is no thermometer."""
         return 0.0 if self.rate is None or self.path is None else self.rate[0]
 
     def ahead(self, triad: Triad) -> Floats:
-        """Difference between the reported mean, the end of a ramp, and the mean over the window; (3,)."""
+        """Return the reported mean, at the end of a ramp, minus the mean over the window; (3,)."""
         return self.ramp[rows_of(triad)] * self.half_s
 
     def goes_on(self, triad: Triad) -> tuple[Floats, Floats]:
-        """Slope that continues for some seconds, (3,), and its sigma: a ramp, or what the thermometer explains."""
+        """Return the slope (3,) that continues for some seconds, and its sigma: a ramp, or a warm-up by thermometer."""
         rows, move = rows_of(triad), self.warm_up[0 if triad == "gyro" else 1]
         prior = np.square(self.rate_k_s * move / WARM_UP_K)
         share = np.where(self.ramp[rows] != 0.0, 1.0, prior / (prior + self.variance[rows] + _TINY))
         return share * self.slope[rows], np.sqrt(share * self.variance[rows])
 
     def unseen(self, powered_s: float) -> Floats:
-        """Variance (6,) of the next minute's biases by an unseen slope: gyro (rad/s)^2, accelerometer (m/s^2)^2.
+        """Return the variance (6,) of the next minute's biases from an unseen slope, (rad/s)^2 and (m/s^2)^2.
 
-        `powered_s`: least age of the sensor at the end of the window.
+        `powered_s`: least time since power-up at the end of the window.
         """
         age_s = max(powered_s, 0.0)
         steepest = math.exp(-age_s / QUICKEST_S) / QUICKEST_S if age_s < QUICKEST_S else 1.0 / (math.e * age_s)
@@ -110,7 +109,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         return _mean_square(prior, self.slope - self.ramp, self.variance) * (self.half_s + NEXT_S / 2.0) ** 2
 
     def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
-        """Explain a gyro sigma that is mostly warm-up; empty where it is not. `other_variance`: (6,), the rest."""
+        """Explain a gyro sigma that is mostly warm-up; empty if it is not. `other_variance`: (6,), the rest."""
         if self.unseen(powered_s)[:3].max() <= other_variance[:3].max():
             return ""
         if self.rate_k_s:
@@ -126,7 +125,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _mean_square(prior: Floats | float, measured: Floats | float, variance: Floats | float) -> Floats:
-    """Return the mean square of a slope that was measured with this variance and is likely as large as the prior."""
+    """Return the mean square of a slope: the prior's, updated with a measurement of this variance."""
     share = prior / (prior + variance + _TINY)
     return np.asarray(np.square(share * measured) + share * variance)
 
@@ -156,7 +155,7 @@ def temperature(batches: Sequence[Batch]) -> tuple[tuple[float, float] | None, P
 
 
 def _fitted(times: Floats, degc: Floats, degree: int) -> tuple[list[float], list[float]]:
-    """Fit a line or a parabola: coefficients, highest first, and their variances."""
+    """Fit a line or a parabola; return coefficients, highest first, and their variances."""
     found, covariance = np.polyfit(times, degc - degc[0], degree, cov=True)
     found[-1] += degc[0]
     half_s = (times[-1] - times[0] + 1.0) / 2.0
@@ -166,16 +165,16 @@ def _fitted(times: Floats, degc: Floats, degree: int) -> tuple[list[float], list
 
 
 def _resolution_k(degc: Floats) -> float:
-    """Step of a thermometer that shows three values at most; zero where it shows more."""
+    """Return the step of a thermometer that shows at most three values; zero if it shows more."""
     values = np.unique(degc)
     if len(values) == 1:
-        # As coarse as its digits allow.
+        # Largest step that its digits allow.
         return next((step for step in _STEPS_K if abs(values[0] / step - round(values[0] / step)) < 1e-6), 0.0)
     return float(np.diff(values).min()) if len(values) <= 3 else 0.0
 
 
 def drifting(name: str, ramps: Floats, temperatures_degc: Sequence[float]) -> tuple[str, ...]:
-    """Warnings of drift of one IMU; `ramps` (6,): gyro rad/s^2, accelerometer m/s^3."""
+    """Return the drift warnings of one IMU; `ramps` (6,): gyro rad/s^2, accelerometer m/s^3."""
     found, size = [], np.abs(ramps)
     span = max(temperatures_degc, default=0.0) - min(temperatures_degc, default=0.0)
     if size[:3].any():

@@ -1,7 +1,7 @@
-"""Means of a still stretch with honest sigmas, from its batches.
+"""Means of a still stretch with realistic sigmas, from its batches.
 
-Two sigmas a reading: `sigma_stat` is what averaging left, `sigma_use` what the next H seconds can expect of the
-sensor. Method 2.2, 2.4, 2.5 and 3.2.
+Each reading has two sigmas: `sigma_stat` is the noise that remains after averaging, `sigma_use` the expected error over
+the next H seconds. Method 2.2, 2.4, 2.5 and 3.2.
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import TRIADS, Triad, Vector, rows_of
 
 WHITE_SHARE: Final = 0.09
-"""White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
+"""White over floor variance below which more averaging gains nothing: the white sigma is 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
-RAW_BATCHES: Final = 10  # Seconds of floats beside integers that say enough of their own scatter
-RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
+RAW_BATCHES: Final = 10  # Least seconds of raw means (floats) to show their scatter
+RAW_STEP: Final = 1e-5  # Rounding of raw means: five decimals, rad/s and m/s^2
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
-"""Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
+"""Share of the usual sample count below which a second has lost samples; above, it is the phase of the grid."""
 _ALLAN_SIGNIFICANT: Final = 3.0
-"""ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
+"""Allan variance at T/5 over that of white noise: upper 5 % point for about four degrees of freedom."""
 
 
 class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU for the collector; `rotation` is that from the sensor to vehicle FRD, 3x3.
+    """One IMU for the collector; `rotation` (3x3) is from the sensor to vehicle FRD.
 
-    The steps are those of integers that are truncated toward zero, 0 for floats; both triads are one or the other.
-    `clock_from_start`: the time in its samples (`t_device_s`) counts from the switch-on of the device.
+    The steps are those of integers truncated toward zero, 0 for floats; both triads are integers, or both floats.
+    `clock_from_start`: the time in its samples (`t_device_s`) counts from power-up of the device.
     """
 
     name: str
     rotation: NDArray[np.float64]
     profile: NoiseProfile
     gyro_step_rad_s: float = 0.0
-    """Step of integers that are truncated toward zero; 0 for floats. Both triads are one or the other."""
+    """Step of integers truncated toward zero; 0 for floats. Both triads are integers, or both are floats."""
     accel_step_m_s2: float = 0.0
     clock_from_start: bool = False
 
@@ -73,11 +73,11 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     """Means of one IMU over one still stretch; axes are the vehicle's FRD.
 
-    `sigma_use` is sqrt(V(T, H)) of the sensor alone; `solve` adds what the pose adds. A curve of the temperature may
-    explain the warnings in `drifting`. Triads in `hidden` have too little noise to spread their integers: their means
-    are good to half a step, and those in `useless` are no measurement at all. On a deck there are `covariance` (6x6 of
-    all axes) and `by_earth` (3x3, the share of the Earth's rate, ahead, right and down, in the gyro means). `mounting`
-    has the rows of the rotation from the sensor's axes.
+    `sigma_use` is sqrt(V(T, H)) of the sensor alone; `solve` adds the error of the pose. A bias curve over temperature
+    may explain the warnings in `drifting`. Triads in `hidden` have too little noise to spread their integers: their
+    means are good to half a step; those in `useless` are no measurement. Only a deck has `covariance` (6x6, all axes)
+    and `by_earth` (3x3, share of the Earth's rate, ahead, right and down, in the gyro means). `mounting` has the rows
+    of the rotation from the sensor's axes.
     """
 
     name: str
@@ -87,27 +87,27 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     accel_m_s2: Vector
     gyro_sigma_stat_rad_s: Vector
     accel_sigma_stat_m_s2: Vector
-    gyro_sigma_use_rad_s: Vector  # sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`
+    gyro_sigma_use_rad_s: Vector  # sqrt(V(T, H)) of the sensor alone; `solve` adds the error of the pose
     accel_sigma_use_m_s2: Vector
     temperature_degc: float | None
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
     hidden: dict[Triad, str] = {}
     useless: frozenset[Triad] = frozenset()
-    named: bool = True  # The part is known
+    named: bool = True  # True if the configuration names the part
     covariance: NDArray[np.float64] | None = None
     by_earth: NDArray[np.float64] | None = None
     mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    warming: Warming | None = None  # Slopes by a warm-up; None: none is allowed for
+    warming: Warming | None = None  # Slopes from a warm-up; None: no allowance for one
 
     def refused(self, part: Triad) -> str | None:
         return self.hidden[part] if part in self.useless else None
 
 
 class Window(msgspec.Struct, frozen=True, kw_only=True):
-    """One window; `powered_s` is the least age of each IMU since its switch-on, at the end.
+    """One window; `powered_s` is the least time since power-up of each IMU, at the window's end.
 
-    `turn_rad_s` is the mean turn of a deck, its axis levelled by the gradienter's readings without an offset.
+    `turn_rad_s` is the mean turn of a deck; the gradienter's readings, without an offset, level its axis.
     """
 
     start_s: float
@@ -116,19 +116,19 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     tilt: TiltWindow | None
     heading: HeadingWindow | None
     field: FieldWindow | None = None
-    """Mean field of a compass that sends it, over those of the good seconds in which it came."""
+    """Mean field of the compass, over the good seconds that have one; None if it sends none."""
     turn_rad_s: Vector | None = None
     powered_s: dict[str, float] = {}
     turn: Turn = Turn()
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2.
+    """Estimate of one IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2.
 
-    The mean of integers is unknown yet where `undecided` (more seconds may bring the rare reading that tells); where
-    `useless` it says no more than that it is less than a step. `half_step`: floats with fewer than 3 distinct readings.
-    `white` is the N in force: measured, or the profile's where that is larger; more seconds reduce `white_variance`, a
-    part of `use_variance`.
+    `undecided`: the mean of integers is not determined yet (more seconds may bring the rare reading that does).
+    `useless`: the mean is only known to be less than a step. `half_step`: floats with fewer than 3 distinct readings.
+    `white` is the N in use: the larger of measurement and profile. More seconds reduce `white_variance`, which is part
+    of `use_variance`.
     """
 
     mean: Floats
@@ -145,10 +145,10 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
 def estimate(
     imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float, rounding: float = 0.0
 ) -> Estimate:
-    """Estimate one IMU over its good seconds, at least 2.
+    """Estimate one IMU from at least 2 good seconds.
 
     A ramp is evaluated at the end of the window, `end_s`, and never later. `horizon_s` is H of V(T, H), `rounding` the
-    step of floats that were rounded.
+    step of rounded floats.
     """
     profile_white, flicker, walk = columns(imu.profile)
     slots = np.array([batch.slot for batch in batches], dtype=np.int64)
@@ -161,7 +161,7 @@ def estimate(
     else:
         values = np.array([batch.mean for batch in batches])
         quantum, half_step = _quantisation(batches, rounding)
-    # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
+    # The profile of an unknown part has the worst floor, which would mask every warm-up.
     wander = slope_variance(flicker, walk, end_s - slots[0]) if imu.profile.is_named else np.zeros(6)
     mean, leverage = robust_mean(values, huber_c, least), np.full(6, 1.0 / seconds)
     slope, ramp, level = np.zeros(6), np.zeros(6), values
@@ -176,8 +176,8 @@ def estimate(
     white = np.maximum(measured, profile_white)
     flicker = _flicker(slots, level, measured, flicker)
     quantum = np.sqrt(np.square(quantum) + np.mean([batch.shared_variance for batch in batches], axis=0))
-    # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
-    # by anything from nothing to slope * H / 2.
+    # A ramp may end now or go on for the next H seconds: the error of the mean over them is uniform between 0 and
+    # slope * H / 2.
     going_on = np.square(ramp * horizon_s / 2.0) / 3.0
     white_part = np.square(white) * leverage
     rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
@@ -207,7 +207,7 @@ def estimate(
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
-    """Return B of every column: the profile's, or the excess of the Allan deviation at T/5 over white noise."""
+    """Return B of every column: from the profile, or from the excess of the Allan deviation at T/5 over white noise."""
     span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
     if span < 2:
         return profile
@@ -218,16 +218,16 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
 
 
 def _quantisation(batches: Sequence[Batch], step: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return one sigma a column that rounding may hide, and where there are fewer than 3 distinct values.
+    """Return one sigma of the rounding error per column, and flags of columns with fewer than 3 distinct values.
 
-    Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
-    sigma^2 / q^2) (method 2.2 and 2.5), with q the `step`, 0 where it is unknown.
+    Half a step for fewer than 3 distinct values; else the bound for noise of that sigma, (q / pi) exp(-2 pi^2 sigma^2 /
+    q^2) (method 2.2 and 2.5), with q the `step`, 0 if unknown.
     """
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
     distinct = np.max([batch.distinct for batch in batches], axis=0)
     if step == 0.0:
-        # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
+        # A stream of floats may still have coarse steps: then the step is the distance of its two values.
         few = distinct < 3
         return np.where(few, (high - low) / 2.0, 0.0), few
     few = high - low < 1.5 * step
@@ -246,7 +246,7 @@ def imu_window(
 ) -> tuple[Estimate, ImuWindow]:
     """Estimate one IMU from its good seconds: in its own axes, and in the vehicle's.
 
-    `raw`: of those seconds, means in floats beside a stream of integers; they count where they know the gyros better.
+    `raw`: means in floats of those seconds, sent beside a stream of integers; used if they determine the gyros better.
 
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
@@ -331,7 +331,7 @@ def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
 
 
 def lost(batches: Sequence[Batch]) -> float:
-    """Return the share of lost samples: by the device's counter, else against the usual number in a second."""
+    """Return the share of lost samples, from the device's counter, else from the usual number in a second."""
     usual = float(np.median([batch.n for batch in batches]))
     missing = came = 0.0
     for batch in batches:

@@ -1,12 +1,12 @@
-"""Allan models of IMU noise, and what a mean over T seconds is worth for the next H seconds.
+"""Allan models of IMU noise, and the error over the next H seconds of a mean over T seconds.
 
-One axis is white noise N (unit * sqrt(s)), flicker B (unit; the floor of the Allan deviation is 0.664 B) and rate
+One axis has white noise N (unit * sqrt(s)), flicker B (unit; the floor of the Allan deviation is 0.664 B) and rate
 random walk K (unit / sqrt(s)). Source: method 2.2; IEEE Std 952.
 
-A recording of a sensor at rest tells all three, each with its error, by maximum likelihood of the overlapping Allan
-variances at averaging times of 1, 2, 4, ... 256 s; a calibration asks for no longer ones, and a drift or a bounded
-wander costs there what it costs a calibration. The variance at t is N^2 / t + (2 ln 2 / pi) B^2 + K^2 t / 3. Each
-octave counts as length / (2 t) independent squares: those of Haar's wavelets, which together are all that it tells.
+A recording of a sensor at rest determines all three, each with its error, by maximum likelihood of the overlapping
+Allan variances at averaging times of 1, 2, 4, ... 256 s. A calibration needs no longer times, and within them a drift
+or a bounded wander counts as it does in a calibration. The variance at t is N^2 / t + (2 ln 2 / pi) B^2 + K^2 t / 3.
+Each octave counts as length / (2 t) independent squares: those of Haar's wavelets, which hold all its information.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from companion.physics.units import DEG_H, MG
 FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor  # Allan deviation of pure flicker noise over B: 0.664
 
 _FLOOR_REACHED_S: Final = 1000.0
-"""Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method 2.2)."""
-WARM_UP_K: Final = 20.0  # Warm-up of a board with its processor and radio; two sigma
+"""Catalogues give no random walk; K is set so that it reaches the flicker floor at this time (method 2.2)."""
+WARM_UP_K: Final = 20.0  # Temperature rise of a board with processor and radio; two sigma
 WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
-"""Bias change of a part without a data sheet: a BMI088's gyro (method 2.1), a BMI160's accelerometer (table there)."""
+"""Warm-up bias change of an unknown part: a BMI088's gyro and a BMI160's accelerometer (table in method 2.1)."""
 
 
 def allan_model(white: float, floor: float) -> AllanModel:
-    """Make a model of a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""
+    """Make a model from a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""
     return AllanModel(white, floor / FLOOR_OF_FLICKER, floor * math.sqrt(3.0 / _FLOOR_REACHED_S))
 
 
@@ -45,7 +45,7 @@ def _profile(
     accel_ug: tuple[float, float],
     per_kelvin: tuple[float, float] | None = None,
 ) -> NoiseProfile:
-    """Make a profile from a data sheet's figures; `per_kelvin` in deg/h and mg, None where it has none."""
+    """Make a profile from a data sheet's figures; `per_kelvin` in deg/h and mg, None if it gives none."""
     return NoiseProfile(
         name,
         allan_model(gyro_deg_h[0] * DEG_H, gyro_deg_h[1] * DEG_H),
@@ -57,10 +57,9 @@ def _profile(
 # N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug: the table of method 2.2. The ADIS16405 gyro carries
 # the figures measured over six sessions of 2.8 h (upper ends), not the catalogue's; its accelerometer is a datasheet
 # velocity random walk of 0.2 m/s/sqrt(h) and in-run stability of 0.2 mg.
-# "unknown" is for a part that nobody named. Its floors are those of the worst common parts, so that sigma_use never
-# promises what an unknown MEMS cannot hold; its white noise is that of the best, because white noise is measured in
-# every window and the larger figure counts. Temperature coefficients: method 2.1, which has none of
-# the two ADIS.
+# "unknown" is for a part that the configuration does not name. Its floors are those of the worst common parts, so that
+# sigma_use is not too small for any MEMS. Its white noise is that of the best part, because every window measures white
+# noise and the larger figure counts. Temperature coefficients: method 2.1, which has none for the two ADIS.
 PROFILES: Final[dict[str, NoiseProfile]] = {
     profile.name: profile
     for profile in (
@@ -74,7 +73,7 @@ PROFILES: Final[dict[str, NoiseProfile]] = {
 
 
 def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
-    """Return a given profile, or that of a part of the catalogue; None: the cautious one for an unknown part.
+    """Return a given profile, or that of a part in the catalogue; None: the cautious profile of an unknown part.
 
     Raises:
         ConfigError: no such profile.
@@ -87,14 +86,14 @@ def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
 
 
 def columns(profile: NoiseProfile) -> Floats:
-    """Return N, B and K of the three axes of the gyro and of the accelerometer: (3, 6)."""
+    """Return N, B and K (rows) of the gyro's and the accelerometer's axes (columns): (3, 6)."""
     return np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
 
 
 def phi(ratio: Floats | float) -> Floats:
-    """Return PHI(H/T), the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method 2.2).
+    """Return PHI(H/T): the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method 2.2).
 
-    Written with log1p so that it neither cancels for H much longer than T nor for H much shorter.
+    Uses log1p to avoid cancellation for H much longer or much shorter than T.
     """
     r = np.asarray(ratio, dtype=np.float64)
     return np.asarray(r * np.log1p(1.0 / r) + (2.0 + 1.0 / r) * np.log1p(r) - np.log(r))
@@ -117,10 +116,10 @@ def predicted_sigma(model: AllanModel, mean_s: float, horizon_s: float) -> float
 
 
 def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float) -> Floats:
-    """Return the variance of the slope that flicker and walk give a straight line over `mean_s` seconds.
+    """Return the slope variance of a straight line over `mean_s` seconds from flicker and walk.
 
-    The line's weights on the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method 2.2: the double
-    integrals are 1/16 and 1/60 of T^4 and T^5, times 144 / T^6.
+    The line's weights are applied to the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method 2.2: the
+    double integrals are 1/16 and 1/60 of T^4 and T^5, times 144 / T^6.
     """
     return np.asarray(9.0 / math.pi * np.square(flicker / mean_s) + 1.2 * np.square(walk) / mean_s)
 
@@ -156,14 +155,14 @@ def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple
 
 
 def student_ratio(freedom: float) -> float:
-    """Give the half width of Student's 95 % interval over the normal one, 3 at most and where nothing is known."""
+    """Return the half width of Student's 95 % interval over the normal one; at most 3, also below one degree."""
     return min(student_quantile(1.96, freedom) / 1.96, 3.0) if freedom >= 1.0 else 3.0
 
 
 def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
-    """Return N of every column by the Allan deviation between neighbouring seconds, widened for few of them.
+    """Return N of every column from the Allan deviation between neighbouring seconds, widened for few of them.
 
-    Falls back on the scatter of the means where no two seconds are neighbours (a gradienter slower than 1 Hz).
+    Without neighbouring seconds (a gradienter slower than 1 Hz), uses the scatter of the means.
     """
     variance, freedom = allan_variance(slots, values, 1)
     if freedom == 0.0:
@@ -175,21 +174,21 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
 # --- from recordings
 
 KNOWN_SIGMAS: Final = 2.0
-"""N^2, B^2 or K^2 over its standard error from which the recordings show it: within 25 % of N, B or K."""
-UPPER_SIGMAS: Final = 1.645  # One-sided 95 %: the upper limit of a figure that the recordings do not show
-LEAST_SLOTS: Final = 8  # Least seconds of a stretch: shorter ones have no two averages that show more than white noise
+"""Least ratio of N^2, B^2 or K^2 to its standard error for a known figure: N, B or K is within 25 %."""
+UPPER_SIGMAS: Final = 1.645  # One-sided 95 %: upper limit of an unknown figure
+LEAST_SLOTS: Final = 8  # Least seconds of a stretch: a shorter one shows white noise only
 LONGEST_S: Final = 256
-_LONGEST_SHARE: Final = 3  # The longest average is a third of the stretch: beyond, one difference is all there is
+_LONGEST_SHARE: Final = 3  # The longest average is a third of the stretch: a longer one has a single difference
 _ROUNDS: Final = 1000
 _UPPER_ROUNDS: Final = 40
 _UNBOUNDED: Final = 1e6
 
 
 class AllanCurve(NamedTuple):
-    """Allan variances of all stretches of a recording at rest; k rows: each averaging time of each stretch.
+    """Allan variances of a recording at rest; k rows, one per averaging time and stretch.
 
-    `spans` are the averaging times, s, `counts` the seconds in an average, fewer where the stretch has holes, and
-    `freedom` the independent squares, (k,) each; `variance` is (k, c).
+    `spans`: averaging times, s; `counts`: seconds in an average, fewer if the stretch has holes; `freedom`: independent
+    squares; (k,) each. `variance` is (k, c).
     """
 
     spans: Floats
@@ -199,10 +198,10 @@ class AllanCurve(NamedTuple):
 
 
 class AxisFit(msgspec.Struct, frozen=True):
-    """N, B and K of one axis in its unit (times sqrt(s), 1, over sqrt(s)); `known`: the recordings show the figure.
+    """N, B and K of one axis in its unit (times sqrt(s), 1, over sqrt(s)); `known`: the recordings determine it.
 
-    `sigmas` are the standard errors of the squares N^2, B^2, K^2; `upper` the one-sided 95 % limits, infinite where the
-    recordings are too short for one.
+    `sigmas` are the standard errors of the squares N^2, B^2, K^2; `upper` the one-sided 95 % limits, infinite if the
+    recordings are too short.
     """
 
     figures: tuple[float, float, float]  # N, B, K; none is negative
@@ -225,7 +224,7 @@ def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> AllanCurve:
         while span <= min(length // _LONGEST_SHARE, LONGEST_S) and len(slots) >= LEAST_SLOTS:
             variance, freedom = allan_variance(slots, values, span)
             if freedom > 0.0:
-                # One second has no hole; of a longer average only the seconds that are there average noise away.
+                # An average of one second has no hole; in a longer one, only the seconds present reduce noise.
                 rows.append((span, max(filled * span, 1.0), len(slots) / (2.0 * span), variance))
             span *= 2
     if not rows:
@@ -241,7 +240,7 @@ def fit_axis(found: AllanCurve, column: int) -> AxisFit:
     """
     spans, counts, freedom, every = found
     variance = every[:, column]
-    # In units of the scatter from second to second, so that no square is small.
+    # Scale by the scatter from second to second, so that no square is small.
     unit2 = float(variance[spans == 1.0].mean())
     if not unit2 > 0.0:
         raise ValueError("nothing to fit: readings that never change")
@@ -250,11 +249,11 @@ def fit_axis(found: AllanCurve, column: int) -> AxisFit:
 
     def errors(theta: Floats) -> Floats:
         information = design.T @ (design * (freedom / (2.0 * np.square(design @ theta)))[:, None])
-        # One stretch with two averaging times tells no three figures: the error of the third comes out large.
+        # Two averaging times cannot determine three figures: the error of the third becomes large.
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.diag(1e-12 * np.diag(information))))))
 
     def upper(which: int) -> float:
-        """Find the square from which an estimate as low as this one is a matter of 5 %; a large one scatters more."""
+        """Find the square for which an estimate this low has a probability of 5 %; a larger one scatters more."""
         limit = theta.copy()
         for _ in range(_UPPER_ROUNDS):
             before = limit[which]
@@ -267,7 +266,7 @@ def fit_axis(found: AllanCurve, column: int) -> AxisFit:
 
     theta = np.array([1.0, 0.05, 1e-3])
     for _ in range(_ROUNDS):
-        # The likelihood of chi-squares rises with every such step, and no figure becomes negative.
+        # Each step increases the chi-square likelihood and keeps all figures non-negative.
         model = design @ theta
         theta = theta * (design.T @ (freedom * variance / np.square(model))) / (design.T @ (freedom / model))
     sigmas = errors(theta)

@@ -1,1 +1,1 @@
-"""Records of calibrations, alignments and flights, and whether a calibration is still good."""
+"""Records of calibrations, alignments and flights, and the validity check of a calibration."""

@@ -1,6 +1,6 @@
-"""Records of alignments: the gradienter's zero, accelerometers held on all sides, a turn on one spot.
+"""Records of alignments: the gradienter's zero, accelerometers on all sides, a turn on one spot.
 
-Others rely on their keys. An unknown figure is None, never zero.
+The keys are a public interface. An unknown figure is None, never zero.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from companion.samples import Vector
 FORMAT_VERSION = 1
 _MOST_DEG = 90.0  # Limit of a gradienter's zero and of its sigma
 SAME_START_S = 30.0
-"""Drift between two clocks in weeks; a restart moves the start by at least the time that it had been on."""
+"""Drift between two clocks in weeks; a restart changes the start by at least the preceding uptime."""
 
 Pair = tuple[float, float]
 Kind = Literal["zero", "tilts"]
 
 
 class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Configuration of the gradienter when the alignment was measured; with another one it is not used."""
+    """Configuration of the gradienter during the alignment, which is not used with another configuration."""
 
     port: str
     protocol: str
@@ -38,7 +38,7 @@ class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Determined(msgspec.Struct, frozen=True, kw_only=True):
-    """Three figures, one sigma each; `known`: the stands determine it, else the sigma is about the prior one."""
+    """Three figures, one sigma each; `known`: the stands determine the figure, else its sigma is about the prior's."""
 
     value: Vector
     sigma: Vector
@@ -46,23 +46,23 @@ class Determined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, vehicle FRD; an autopilot has subtracted its own offsets already.
+    """Level bias of one IMU, vehicle FRD, after the offsets that the autopilot subtracts.
 
-    The level bias is the effective one of the accelerometers when the base is level, as a calibration there finds it.
+    It is the effective accelerometer bias when the base is level, as a level calibration measures it.
     """
 
     name: str
     temperature_degc: float | None
-    level_bias_mg: Vector  # Effective accelerometer bias when the base is level, as a calibration there finds it
+    level_bias_mg: Vector  # Effective accelerometer bias when the base is level, as a level calibration measures it
     level_sigma_mg: Vector
     gyro_bias_deg_h: Determined
 
 
 class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
-    """One IMU beside a gradienter; the small misalignment is from the gradienter's axes to this IMU's.
+    """One IMU aligned with a gradienter; the small misalignment is from the gradienter's axes to this IMU's.
 
-    `accel_bias_mg` is the bias proper, without scale, shear and misalignment, each of which looks like a bias in one
-    pose. Shear: xy, xz, yz.
+    `accel_bias_mg` is the bias alone, without scale, shear and misalignment, which all look like a bias in one pose.
+    Shear: xy, xz, yz.
     """
 
     accel_bias_mg: Determined
@@ -85,7 +85,7 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
     format_version: int = FORMAT_VERSION
     measured_at: str
     slope_deg: float
-    checked: bool  # True if a spot that moved between the stands would have been noticed
+    checked: bool  # True if the stands would have revealed a spot that moved
     chi_square: float
     freedom: int
     stands: tuple[StandRecord, ...]
@@ -109,7 +109,7 @@ class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
-    """One power-up of a sensor; another one has other biases."""
+    """Identity of one power-up of a sensor; biases change with each."""
 
     host: str  # Identity of the companion computer's start, whose clock counts
     started_s: float
@@ -120,11 +120,11 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, in its own axes; the autopilot has subtracted its offsets already.
+    """Result of one IMU on all sides, in its own axes, after the offsets that the autopilot subtracts.
 
     Shear: xy, xz, yz; no firmware corrects it. `left_out`: stands, from 1, that do not fit the others. `scatter_mg`:
-    rms by which the stands' readings, corrected, miss the length of gravity. `whole_bias_mg`: bias without any offset,
-    as it is written; None: of an earlier version.
+    rms of the corrected readings' length minus gravity. `whole_bias_mg`: bias without any offset, as it is written;
+    None: the record is of an earlier version.
     """
 
     name: str
@@ -170,13 +170,13 @@ def check(record: AlignmentRecord | FacesRecord) -> None:
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
     written: dict[str, WrittenParameter] = {}
     whole_bias_mg: Vector | None = None
-    """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
+    """Level bias without the autopilot's offsets, as it would be written; None: record of an earlier version."""
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Tilt of the board against the base: the attitude (roll right side down) that it shows on a level base.
+    """Tilt of the board against the base: its attitude (roll right side down) on a level base.
 
-    The accelerometers of `imu` showed it, whose bias and scale are known from all sides.
+    The accelerometers of `imu` measured it; their bias and scale are known from all sides.
     """
 
     imu: str

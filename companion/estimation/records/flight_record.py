@@ -1,4 +1,4 @@
-"""Records of flights, from logs of the autopilot; SI units. Biases are those that the offsets in force left."""
+"""Records of flights, from logs of the autopilot; SI units. Biases are residuals after the active offsets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEADS: Final = {
 }  # fmt: skip
 """Terms of a `Split`, as tables name them (docs/flight.md)."""
 UNSEEN: Final = "accel x, y: not counted, in the air nothing tells them from tilt"
-_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}  # Smaller findings are nobody's worry
+_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}  # Least bias worth a recommendation
 
 
 class Term(msgspec.Struct, frozen=True):
@@ -28,11 +28,11 @@ class Term(msgspec.Struct, frozen=True):
 
 
 class Split(msgspec.Struct, frozen=True, kw_only=True):
-    """Parts of one axis' bias, over what the offsets in force left; None: the log does not carry it.
+    """Parts of one axis' residual bias after the active offsets; None: not in the log.
 
     `in_flight`: mean from take-off to landing. `ekf`: the EKF's estimate in the latter half of the flight. `turn_on`:
     mean while standing, before the motors start. `temperature`: change from there into the air, by the learned curve.
-    `motors`: step at the motors' start, by vibration rectification, and by temperature where no curve is known.
+    `motors`: step at the motors' start, from vibration rectification, and from temperature without a known curve.
     `vibration`: change for each m/s^2 of vibration level. `trend`: change in a minute of flight.
     """
 
@@ -66,7 +66,7 @@ class Stages(msgspec.Struct, frozen=True):
 
 
 class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU with the offsets that were in force, in its own axes, by the record that began at `calibration`."""
+    """Flight result of one IMU; its active offsets, in its own axes, came from the record begun at `calibration`."""
 
     imu: int
     rate_hz: float
@@ -76,18 +76,18 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     set_gyro_rad_s: tuple[float, ...] | None
     set_accel_m_s2: tuple[float, ...] | None  # Offsets in force, in the IMU's own axes
     axes: tuple[Split, ...]
-    drift: dict[str, list[Drift]]  # Drift without aid, by whose offsets: `flown`, `before`
+    drift: dict[str, list[Drift]]  # Drift without aid, by offsets: `flown`, `before`
     notes: tuple[str, ...]
 
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
     key: str
-    """Identity of this arming of this start of this autopilot, whichever file it is read from."""
+    """Identity of this arming of the autopilot, equal for every file that it is read from."""
     system_id: int | None
     began_at: str | None
     stages: Stages
     reference: str
-    """Solution that the drift is measured from: "ekf", or "truth" of a simulator."""
+    """Reference solution of the drift: "ekf", or "truth" of a simulator."""
     imus: tuple[ImuFlight, ...]
     notes: tuple[str, ...]
 
@@ -115,7 +115,7 @@ def drift_lines(imu: ImuFlight) -> list[str]:
 
 
 def figure(imus: Sequence[ImuFlight]) -> str | None:
-    """Summarise a flight by the drift of its first IMU at 30 s, or next to that; None: it did not fly."""
+    """Summarise a flight by the drift of its first IMU at the time nearest to 30 s; None: no IMU has one."""
     first = next((imu for imu in imus if imu.drift.get("flown")), None)
     if first is None:
         return None

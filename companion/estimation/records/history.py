@@ -1,10 +1,10 @@
 """History of one IMU's biases, and the part of it that a prediction uses.
 
-Kept are whole biases as they were *measured*, never what a prior has made of them: a prior that learns from itself
-believes itself more with every calibration. One power-up is one point, however often was calibrated in it: the bias
-that the sensor has started with is in all of them.
+The history has whole biases as *measured*, never combined with a prior: a prior that learns from itself becomes more
+certain with every calibration. One power-up counts as one point, whatever the number of calibrations in it: they all
+include the turn-on bias of that power-up.
 
-Thousands of points are read at a start: so they are arrays on the disk, and nothing that the garbage collector follows.
+A start reads thousands of points: they are stored as arrays and not tracked by the garbage collector.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ import msgspec
 from companion.samples import Triad, Vector
 
 _MOST: Final = 100.0
-"""rad/s or m/s^2, of a whole bias and of its sigmas: beyond what the worst IMU could have, even with a wrong scale."""
+"""Limit of a whole bias and of its sigmas, rad/s or m/s^2: above the worst IMU's, even with a wrong scale."""
 _Bias = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 _Sigma = Annotated[float, msgspec.Meta(ge=0.0, le=_MOST)]
 _Sigmas = tuple[_Sigma, _Sigma, _Sigma]
 WEIGHS_FROM: Final = 5
-"""Least earlier power-ups that take part in the estimate."""
+"""Least earlier power-ups for a prediction that takes part in the estimate."""
 NEW_AFTER: Final = 3
-"""Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor was replaced."""
+"""Power-ups in a row that contradict earlier ones and show a replaced sensor: they are no outliers then."""
 KEEP_POWER_UPS: Final = 48
-KEEP_POINTS: Final = 8  # Most points of a power-up
-NEAR_K: Final = 2.0  # Temperatures that tell the same
+KEEP_POINTS: Final = 8  # Maximum points of a power-up
+NEAR_K: Final = 2.0  # Temperature difference below which points are redundant
 _LATEST: Final = 10
-"""Power-ups that are kept whatever their temperature: a sensor ages."""
+"""Latest power-ups to keep at any temperature: a sensor ages."""
 SAME_START_S: Final = 60.0
-"""Two power-ups whose beginnings differ by less are one: the wall clock is set in between, by a little."""
+"""Two starts closer than this are the same power-up: the wall clock may have been adjusted in between."""
 
 
 class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """Start of the companion computer (`host`) and of the sensor's own device, by the wall clock.
 
-    Two are taken for one where either says so: too few points make a prior cautious, one counted twice makes it bold.
+    Two are the same if either start matches: too few points make a prior cautious, double counting overconfident.
     """
 
     host: str
@@ -51,17 +51,16 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
         return self.host == other.host or self.started_with(other)
 
     def started_with(self, other: PowerUp) -> bool:
-        """Return True if both tell the same start: the power was on all the while."""
+        """Return True if both have the same start: the power was on all the time."""
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 
 
 class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it.
+    """One triad's whole bias from the readings alone, vehicle FRD, rad/s or m/s^2.
 
-    `sigma_use` is that of the sensor alone, `sigma_shared` that by place and heading, without the gradienter's zero.
-    `suspect`: it contradicts what was known. `chosen`: it was written on request all the same; earlier points count no
-    more.
+    `sigma_use` is that of the sensor alone, `sigma_shared` that from place and heading, without the gradienter's zero.
+    `suspect`: contradicts the prediction. `chosen`: suspect, but written on request; earlier points no longer count.
     """
 
     bias: tuple[_Bias, _Bias, _Bias]
@@ -79,8 +78,8 @@ class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
 class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """One calibration of one IMU, or one still window that no calibration used (`started_at` is empty).
 
-    `up`: in the vehicle's axes, where the accelerometers were measured. `zero`: the gradienter's behind them; None
-    without.
+    `up`: attitude of the accelerometer measurement, in the vehicle's axes. `zero`: identity of the gradienter's zero in
+    use; None without a gradienter.
     """
 
     started_at: str
@@ -103,7 +102,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
         return found
 
     def as_chosen(self, *, gyro: bool = True) -> Point:
-        """Mark a contradiction as decided for: its calibration was requested and is in force; `gyro`: gyros too."""
+        """Mark a suspect point as chosen: its calibration was requested and is active. `gyro`: gyros too."""
         found: dict[Triad, MeasuredBias | None] = {"gyro": self.gyro if gyro else None, "accel": self.accel}
         chosen = {t: msgspec.structs.replace(one, chosen=True) for t, one in found.items() if one and one.suspect}
         return msgspec.structs.replace(self, **chosen)
@@ -122,10 +121,10 @@ def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
 
 
 def kept(points: Sequence[Point]) -> tuple[Point, ...]:
-    """Choose the points worth keeping: winter is not forgotten in summer.
+    """Choose the points to keep, so that rare temperatures (winter) stay in the history.
 
-    Of too many power-ups the one goes whose temperatures are the most common, of several the oldest. Of too many points
-    of one power-up the latest and those at the most different temperatures stay.
+    With too many power-ups, the one with the most common temperatures is dropped; of several, the oldest. Of too many
+    points in one power-up, the latest and those at the most different temperatures stay.
     """
     groups = [_thinned(group) for group in by_power_up(points)]
     while len(groups) > KEEP_POWER_UPS:
@@ -140,7 +139,7 @@ def kept(points: Sequence[Point]) -> tuple[Point, ...]:
 def _thinned(group: Sequence[Point]) -> Sequence[Point]:
     left = list(group)
     while len(left) > KEEP_POINTS:
-        # Windows that nobody calibrated from go first, what somebody has decided for last.
+        # Drop windows without a calibration first, chosen points last.
         ranks = [(any(of is not None and of.chosen for of in (p.gyro, p.accel)), bool(p.started_at)) for p in left[:-1]]
         steps = [abs((b.temperature_degc or 0.0) - (a.temperature_degc or 0.0)) for a, b in itertools.pairwise(left)]
         del left[min(range(len(steps)), key=lambda k: (ranks[k], steps[k]))]
@@ -150,7 +149,7 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
     """Choose the points for a prediction of one triad, by power-up.
 
-    Outliers are left out. `NEW_AFTER` of them in a row, or a chosen one, are none: then all before them is left out.
+    Outliers are left out. `NEW_AFTER` in a row, or a chosen one, show a new sensor: then all before are left out.
     """
     measured = [point for point in points if point.of(triad) is not None]
     start = max((k for k, point in enumerate(measured) if point.measured(triad).chosen), default=0)

@@ -1,6 +1,6 @@
-"""The record of one calibration: what was found, how well, and what was done with it.
+"""Record of one calibration: results, sigmas, and parameters written.
 
-The keys are a surface that others rely on. What is unknown or does not apply is None (null in JSON), never absent
+The keys are a public interface. A value that is unknown or does not apply is None (null in JSON), never absent
 and never zero. All axes are the vehicle's FRD.
 """
 
@@ -40,7 +40,7 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     gamma_deg: float | None
     psi_deg: float | None
     sigma_deg: PoseSigma
-    tilt_from: TiltFrom | None = None  # "accelerometers": those of an IMU that was held on all sides before
+    tilt_from: TiltFrom | None = None  # "accelerometers": of an IMU that was calibrated on all sides before
     heading_from: HeadingFrom | None = None
 
 
@@ -55,9 +55,9 @@ class SiteRecord(msgspec.Struct, frozen=True, kw_only=True):
 class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     """Magnetic field at the compass and the Earth's by WMM2025; inclinations down positive. None: unknown.
 
-    The heading's error exceeds its bound in one case of twenty; 180: the field shows no heading. `heading_from`: with
-    the device's own tilt compensation, or with ours by the gradienter. `device_minus_field_deg`: the one less the
-    other, where the device gives both.
+    The heading error exceeds its bound in one case of twenty; 180: the field gives no heading. `heading_from`: the
+    device's own tilt compensation, or ours from the gradienter. `device_minus_field_deg`: difference of both headings,
+    if the device sends both.
     """
 
     heading_bound_deg: float | None
@@ -91,11 +91,11 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
-    """Platform under the aircraft, and its own turn; the gyros' sigma allows for it.
+    """Turn of the platform under the aircraft, about the vertical, clockwise seen from above.
 
-    It turns about the vertical, clockwise seen from above; that is not taken off. None: nothing told, and the ground
-    was taken for fixed to the Earth. Told by gyros: by their level at an earlier rest; by earlier calibrations: by the
-    biases that they have led to expect.
+    The turn is not subtracted; the gyros' sigma includes it. None: no source measured it, and the ground was assumed
+    fixed to the Earth. "gyros": measured against their level at an earlier rest. "earlier calibrations": against the
+    biases that these predict.
     """
 
     platform: Literal["ground", "deck"]
@@ -103,14 +103,14 @@ class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
     """About the vertical, clockwise seen from above, not subtracted; None: not measured, assumed fixed to the Earth."""
     turn_sigma_deg_s: float | None
     told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
-    """Gyros: by their level at an earlier rest; earlier calibrations: by the biases that they have led to expect."""
+    """Source of the turn. Gyros: against their level at rest; earlier calibrations: against predicted biases."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
-    """One autopilot parameter: before, what was set, what came back.
+    """One autopilot parameter: value before, value set, value read back.
 
     "verified": read back and seen in the telemetry. "stored": read back, but its effect cannot be seen.
-    "failed": not set, or not put back. "rolled_back": the old value is in force again.
+    "failed": not set, or not restored. "rolled_back": the old value is active again.
     """
 
     before: float | None
@@ -120,23 +120,23 @@ class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 Prior = dict[Triad, dict[str, Any] | None]
-"""Predictions for one IMU from earlier power-ups; None: fewer than three of them.
+"""Predictions for one IMU from earlier power-ups; None: fewer than three power-ups.
 
-`used`: it took part in the estimate; it guards in any case. `power_ups`: their number. `temperature_model`: by a curve.
-`expected_rad_s` or `expected_m_s2`, with `sigma_…` of today's bias about it. `measured_…`: the bias by the readings
-alone. `shift_sigma`: their difference in sigmas.
+`used`: the prediction took part in the estimate (every prediction is a plausibility gate). `power_ups`: their number.
+`temperature_model`: from a curve. `expected_rad_s` or `expected_m_s2`, with `sigma_…` of today's bias about it.
+`measured_…`: bias from the readings alone. `shift_sigma`: their difference in sigmas.
 """
 
 
 class Effective(msgspec.Struct, frozen=True, kw_only=True):
-    """Sigma of the accelerometers' bias at another attitude: scale errors times 1 g are in it.
+    """Sigma of the accelerometers' bias at another attitude, with scale errors times 1 g.
 
-    The scale is told by an alignment with tilts, or assumed (0.5 %). An axis' bias moves by `scale_sigma_m_s2`, one
-    sigma, times the change of its share of gravity; the vertical one's of a level aircraft that is tilted, times
-    1 - cos(tilt). `sensor_sigma_m_s2` is that of the sensor's own bias, in its own axes, whatever its attitude.
+    An alignment with tilts measures the scale; else 0.5 % is assumed. The bias of an axis changes by
+    `scale_sigma_m_s2`, one sigma, times the change of its share of gravity: 1 - cos(tilt) for the vertical axis of a
+    level aircraft. `sensor_sigma_m_s2` is that of the sensor's own bias, in its own axes, at any attitude.
     """
 
-    scale_from: Literal["assumed", "alignment"]  # An alignment with tilts has told the scale; else 0.5 % is assumed
+    scale_from: Literal["assumed", "alignment"]  # "alignment": measured with tilts; "assumed": 0.5 %
     scale_sigma_m_s2: Vector
     level_sigma_m_s2: Vector
     sensor_sigma_m_s2: Vector
@@ -150,7 +150,7 @@ class WhenWarm(msgspec.Struct, frozen=True):
     gyro_sigma_rad_s: Vector
     accel_bias_m_s2: Vector | None
     accel_sigma_m_s2: Vector | None
-    words: tuple[str, ...] = ()  # Words for people on the axes that will move most; empty: not worth saying
+    words: tuple[str, ...] = ()  # Text on the axes that will change most; empty: negligible
 
 
 class TriadFigures(NamedTuple):
@@ -165,10 +165,10 @@ class TriadFigures(NamedTuple):
 class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written.
 
-    The covariance is 6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None where that half was not determined.
-    The warm-up's part of sigma_use is too small to see, and only time removes it. Triads `held_back` contradict earlier
-    calibrations and were not requested; `unchanged` are those whose offsets in force are as good, with their sigma in
-    force. Device ids are the autopilot's; None: it has none, or the record is of an older version.
+    The covariance is 6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None for a half that was not determined.
+    sigma_use includes an invisible warm-up, which only time removes. Triads `held_back` contradict earlier calibrations
+    and were not requested explicitly. Triads `unchanged` keep their active offsets, which are as good, with the sigma
+    "in force". Device ids are the autopilot's; None: it has none, or the record is of an older version.
     """
 
     name: str
@@ -190,13 +190,13 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
     gyro_sigma_warm_up_rad_s: Vector | None = None
-    """Part of sigma_use for a warm-up too small to see; only time removes it."""
+    """Part of sigma_use from a warm-up too small to see; only time removes it."""
     accel_sigma_warm_up_m_s2: Vector | None = None
     when_warm: WhenWarm | None = None  # None: the board was warm, or the end of its warm-up is unknown
     gyro_id: int | None = None  # Device ids in the autopilot; None: it has none, or the record is of an older version
     accel_id: int | None = None
     gyro_sigma_in_force_rad_s: Vector | None = None
-    """One sigma of the offsets that this calibration left unchanged; None where it wrote them."""
+    """One sigma of the offsets that this calibration left unchanged; None if it wrote them."""
     accel_sigma_in_force_m_s2: Vector | None = None
 
     def of(self, triad: Triad) -> TriadFigures:
@@ -207,7 +207,7 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
         return TriadFigures(self.accel_bias_m_s2, *sigmas, self.residual_accel_m_s2, self.accel_sigma_in_force_m_s2)
 
     def sigma_in_force(self, triad: Triad) -> Vector | None:
-        """Return one sigma of what the offsets in force leave in the output, for the next minutes."""
+        """Return one sigma of the residual bias with the active offsets, for the next minutes."""
         own = self.of(triad)
         if own.sigma_in_force is not None:
             return own.sigma_in_force
@@ -216,14 +216,14 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
         return _each(math.hypot, own.sigma_use, own.residual)
 
     def settled_sigma(self, triad: Triad) -> Vector | None:
-        """Return sigma_use without the warm-up, which moves the output alike under old and new offsets."""
+        """Return sigma_use without the warm-up, which changes the output equally with old and new offsets."""
         own = self.of(triad)
         if own.sigma_use is None or own.sigma_warm_up is None:
             return own.sigma_use
         return _each(lambda use, part: math.sqrt(max(use**2 - part**2, 0.0)), own.sigma_use, own.sigma_warm_up)
 
     def confirming(self, before: ImuRecord | None) -> ImuRecord:
-        """Return this record with the sigma of the offsets that it left unchanged; `before` describes their origin."""
+        """Return this record with the sigma of the offsets that it left unchanged; `before`: record of their origin."""
 
         def confirmed(triad: Triad) -> Vector | None:
             own = self.of(triad)
@@ -237,10 +237,10 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: float) -> float:
-    """Return one sigma of an offset of known sigma after a second measurement has found this residual.
+    """Return one sigma of an offset whose sigma was `earlier`, after a second measurement with this residual.
 
-    The residual counts by the share that its own noise does not explain. The second measurement alone would leave
-    hypot(sigma, residual). No average of the two sigmas is claimed: part of their errors is common.
+    The residual counts by the share that its noise does not explain. The second measurement alone would give
+    hypot(sigma, residual). The sigmas are not averaged, because part of their errors is common.
     """
     gain = earlier**2 / max(earlier**2 + averaged**2, sys.float_info.min)
     return min(math.hypot(earlier, gain * residual), math.hypot(sigma, residual))
@@ -252,10 +252,10 @@ def _each(function: Callable[..., float], *vectors: Vector | None) -> Vector:
 
 
 class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Calibration in force when the aircraft armed.
+    """Calibration that was active when the aircraft armed.
 
-    "calibrated": by the calibration that began at `calibration`. "checked": offsets of unknown origin, measured to be
-    right. "uncalibrated": neither; `reason` says why.
+    "calibrated": by the calibration that began at `calibration`. "checked": offsets of unknown origin that a
+    measurement confirmed. "uncalibrated": neither; `reason` gives the cause.
     """
 
     armed_at: str
@@ -264,13 +264,13 @@ class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
     at_arm: Literal["gate", "warn", "off"]
     calibration: str | None
     calibrated_ago_s: float | None
-    confirmed_ago_s: float | None  # Time since a still window last agreed with the offsets in force
+    confirmed_ago_s: float | None  # Time since a still window last agreed with the active offsets
     gyro_sigma_use_rad_s: float | None
     accel_sigma_use_m_s2: float | None
 
 
 class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
-    """The alignment of the gradienter that was in force: its zero on top of the configured one, and its sigma."""
+    """Alignment of the gradienter in use: its zero on top of the configured one, and sigma."""
 
     measured_at: str
     offset_deg: tuple[float, float]
@@ -278,10 +278,10 @@ class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """One calibration, finished in whatever way; times are UTC, ISO 8601, by the host's clock, which may be wrong.
+    """One finished calibration; times are UTC, ISO 8601, by the host's clock, which may be wrong.
 
-    `alignment` None: the gradienter's zero and sigma were those of the configuration. `armings` is empty in the file,
-    and filled in by the history.
+    `alignment` None: the gradienter's zero and sigma were those of the configuration. `armings` is empty in the file;
+    the history fills it in.
     """
 
     format_version: int = FORMAT_VERSION
@@ -293,9 +293,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     pose: Pose | None
     site: SiteRecord | None
     imus: tuple[ImuRecord, ...]
-    system_id: int | None = None  # MAVLink system of the vehicle; None while it had not been heard
+    system_id: int | None = None  # MAVLink system id of the vehicle; None before its first heartbeat
     alignment: AlignmentUsed | None = None
-    undone_at: str | None = None  # UTC, ISO 8601: when what this calibration has written was put back on request
+    undone_at: str | None = None  # UTC, ISO 8601: time at which the old offsets were restored on request
     magnetic: Magnetic | None = None
     standing: PlatformTurn | None = None
     armings: tuple[ArmingRecord, ...] = ()
@@ -314,7 +314,7 @@ def to_json(record: Record) -> bytes:
 
 
 def from_json(data: bytes) -> Record:
-    """Read a record back.
+    """Parse a record.
 
     Raises:
         msgspec.MsgspecError: not a record, or one of a newer companion.

@@ -1,15 +1,15 @@
-"""Is the calibration in force still good?
+"""Validity check of the active calibration.
 
-What was found right (written and seen, or measured to be right as it is) ages. Limits from the error budget (method
-2.2 and 3.2):
+A confirmed calibration (written and seen in the telemetry, or measured to be right) ages. Its limits follow from the
+error budget (method 2.2 and 3.2):
 
-- age: the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use; at most the configured
-  limit (30 minutes);
+- age: the wander predicted by the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, for at most the
+  configured limit (30 minutes);
 - temperature: the change of the bias by its curve stays below `DRIFT_SIGMAS` sigma; without a curve 3 K, configurable;
-- the rolling window: the output now differs from what it must be by less than `RESIDUAL_SIGMAS` of both.
+- residual: the output of the rolling window differs from the expected one by less than `RESIDUAL_SIGMAS` of both.
 
-Age and temperature count from the last time that a still window agreed: an aircraft that stands about for an hour keeps
-its calibration without a single write.
+Age and temperature count from the last still window that agreed: an aircraft that stands for an hour keeps its
+calibration without a write.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from companion.samples import Triad, Vector
 DRIFT_SIGMAS: Final = 2.0
 RESIDUAL_SIGMAS: Final = 3.0
 WORTH_SIGMAS: Final = 2.0
-"""A new write must be worth more than this many sigma_use: below, it would mostly write the noise of today."""
+"""Least improvement for a new write, in sigma_use: a smaller one would mostly write noise."""
 
 _LONGEST_S: Final = 24 * 3600.0
 _NONE: Final[Vector] = (0.0, 0.0, 0.0)
@@ -40,7 +40,7 @@ _DIGITS: Final[dict[Triad, int]] = {"gyro": 0, "accel": 2}
 
 
 class Why(enum.Enum):
-    """Reasons why a calibration does not count as good; the values are what people read."""
+    """Reasons why a calibration does not count as good; the values are shown to operators."""
 
     NEVER = "not calibrated yet"
     UNDONE = "calibration was undone"
@@ -56,11 +56,11 @@ class Why(enum.Enum):
 
 
 class Held(msgspec.Struct, frozen=True, kw_only=True):
-    """The gyros or accelerometers of one IMU while its calibration is good; rad/s or m/s^2.
+    """State of one triad of one IMU while its calibration is good; rad/s or m/s^2.
 
-    `calibrated_s` None: the offsets were only measured to be right. `sigma_use` was promised; `sigma` leaves out the
-    warm-up to come, for comparisons: that moves old and new offsets alike. `expected` is the output minus truth: zero
-    where the autopilot corrects, else the whole bias. `seen`: in the telemetry. `averaged_s`: T of V(T, H).
+    `calibrated_s` None: the offsets were only measured to be right. `sigma_use` is the stated sigma. `sigma`, for
+    comparisons, excludes the coming warm-up, which affects old and new offsets equally. `expected`: output minus truth,
+    zero if the autopilot corrects, else the whole bias. `seen`: in the telemetry. `averaged_s`: T of V(T, H).
     """
 
     calibrated_s: float | None
@@ -76,7 +76,7 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
 def held_of(
     imu: ImuRecord, triad: Triad, now_s: float, averaged_s: float, *, corrected: bool, seen: bool
 ) -> Held | None:
-    """State of one triad right after its calibration; None where that found nothing. `corrected`: by the autopilot."""
+    """Return one triad's state after its calibration; None without a result. `corrected`: by the autopilot."""
     bias = imu.of(triad).bias
     sigma, settled = imu.sigma_in_force(triad), imu.settled_sigma(triad)
     if sigma is None or settled is None or bias is None:
@@ -94,7 +94,7 @@ def held_of(
 
 
 class Present(msgspec.Struct, frozen=True, kw_only=True):
-    """Rolling window now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD), sigmas as in `Held`."""
+    """Rolling window's output minus truth at this pose (rad/s or m/s^2, vehicle FRD); sigmas as in `Held`."""
 
     residual: Vector
     sigma_use: Vector
@@ -108,7 +108,7 @@ class Objection(NamedTuple):
 
 @functools.lru_cache(maxsize=128)
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
-    """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
+    """Return the horizon H at which V(T, H) without its white part, the wander, reaches DRIFT_SIGMAS sigma_use.
 
     At most a day, far beyond the configured limit. The smallest axis of `sigma` counts; `averaged_s` is T.
     """
@@ -130,8 +130,8 @@ def judge(
 ) -> list[Objection]:
     """List the reasons against one triad's calibration; empty while it is good.
 
-    `now_s` is on the clock of `held`; `present` is a still window, if there is one. `drift`: change of the bias with
-    the temperature since `held`, and its variance; None: unknown.
+    `now_s` is on the clock of `held`; `present` is a still window, or None. `drift`: change of the bias with the
+    temperature since `held`, and its variance; None: unknown.
     """
     name, triad = key
     (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
@@ -170,14 +170,14 @@ def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor:
 
 
 def worst_axis(held: Held, present: Present) -> float | None:
-    """The largest difference, signed, beyond RESIDUAL_SIGMAS of what both sides were known with; None: all agree."""
+    """Return the largest signed difference beyond RESIDUAL_SIGMAS of both sigmas combined; None: all axes agree."""
     return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
-    """Decide whether new offsets would better any axis by more than WORTH_SIGMAS and more than the floor.
+    """Return whether new offsets would improve any axis by more than WORTH_SIGMAS and more than `floor`.
 
-    The calibration in force was not known better than its own sigma; the floor is in the same unit.
+    The active calibration is not better than its own sigma; the floor is in the same unit.
     """
     expected, then = (_NONE, _NONE) if held is None else (held.expected, held.sigma)
     return bool(_off(present, expected, then, WORTH_SIGMAS, floor))

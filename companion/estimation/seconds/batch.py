@@ -1,4 +1,4 @@
-"""One-second batches: all that is kept of a stream.
+"""One-second batches: the summary of a stream that is kept.
 
 Batches lie on one grid for all sources: slot k holds k <= t < k + 1 s of the host's clock. Samples are plain tuples
 until a slot is over; then numpy summarises them once.
@@ -18,29 +18,29 @@ from numpy.typing import NDArray
 
 from companion.physics.frames import Floats
 
-MAX_SAMPLES: Final = 4096  # Samples kept of one slot, ten times the fastest stream; more are dropped and counted
+MAX_SAMPLES: Final = 4096  # Maximum samples of one slot, ten times the fastest stream; more are dropped and counted
 MAX_LEVELS: Final = 1024
-"""Largest range of integers within one second that are counted one by one; at rest it is a tenth of that."""
+"""Largest range of integers in one second for which a histogram is kept; at rest the range is a tenth of this."""
 
-_EVEN: Final = 1.4999  # Counter steps within this ratio of each other are one sample each
+_EVEN: Final = 1.4999  # Counter steps within this ratio of each other count as one sample each
 _OFF_BEAT: Final = 0.25
-"""A step farther from a whole number of usual ones is no loss: lost samples leave whole steps out."""
+"""Largest distance of a step from a multiple of the usual one that shows a loss: lost samples skip whole steps."""
 _MOST_OFF_BEAT: Final = 0.2
-"""With a larger share of such steps the stamps do not count samples: the sender picks some of them."""
+"""Largest share of off-beat steps; beyond it the stamps do not count samples, because the sender picks some of them."""
 _LEAST_OF_A_PART: Final = 4
-_FINEST: Final = 5  # Halvings of a second: 1/32 s; what is faster is vibration
+_FINEST: Final = 5  # Halvings of a second, down to 1/32 s; anything faster is vibration
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
 _MAX_TIME_S: Final = 1e12
-_BACKWARD_SAMPLES: Final = 20  # Samples in a row from the past that show a clock gone back; fewer are late
+_BACKWARD_SAMPLES: Final = 20  # Samples in a row from the past that show a clock set back; fewer are late samples
 _BACKWARD_S: Final = 2.0
-_PAUSE_S: Final = 3.0  # A sensor that was silent for longer may have been switched off
+_PAUSE_S: Final = 3.0  # Longest silence without suspicion of a power-off
 _MAX_DECIMALS: Final = 4
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """Histogram of one second: how often, (k, c), each integer was read, from `lowest` (c,) on, in steps."""
+    """Histogram of one second: counts (k, c) of the integers from `lowest` (c,) on, in steps."""
 
     lowest: NDArray[np.int64]
     table: NDArray[np.int32]  # (k, c), k at most `MAX_LEVELS`
@@ -50,10 +50,10 @@ class Batch(msgspec.Struct, frozen=True):
     """One second of one source; arrays are (c,) over its channels, in the source's units.
 
     `white`: half the mean square of successive differences (von Neumann), the white part of the variance. `missing`:
-    samples lost, by the device's counter or clock; None where it has none that counts samples. `counts`: None for
+    samples lost, from the device's counter or clock; None without one that counts samples. `counts`: None for
     floats, and for a second that spans more than `MAX_LEVELS`. `allan`: (k, c) Allan variances at averaging times of
-    1/2, 1/4 ... 1/32 of the second, each of four samples or more. `shared_variance`: (6,) variance of an error that all
-    samples of an IMU, also of other seconds, have in common.
+    1/2, 1/4 ... 1/32 of the second, each of four samples or more. `shared_variance`: (6,) variance of an error common
+    to all samples of an IMU, also of other seconds.
     """
 
     slot: int
@@ -64,8 +64,8 @@ class Batch(msgspec.Struct, frozen=True):
     low: Floats
     high: Floats
     distinct: NDArray[np.int64]
-    clipped: bool  # Some channel's commonest value is its extreme one: readings pile up at the end of the range
-    largest_gap_s: float  # Between samples, and to both ends of the slot
+    clipped: bool  # True if readings of a channel pile up at the end of its range
+    largest_gap_s: float  # Longest gap between samples, or to an end of the slot
     missing: int | None
     temperature_degc: float | None
     counts: Counts | None = None
@@ -84,11 +84,11 @@ def summary(
     steps: Floats | None = None,
     shared_variance: Floats | None = None,
 ) -> Batch:
-    """Summarise (n, c) rows of one second, at least one; angles are unrolled, `steps` are those of integers."""
+    """Summarise at least one row (n, c) of one second; `circle`: unroll angles; `steps`: of an integer stream."""
     n = len(rows)
     ordered = np.sort(rows, axis=0)
     distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
-    # The very sums of `mean` and `var`, each once.
+    # The sums of `mean` and `var`, computed once each.
     centre = np.add.reduce(rows, axis=0) / n
     off, successive = rows - centre, rows[1:] - rows[:-1]
     return Batch(
@@ -111,7 +111,7 @@ def summary(
 
 
 def _allan_within(off: Floats) -> Floats:
-    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
+    """Return Allan variances of rows (n, c) of one second, for halves, quarters ... of at least four samples each."""
     firsts, sizes = _parts_of(len(off))
     depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))
@@ -125,7 +125,7 @@ def _allan_within(off: Floats) -> Floats:
 
 @functools.lru_cache(maxsize=64)
 def _parts_of(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Divide n samples into k parts, a power of two: first sample of each, (k,), and its number of samples, (k, 1)."""
+    """Divide n samples into k parts, a power of two; return each part's first sample, (k,), and size, (k, 1)."""
     depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
     edges = np.arange((1 << depth) + 1) * n >> depth
     return edges[:-1], np.diff(edges)[:, None]
@@ -153,9 +153,9 @@ def unrolled(rows: Floats) -> Floats:
 
 
 def _fresh(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
-    """Mark rows, (n,), that do not repeat an earlier stamp and its values: the same packet over a second route.
+    """Mark rows, (n,), that do not repeat both stamp and values of an earlier one (a packet over a second route).
 
-    A stamp alone is not enough: counters wrap, and some devices' clocks stand still.
+    A stamp alone is not enough: counters wrap, and some devices' clocks do not advance.
     """
     if (stamps[1:] > stamps[:-1]).all():
         return np.ones(len(rows), dtype=np.bool_)
@@ -164,10 +164,10 @@ def _fresh(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
 
 
 def _missing(stamps: Floats) -> int | None:
-    """Count lost samples by a counter; a clock in seconds counts in its own steps just as well.
+    """Count lost samples from the steps of a counter or of a clock in seconds.
 
-    The step is learned, since some devices count at an internal rate; a step down, as after a restart, is no loss.
-    None where stamps count no samples: PX4's telemetry takes those of 4 ms that are there when a message is due.
+    The step is learned, because some devices count at an internal rate; a step down, as after a restart, is no loss.
+    None if stamps do not count samples: PX4 sends the newest sample (every 4 ms) whenever a message is due.
     """
     steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
@@ -181,11 +181,11 @@ def _missing(stamps: Floats) -> int | None:
 
 
 def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
-    """True if some channel's lowest or highest value is by far its commonest.
+    """Return whether a channel's lowest or highest value is by far its most frequent one.
 
-    Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing: a
-    quantised stream of a still sensor looks like that. Of 50 integers the lowest is now and then the commonest by
-    chance, so the pile must exceed the next by four standard deviations of such counts.
+    Noise gets rare towards its extremes, so a pile there shows the end of the range. Few distinct values prove nothing:
+    the quantised stream of a still sensor has few. Of 50 integers, the lowest is sometimes the most frequent by chance,
+    so its count must exceed the next by four standard deviations.
     """
     if len(ordered) <= _PINNED_SAMPLES:
         return False
@@ -203,7 +203,7 @@ def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
 
 
 def decimal(low: Floats, high: Floats) -> Floats:
-    """Find the last decimal that a stream prints, (c,), by the lowest and highest readings of any seconds, (..., c)."""
+    """Find the unit of the last printed decimal, (c,), from lowest and highest readings of seconds, (..., c)."""
     ends = np.vstack((low, high))
     found = np.full(ends.shape[1], 10.0**-_MAX_DECIMALS)
     for digits in range(_MAX_DECIMALS - 1, -1, -1):
@@ -213,15 +213,15 @@ def decimal(low: Floats, high: Floats) -> Floats:
 
 
 def few_distinct(distinct: Floats | NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(c,) whether no second, (m, c), shows more than two values: then noise does not spread the readings."""
+    """Return (c,) flags of channels with at most two values in every second (m, c): noise does not spread them."""
     return np.asarray(distinct.max(axis=0) < 3)
 
 
 class BatchSource:
-    """Collects one stream into batches. Never raises on what arrives; counts what it drops by reason.
+    """Collects one stream into batches. No sample value raises an exception; dropped samples are counted by reason.
 
     Values beyond `limits` (c,) are dropped; `keep` batches are kept. `circle`: the single channel is an angle in
-    degrees. `steps` (c,): resolution of a stream of integers, whose histogram every second keeps.
+    degrees. `steps` (c,): resolution of an integer stream, for which every batch has a histogram.
     """
 
     def __init__(
@@ -230,17 +230,17 @@ class BatchSource:
         self.dropped: Counter[str] = Counter()
         self.batches: dict[int, Batch] = {}
         self.closed_through: int | None = None
-        """No batch of this slot or an earlier one will follow."""
+        """Last closed slot: no batch of it or of an earlier slot will follow."""
         self.last_s: float | None = None
         self.begun: int | None = None
-        """First second without a longer pause since."""
+        """First second of the stream since its last pause of more than `_PAUSE_S`."""
         self.lost = 0  # Samples lost since the beginning, by the device's counter or clock
         self.restarts = 0  # Number of times that the clock went back and everything was dropped
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
         """Plausibility check of a second's temperature: takes slot and degC, returns the temperature, or None."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
-        """Called with every second, its times (n,) and its rows (n, c), before those are dropped."""
+        """Callback for every second: batch, times (n,) and rows (n, c), before these are dropped."""
         self._restart()
 
     def _restart(self) -> None:
@@ -264,7 +264,7 @@ class BatchSource:
         self._shared_variance: tuple[float, ...] | None = None
 
     def forget(self) -> None:
-        """Drop all batches and the second under way; counts stay."""
+        """Drop all batches and the current second; counts stay."""
         self.batches.clear()
         if self._slot is not None:
             self.closed_through = self._slot
@@ -278,7 +278,7 @@ class BatchSource:
         stamp: float | None = None,
         shared_variance: tuple[float, ...] | None = None,
     ) -> bool:
-        """Add one sample; True when it ends a second, or shows that its clock went back."""
+        """Add one sample; return True if it closes a second, or shows a clock set back."""
         ended = False
         if not self._newest <= t_s < self._slot_end:
             if not self._newest <= t_s < _MAX_TIME_S:
@@ -318,7 +318,7 @@ class BatchSource:
         self._close()
         self._slot = slot
         self._slot_end = slot + 1.0
-        # A stream that has just begun did so in the middle of a second.
+        # A stream begins in the middle of a second.
         self._partial = first
         self.closed_through = slot - 1
         return not first
@@ -328,7 +328,7 @@ class BatchSource:
             return False
         slot = math.floor(t_s)
         self._open(slot)
-        # A sample from before is late now.
+        # An older sample counts as late from now on.
         self._newest = max(self._newest, float(slot))
         return True
 

@@ -1,8 +1,8 @@
-"""Turn of an aircraft on its spot: its gyros, sample by sample, integrated as rotations.
+"""Turn of an aircraft on its spot, from its gyro samples integrated as rotations.
 
-Hands that turn an aircraft tilt it too. With a tilt of 4 deg, rates about down alone miss half a turn by 0.5 deg, with
-12 deg by 5; all three axes together miss it by 0.05 and 0.1 (simulated: scales of 1 %, axes 0.5 deg from square). The
-gyros' scale remains, 1.8 deg of half a turn; closing the circle shows it (`alignment.align_model`).
+Turning an aircraft by hand tilts it, too. In half a turn, the integral of rates about down alone is wrong by 0.5 deg
+at a tilt of 4 deg, and by 5 deg at 12 deg; with all three axes by 0.05 and 0.1 deg (simulated: scales of 1 %, axes
+0.5 deg from square). The gyros' scale error remains, 1.8 deg in half a turn; a closed circle shows it (`align_model`).
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import numpy as np
 from companion.physics.frames import Array, Floats, Matrix, rotations, running_products
 from companion.samples import ImuSample
 
-MAX_SAMPLES: Final = 60_000  # Ten minutes at 100 Hz, 2.4 MB, since the stand before; a longer turn is not counted
+MAX_SAMPLES: Final = 60_000  # Ten minutes at 100 Hz, 2.4 MB, since the last stand; a longer turn is not counted
 LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
-"""Longest hole beyond the stream's interval: hands that turn by 60 deg/s turn by 3 degrees meanwhile."""
-AT_REST_S: Final = 0.5  # Longest hole at rest: nobody turns an aircraft from rest to rest in less
+"""Longest gap beyond the stream's interval: a turn by hand at 60 deg/s makes 3 degrees in it."""
+AT_REST_S: Final = 0.5  # Longest gap at rest: a turn from rest to rest takes longer
 LATE_S: Final = 0.05
-"""Delay of a sample; a larger disagreement of the clocks is a wrong pace, as of a simulator on a busy computer."""
+"""Largest delay of a sample; a larger difference of the clocks shows a wrong rate, as of a slow simulator."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
-"""Error of each turn besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
+"""Error of each turn besides scale and time stamps: non-orthogonal axes while the aircraft is tilted."""
 
 
 class Counted(NamedTuple):
@@ -36,7 +36,7 @@ class Counted(NamedTuple):
 
 
 class TurnCounter:
-    """Keeps the latest rates of one IMU, sample by sample."""
+    """Buffers the latest rates of one IMU and integrates the turn between two times."""
 
     def __init__(self) -> None:
         self._samples = array("d")
@@ -50,9 +50,9 @@ class TurnCounter:
     def counted(
         self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix, cut_rad_s: float = 0.0
     ) -> Counted | None:
-        """Integrate the turn between two times at rest; None where samples are missing. Drops older samples.
+        """Integrate the turn between two times at rest; None if samples are missing. Drops older samples.
 
-        `bias_rad_s` (3,) is in the vehicle's axes; `cut_rad_s` is the step of integers that are cut off toward zero.
+        `bias_rad_s` (3,) is in the vehicle's axes; `cut_rad_s` is the step of integers truncated toward zero.
         """
         rows = np.array(self._samples).reshape(-1, 5)
         old = int(np.searchsorted(rows[:, 0], start_s))
@@ -60,9 +60,9 @@ class TurnCounter:
         rows = rows[old : int(np.searchsorted(rows[:, 0], end_s))]
         if len(rows) < LEAST_SAMPLES or rows[0, 0] - start_s > AT_REST_S or end_s - rows[-1, 0] > AT_REST_S:
             return None
-        if (np.diff(rows[:, 1]) < -AT_REST_S).any():  # the device has begun anew
+        if (np.diff(rows[:, 1]) < -AT_REST_S).any():  # the device has restarted
             return None
-        # By the device's clock where it has one, for on their way samples bunch, and come twice.
+        # Prefer the device's clock: transmission bunches samples and repeats some.
         times, rates, late_s = rows[:, 0], rows[:, 2:], 0.0
         device_s, order = np.unique(rows[:, 1], return_index=True)
         if np.isfinite(device_s).all() and 2 * len(device_s) > len(rows):
@@ -71,7 +71,7 @@ class TurnCounter:
         if len(gaps) == 0 or max(gaps.max(), late_s) > AT_REST_S:
             return None
         rates = (rates + np.sign(rates) * cut_rad_s / 2.0) @ vehicle_from_sensor.T - bias_rad_s
-        # At rest it does not turn, whatever integers and a bias that wanders make of minutes of it.
+        # Integrate only while it moves: at rest, truncation and a wandering bias would add up over minutes.
         moves_s = times[np.abs(rates).max(axis=1) > MOVES_RAD_S + cut_rad_s]
         if len(moves_s) == 0:
             return Counted(0.0, SIGMA_RAD)
@@ -80,14 +80,14 @@ class TurnCounter:
         if len(times) < LEAST_SAMPLES or np.diff(times).max() > np.median(gaps.tolist()) + HOLE_S:
             return None
         angle_rad = _turned_rad(times, rates)
-        # Every fourth sample by itself misses by twice as much as sampling and stamps make of all.
+        # The error of every fourth sample alone is twice the error of all from sampling and stamps.
         parts = [_turned_rad(times[k::4], rates[k::4]) - angle_rad for k in range(4)]
         off_pace = abs(angle_rad) * max(late_s - LATE_S, 0.0) / float(np.ptp(times))
         return Counted(angle_rad, math.hypot(SIGMA_RAD, float(np.linalg.norm(parts)) / math.sqrt(12.0), off_pace))
 
 
 def _turned_rad(times_s: Floats, rates_rad_s: Floats) -> float:
-    """Twist about z of the rotation by rates (n, 3), by trapezoids, followed all the way."""
+    """Return the twist about z, not wrapped, of the rotation by rates (n, 3), integrated by trapezoids."""
     vectors = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0 * np.diff(times_s)[:, None]
     turns = running_products(rotations(vectors))
     return float(np.unwrap(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))[-1])

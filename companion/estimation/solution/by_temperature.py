@@ -1,4 +1,4 @@
-"""Biases of one IMU over temperature, as the terminal, the page and reports show them.
+"""Biases of one IMU over temperature, for the terminal, the page and reports.
 
 Imports no numpy: the page's process reads these types.
 """
@@ -26,9 +26,9 @@ _DAY_S: Final = 86400.0
 
 
 class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
-    """One still window, vehicle FRD; `started_at` of the calibration that used it, if one did.
+    """Biases of one still window, vehicle FRD; `started_at`: calibration that used it; empty: none did.
 
-    Power-ups are counted from 0. Accelerometers None: the tilt was unknown.
+    Power-ups count from 0. Accelerometers None: the tilt was unknown.
     """
 
     at_unix_s: float
@@ -68,10 +68,10 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     curve: tuple[Expected, ...]  # Expected gyro biases of the next power-up; empty: not known yet
     accel_curve: tuple[ExpectedForces, ...] = ()
     """Expected accelerometer biases of the next power-up; empty: not known yet."""
-    needs: str | None = None  # Reason why there is no curve, and what will make one; None: there is one
-    today: int | None = None  # Number of the present power-up; None: nothing is known of it yet
-    now: Expected | None = None  # Bias now: as last measured in this power-up, moved along the curve since
-    at_power_up: Expected | None = None  # Bias that the curve expects of a power-up at the temperature now
+    needs: str | None = None  # Reason why there is no curve, and the remedy; None: there is one
+    today: int | None = None  # Number of the present power-up; None: no window of it yet
+    now: Expected | None = None  # Present bias: last measured in this power-up, then moved along the curve
+    at_power_up: Expected | None = None  # Bias that the curve predicts for a power-up at the present temperature
 
 
 def by_temperature(

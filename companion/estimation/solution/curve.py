@@ -1,20 +1,20 @@
-"""Model of one triad's bias over temperature: a mean over power-ups, or one cubic common to all of them.
+"""Model of one triad's bias over temperature: a mean over power-ups, or one cubic common to all power-ups.
 
 The bias of power-up s at the temperature T is
 
     o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K.
 
 Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run); the cubic is
-common to all. The die is as warm as its thermometer was `lag` before: that is why heating and cooling differ. The fit
-is generalised least squares over means of still seconds at one temperature. The coefficients have a prior as
-wide as the catalogue's parts move, so the model is uncertain at temperatures that were not seen.
+common to all. The die is as warm as its thermometer was `lag` earlier, so heating and cooling differ. The fit is
+generalised least squares over means of still seconds at one temperature. The prior of the coefficients is as wide as
+the catalogue's slopes, so the model is uncertain at temperatures that were not seen.
 
-Each power-up is predicted from the others at its first node. The errors choose the lag, choose between cubic and mean,
+Each power-up is predicted from the others at its first node. The errors select the lag and the order (cubic or mean),
 and scale tau until the actual error matches the predicted one. The change from the first node to the last is predicted
 as well: it scales the error of changes, and reveals a thermometer that is not in this IMU.
 
-A warm-up ends where the present rate says: a board that approaches its end as exp(-t / tau) has tau dT/dt to go,
-whatever the temperature of the air. Earlier power-ups tell tau.
+The present rate predicts the end of a warm-up: a board that approaches its end as exp(-t / tau) still warms by
+tau dT/dt, at any air temperature. Earlier power-ups determine this time constant.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ REFERENCE_DEGC: Final = 35.0
 UNIT_K: Final = 20.0
 LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
-"""Kelvins beyond the temperatures seen within which the model is valid (method 3.3)."""
+"""Range beyond the temperatures seen in which the model is valid, K (method 3.3)."""
 FEWEST: Final = 3
 _CUBIC: Final = 3
 _BETTER: Final = 0.9
@@ -47,29 +47,29 @@ _BETTER: Final = 0.9
 _AT_LEAST: Final = 0.5
 """Least scatter, as a share of the mean square error: the stated noise may be too large."""
 _RANGE: Final = 18.0
-"""Half the search range of the logarithm of the scatter's variance, about that of a kelvin."""
+"""Half the search range for the logarithm of the scatter's variance, around that of one kelvin."""
 _HALVINGS: Final = 25
 _SURELY: Final = 2.0  # Sigmas beyond which an error is not chance
 _LITTLE: Final = 1e-6
-"""Lower bounds of variances, as shares of that of a kelvin and of that of the noise."""
+"""Lower bound of variances, as a share of the squared bias change per kelvin, or of the noise variance."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
-"""Prior sigma of each coefficient, in kelvins of the slope of parts."""
-_SLOWED_K_S: Final = 0.25 / 60.0  # Least slowing of a warm-up that tells where it ends
+"""Prior sigma of each coefficient, in kelvins times the usual slope of parts."""
+_SLOWED_K_S: Final = 0.25 / 60.0  # Least decrease of the rate that determines the end of a warm-up
 _TAU_SIGMA: Final = 0.05
 """Lower bound of the relative sigma of tau: one time constant does not fully describe a board."""
 _WARM_AFTER: Final = 5.0  # Time constants after which a board is warm
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 _END_LESS_MEAN: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
-"""Weights of start, middle and end: the end less the mean by Simpson's rule."""
+"""Weights of start, middle and end for the end minus the mean, by Simpson's rule."""
 CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
 """Run-to-run scatter of method 1.3."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
-"""Slope over temperature of a BMI088, the worse one of method 2.1."""
+"""Slope over temperature of a BMI088, the worse part in method 2.1."""
 
 
 class PowerUpNodes(NamedTuple):
-    """Still seconds of one power-up, n rows; vehicle FRD, rad/s or m/s^2.
+    """Means of still seconds in one power-up, n rows; vehicle FRD, rad/s or m/s^2.
 
     `states` (n, 2): temperature in degC and its rate in K/s. `variance` (n,): white noise, mean over the axes.
     """
@@ -78,7 +78,7 @@ class PowerUpNodes(NamedTuple):
     bias: Floats
     variance: Floats
     common_variance: float = 0.0
-    """Variance of an error that all rows share; it lowers the weight."""
+    """Variance of an error common to all rows; it lowers the weight."""
 
 
 class Warm(msgspec.Struct, frozen=True, kw_only=True):
@@ -90,9 +90,9 @@ class Warm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Along(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one triad's bias within one window; vehicle FRD, rad/s or m/s^2, and those a second.
+    """Prediction of one triad's bias change within one window; vehicle FRD, rad/s or m/s^2, rates per second.
 
-    `shift`: bias at the end less the mean over the window. `warm` None: the end of the warm-up is unknown, or beyond
+    `shift`: bias at the end minus the mean over the window. `warm` None: the end of the warm-up is unknown, or beyond
     the temperatures seen.
     """
 
@@ -107,9 +107,9 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
 class Curve:
     """Model of the next power-up's bias over temperature, vehicle FRD, rad/s or m/s^2; factors and variances (3,).
 
-    `order` 0: a mean; 3: a cubic. `covariance` of the coefficients is for an axis with the usual scatter, `widening`
-    the factor for each axis, `of_changes` that for changes within a power-up. `unexplained`: share of the changes, in
-    squares, that neither the model nor chance explains. `scatter`: variance of one more power-up, wandering included.
+    `order` 0: a mean; 3: a cubic. `covariance`: of the coefficients, for an axis with the usual scatter. `widening`:
+    its factor for each axis; `of_changes`: its factor for changes within a power-up. `unexplained`: share of the
+    squared changes that neither model nor chance explains. `scatter`: variance of one more power-up, with its wander.
     """
 
     order: int
@@ -124,24 +124,24 @@ class Curve:
     shares: Array
     freedom: float
     span_degc: tuple[float, float]
-    per_kelvin: float  # One sigma of the change per kelvin beyond them
+    per_kelvin: float  # One sigma of the change per kelvin beyond the temperatures seen
 
     def beyond_k(self, degc: float) -> float:
         return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
 
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
-        """Predict the next power-up's bias at a temperature, and its variance, (3,) each; a line beyond the range."""
+        """Predict the next power-up's bias at a temperature, and its variance, (3,) each; linear beyond the range."""
         x, (low, high) = self._row(degc, k_s), self.span_degc
         moved = float(np.abs((self._row(high) - self._row(low)) @ self.coefficients).max())
         outside = (max(self.per_kelvin, moved / max(high - low, VALID_K)) * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
     def change(self, then: State, now: State) -> tuple[Array, Array]:
-        """Predict the change of the bias within a power-up, and its variance, (3,) each; a mean has none."""
+        """Predict the change of the bias within a power-up, and its variance, (3,) each; zero for a mean."""
         return self.moves([(-1.0, then), (1.0, now)])
 
     def moves(self, weighted: Iterable[tuple[float, State]]) -> tuple[Array, Array]:
-        """Predict a weighted sum of several states, and its variance, (3,) each; the weights add up to zero."""
+        """Predict the weighted sum of biases at several states, and its variance, (3,) each; weights add up to zero."""
         x, outside_k = np.zeros(self.order + 1), 0.0
         for weight, (degc, k_s) in weighted:
             side = 1.0 if degc > self.span_degc[1] else -1.0
@@ -151,12 +151,12 @@ class Curve:
         return x @ self.coefficients, variance
 
     def along(self, path: Path, tau_s: tuple[float, float] | None, model: AllanModel) -> Along:
-        """Predict the bias within a window; `tau_s`: time constant of the board and one sigma, where it is known."""
+        """Predict the bias within a window; `tau_s`: time constant of the board and one sigma, or None."""
         start, (middle_degc, k_s), end = path.states
         shift, shift_variance = self.moves(zip(_END_LESS_MEAN, path.states, strict=True))
         slope, slope_variance = self.change(start, end)
         by_end = np.square(self._per_k(end[0])) * path.variance
-        # A line goes by half of its change from its middle to its end.
+        # A line changes by half of its range from its middle to its end.
         of_rate = (2.0 / path.span_s) ** 2
         warm = None
         if tau_s is not None and self.beyond_k(degc := middle_degc + tau_s[0] * k_s) == 0.0:
@@ -177,7 +177,7 @@ class Curve:
         return self.change((degc - 0.5, 0.0), (degc + 0.5, 0.0))[0]
 
     def _row(self, degc: float, k_s: float = 0.0) -> Array:
-        """Give the terms at a temperature, (1 + order,), as a straight line beyond the valid range."""
+        """Return the terms (1 + order,) at a temperature; linear beyond the valid range."""
         die_degc = degc - self.lag_s * k_s
         edge_degc = min(max(die_degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
         d, power = (edge_degc - REFERENCE_DEGC) / UNIT_K, np.arange(self.order + 1)
@@ -186,9 +186,9 @@ class Curve:
 
 
 def settling(power_ups: Iterable[Sequence[State]]) -> tuple[float, float] | None:
-    """Estimate the time constant of a board and one sigma, s, from earlier power-ups; None: too few tell it.
+    """Estimate the time constant of a board and one sigma, s, from earlier power-ups; None: too few show it.
 
-    From where it rose fastest to the last state a board has gained tau times what it has slowed down.
+    From its fastest rise to its last state, a board's temperature rises by tau times the decrease of its rate.
     """
     found = []
     for states in power_ups:
@@ -204,7 +204,7 @@ def settling(power_ups: Iterable[Sequence[State]]) -> tuple[float, float] | None
 
 
 def in_run_variance(model: AllanModel, gap_s: float = 0.0) -> float:
-    """Give the variance by which a bias wanders within a power-up, over at least three minutes."""
+    """Return the variance of a bias' wander within a power-up, over `gap_s`, at least three minutes."""
     return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * max(gap_s, _SHORTEST_GAP_S)))
 
 
@@ -218,10 +218,10 @@ def fit(
     """Fit the model of one triad of one IMU; None: fewer than three power-ups.
 
     Args:
-        power_ups: at least one node each, in the order in which they were measured.
-        in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
-        per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
-        may_be_mean: whether to return a mean where it predicts as well; a mean has no change within a power-up.
+        power_ups: at least one node each, in order of measurement.
+        in_run_variance: variance of the wander within a power-up, (rad/s)^2 or (m/s^2)^2.
+        per_kelvin: one sigma of the slope of parts, (rad/s)/K or (m/s^2)/K.
+        may_be_mean: return a mean if it predicts equally well; a mean has no change within a power-up.
     """
     if len(power_ups) < FEWEST:
         return None
@@ -271,7 +271,7 @@ class _Fit:
         shares, normal, right = self._equations(scatter)
         covariance = np.linalg.inv(self._base + normal.sum(axis=0))
         squares = np.mean(np.square(error), axis=0)
-        # Three axes know the scatter better than one, but one may scatter more than the others.
+        # Three axes together determine the scatter better, but one may scatter more than the others.
         freedom = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0)
         student = freedom / (freedom - 2.0)
         widening = np.maximum(_over(error, variance), 1.0) * student
@@ -314,7 +314,7 @@ class _Fit:
         return weight, self._within + by * self._between, self._within_right + by * self._between_right
 
     def _left_out(self, scatter: float) -> tuple[Floats, Floats]:
-        """Give each first node less its prediction by the other power-ups, (n, 3), and the variance of that, (n,)."""
+        """Return each first node minus its prediction from the other power-ups, (n, 3), and its variance, (n,)."""
         predicted, variance = self._by_others(scatter, self._first)
         return self._first_bias - predicted, variance + self._first_variance + scatter
 
@@ -327,7 +327,7 @@ class _Fit:
 
 
 def _over(error: Floats, variance: Floats) -> Floats:
-    """Give the actual over the predicted mean square error of each axis, (3,)."""
+    """Return the actual over the predicted mean square error of each axis, (3,)."""
     return np.asarray((error * error / variance[:, None]).sum(axis=0) / len(error))
 
 
@@ -337,9 +337,9 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
-    """Bias over temperature as firmwares compensate it, in an IMU's own axes.
+    """Bias over temperature in the form that firmwares use, in an IMU's own axes.
 
-    c0 + c1 d + c2 d^2 + c3 d^3, with d the temperature, limited to the span, less the reference.
+    c0 + c1 d + c2 d^2 + c3 d^3, with d the temperature, limited to the span, minus the reference.
     """
 
     coefficients: tuple[Vector, Vector, Vector, Vector] = (ZERO, ZERO, ZERO, ZERO)
@@ -356,7 +356,7 @@ class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
         return value
 
     def zero_at(self, degc: float) -> Polynomial:
-        """Return the polynomial with the constant that makes it zero at this temperature."""
+        """Return the polynomial shifted by a constant, so that it is zero at this temperature."""
         c0, first, second, third = self.coefficients
         constant = vector(np.subtract(c0, self.at(degc)))
         return msgspec.structs.replace(self, coefficients=(constant, first, second, third))
@@ -366,9 +366,9 @@ NOTHING: Final = Polynomial()
 
 
 def of_curve(curve: Curve, orientation: Matrix, scale: Vector = (1.0, 1.0, 1.0)) -> Polynomial:
-    """Convert a curve, over the span that was seen; zero at the reference.
+    """Convert a curve to a polynomial over the span that was seen; zero at the reference.
 
-    The lag is left out: no firmware knows of one.
+    The lag is left out: no firmware supports one.
 
     Args:
         curve: in the vehicle's axes.

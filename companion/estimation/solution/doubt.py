@@ -1,8 +1,8 @@
-"""Names what contradicts earlier calibrations.
+"""Finds contradictions to earlier calibrations, and their cause.
 
-One tilt, one gravity and one rotation are behind the readings of all IMUs. What has changed alike in all of them is
-the gradienter (or its zero), the gravity that the place was believed to have, or a turn; what has changed in one of
-them, while the others agree with their predictions, is that one (method 2.1).
+All IMUs measure the same tilt, gravity and rotation. A change common to all of them comes from the gradienter (or its
+zero), from a wrong local gravity, or from a turn. If one IMU has changed while the others agree with their predictions,
+that IMU is the cause (method 2.1).
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from companion.samples import TRIADS, Triad
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
 TELLS: Final = 9.0
-"""Least gain in chi square by which one explanation beats another: three sigmas."""
+"""Least gain in chi-square by which one explanation beats another: three sigmas."""
 AGREES: Final = 11.34
-"""Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
-well be of another sensor takes no part."""
+"""Chi-square of three axes that chance exceeds once in a hundred. Beyond it there is no warning yet, but the prediction
+takes no part in the estimate, because it may be of another sensor."""
 _OF_ALL: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",
     "turn": "the aircraft turns",
 }
-"""Causes that concern a triad of all IMUs, in a few words."""
+"""Short texts for causes that affect a triad of all IMUs."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Witness:
-    """One triad of IMU number `imu`, measured and predicted.
+    """Measurement and prediction of one triad of IMU number `imu`.
 
-    `own_variance` (3,) of the difference is this IMU's own, `common` (3, 3) is shared by all.
+    The variance of the difference has a part of this IMU, `own_variance` (3,), and one common to all, `common` (3, 3).
     """
 
     imu: int
@@ -52,7 +52,7 @@ class Witness:
 
     @property
     def difference(self) -> Array:
-        """Measurement less prediction, (3,)."""
+        """Measurement minus prediction, (3,)."""
         return np.asarray(self.measured - np.array(self.expected.value))
 
     @property
@@ -76,7 +76,7 @@ class Witness:
         return float(up @ self.difference), math.sqrt(variance)
 
     def gain(self, shift: Array) -> float:
-        """Give the drop of chi square, against the own variance only, when a common shift is subtracted."""
+        """Return the decrease of chi-square, with the own variance only, if a common shift is subtracted."""
         return float(np.sum((np.square(self.difference) - np.square(self.difference - shift)) / self.own_variance))
 
     def is_explained(self, shift: Array) -> bool:
@@ -89,7 +89,7 @@ class Doubt:
 
     triad: Triad
     cause: Cause
-    names: tuple[str, ...]  # IMUs whose readings are not to be believed
+    names: tuple[str, ...]  # IMUs with doubtful readings
     words: str
 
     @property
@@ -104,9 +104,9 @@ class Doubt:
 def contradictions(
     earlier: Sequence[Witness], today: Sequence[Witness], imus: int, up: Array, by_reading: Matrix | None
 ) -> list[Doubt]:
-    """Find all contradictions to predictions from earlier power-ups and from this one; empty while all is well.
+    """Find all contradictions to predictions from earlier power-ups and from this one; empty if there are none.
 
-    Those from this power-up are the most exact: earlier ones count only where they are silent. `imus`: number of IMUs.
+    Predictions from this power-up are the most exact; earlier ones count only without these. `imus`: number of IMUs.
     `by_reading`: d (accelerometer bias) / d (gradienter's readings), (3, 2).
     """
     gravity: tuple[Cause, Matrix] = ("gravity", up[:, None])
@@ -125,7 +125,7 @@ def contradictions(
 
 
 def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool) -> list[Doubt]:
-    """Explain what contradicts by one shift of all IMUs, if a cause has such a one; else each by itself."""
+    """Explain all contradictions by one shift of all IMUs if a cause fits; else explain each alone."""
     against = [witness for witness in witnesses if witness.contradicts]
     others = [witness for witness in witnesses if not witness.contradicts]
     for cause, directions in causes if against else ():
@@ -141,7 +141,7 @@ def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]]
 
 
 def _common(witnesses: Sequence[Witness], directions: Matrix) -> tuple[Array, Array]:
-    """Fit the one shift along these directions that explains all best; also give its size along each."""
+    """Fit the common shift along these directions that best explains all; return it, and its size along each."""
     by = np.vstack([directions / np.sqrt(witness.own_variance)[:, None] for witness in witnesses])
     found = np.concatenate([witness.difference / np.sqrt(witness.own_variance) for witness in witnesses])
     size = np.asarray(np.linalg.lstsq(by, found)[0], dtype=np.float64)

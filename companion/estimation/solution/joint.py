@@ -1,21 +1,20 @@
-"""Combines the predictions of earlier calibrations with today's readings of all IMUs (method 3.3).
+"""Combination of predictions from earlier calibrations with today's readings of all IMUs (method 3.3).
 
-A window that warmed is moved to its end first: the curve predicts how the bias went from the mean to the end, the
-readings' own slope measures it, and each has a share by its variance. Where they contradict each other the window alone
-counts.
+If a window warmed, its estimate is first moved to its end. The curve predicts the change of the bias from the mean to
+the end, the readings' slope measures it; both are weighted by their variances. If they contradict each other, only the
+window counts.
 
 Then measurements and predictions are combined. With d the biases by today's readings and p the predictions,
 
     d = b + e_d     p = b + e_p     b_MAP = d + K (p - d)     K = cov(e_d, e_d - e_p) cov(e_d - e_p)^-1
 
-The error of the gradienter's zero is the same in all IMUs, and where the earlier calibrations were made with today's
-zero, in p as well, so that nothing averages it away. Where they were made with other zeros, several IMUs together tell
-today's tilt.
+The error of the gradienter's zero is the same in all IMUs. It is also in p if earlier calibrations used today's zero,
+so that it does not average out. If they used other zeros, several IMUs together determine today's tilt.
 
-A sigma_use that is too cautious would hand the estimate to the prior. So K counts as e_d only what is *known* to be
-noise: what averaging has left (sigma_stat), the gradienter's scatter, what is not known of the platform's turn, and
-the sigma of the zero if it was measured or configured. K is then smaller than the best one, and with any K between zero
-and twice that the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
+A sigma_use that is too cautious would give the prior too much weight. For K, e_d therefore includes only *known* noise:
+the rest after averaging (sigma_stat), the gradienter's scatter, the uncertainty of the platform's turn, and the sigma
+of the zero if it was measured or configured. This K is smaller than the optimum. With any K from zero to twice the
+optimum, the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
 """
 
 from __future__ import annotations
@@ -40,15 +39,15 @@ from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS, Triad, Vector, rows_of
 
 BOUNDS_RAD_S: Final = 0.1 * DEG
-"""Largest sigma of a gyro's prediction that says something of a turn."""
-_CONTRADICTS: Final = 4.0  # Sigmas between the slope of the readings and that of the curve
-_WORTH_SAYING: Final = 2.0  # Least change until warm that is reported, in sigma_use
+"""Largest sigma of a gyro's prediction that can bound a turn."""
+_CONTRADICTS: Final = 4.0  # Threshold in sigmas between the slope of the readings and that of the curve
+_WORTH_SAYING: Final = 2.0  # Least change until warm to report, in sigma_use
 _END_OF_RAMP: Final = 0.25
 """Variance of a mean over that of the end of a line through the same values (`RobustLine.end_leverage`)."""
 
 
 def weigh(solution: Solution, expectation: Expectation) -> Solution:
-    """Check a solution against earlier calibrations, and let them take part where they may."""
+    """Check a solution against earlier calibrations, and combine it with the predictions that may take part."""
     shared, by_name = solution.shared, {each.name: each for each in expectation.imus}
     expected = [by_name.get(imu.name) or ExpectedImu(name=imu.name) for imu in solution.imus]
     ends = [at_end(imu, known, shared) for imu, known in zip(solution.imus, expected, strict=True)]
@@ -72,7 +71,7 @@ def weigh(solution: Solution, expectation: Expectation) -> Solution:
 
 
 def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[ImuSolution, tuple[Triad, ...]]:
-    """Move an estimate to the end of its window; also give the triads that followed a curve."""
+    """Move an estimate to the end of its window; also return the triads that followed a curve."""
     shift, stat, warm_up = np.zeros(6), imu.sigma_stat.copy(), imu.warm_up_variance.copy()
     covariance, followed = imu.covariance.copy(), list[Triad]()
     for triad, bias in zip(TRIADS, imu.biases, strict=True):
@@ -159,7 +158,7 @@ def _witnesses(
 
 
 def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: bool) -> Solution:
-    """Combine measurements and predictions by the equations at the top; also return the shift of all biases, (6 n,)."""
+    """Combine measurements with the predictions `used`, by the equations at the top of this module."""
     shared, count = solution.shared, len(solution.imus)
     if not used:
         return solution
@@ -170,7 +169,7 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
     for imu, part in zip(solution.imus, parts, strict=True):
         s_d[part, part] = imu.covariance
     zero, none = shared.by_zero, np.zeros((3, 2))
-    # Every accelerometer's share of the zero's error: in d it is whole, in p as far as that was measured with it.
+    # Effect of the zero's error on each accelerometer: whole in d, and in p for the share measured with this zero.
     zero_in_d = np.tile(np.vstack([none, zero]), (count, 1))
     noise_in_d = np.tile(np.vstack([none, shared.tilted(np.array(shared.reading_sigma_rad))]), (count, 1))
     accels = [(one.triad == "accel", one.expected) for one in used]
@@ -203,10 +202,10 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
 
 
 def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Witness]) -> Solution:
-    """Bound the platform's turn by the gyros' predictions, where neither a compass nor a rest has measured it.
+    """Bound the platform's turn by the gyros' predictions if neither a compass nor a rest has measured it.
 
-    What they read more about the vertical is taken for chance up to `CHANCE_SIGMAS`, and else belongs to sigma. Only
-    earlier power-ups tell that nothing turns: what was measured today may have turned already.
+    An excess about the vertical counts as chance up to `CHANCE_SIGMAS`; a larger one adds to sigma. Only earlier
+    power-ups can show that nothing turns: today's measurements may include the turn already.
     """
     if solution.turn.is_told or solution.platform == "deck":
         return solution

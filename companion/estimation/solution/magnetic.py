@@ -1,10 +1,10 @@
-"""Quality of a compass heading, judged by its field, its steadiness and the Earth's field.
+"""Quality of a compass heading, from its field, its steadiness and the Earth's field.
 
-A disturbance of the field has three parts. Along the field and in the dip it shows, as a wrong strength F and a wrong
-inclination I; across the meridian it turns the heading and shows in nothing. So the visible parts say how large the
-invisible one may be: drawn with one unknown size, it exceeds `BOUND_OF_TWO` times their root of squares in one case of
-twenty. Its effect is dB / (F cos I) (method 3.5: 1.3 uT make 4 degrees at I = 68 degrees,
-where a norm gate of 5 % sees nothing). What the model WMM2025 itself does not know counts as visible disturbance.
+A disturbance of the field has three parts. Two are visible, as errors of the strength F and of the inclination I. The
+part across the meridian turns the heading and is invisible. The visible parts bound it: if all three have the same
+unknown sigma, it exceeds `BOUND_OF_TWO` times their root sum of squares in one case of twenty. Its effect on the
+heading is dB / (F cos I) (method 3.5: 1.3 uT cause 4 degrees at I = 68 degrees; a gate of 5 % on the norm misses them).
+The uncertainty of the model WMM2025 counts as visible disturbance.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from companion.physics.units import DEG
 
 STRENGTH_GATE: Final = 0.02
 INCLINATION_GATE_DEG: Final = 1.0
-"""Beyond these a warning is given (method 3.5); what counts is the bound."""
+"""Thresholds of strength and inclination for a warning (method 3.5); the sigma uses the bound instead."""
 UNIT_GATE: Final = 0.5
-"""Farther off the Earth's field than this it is no disturbance but a wrong unit or scale."""
+"""Deviation from the Earth's field, as a share, beyond which unit or scale are wrong."""
 WANDER_WARNING_DEG: Final = 1.5
 DEVICE_WARNING_DEG: Final = 3.0
-"""Three sigma of an HMR3300 that is level."""
+"""Three sigma of a level HMR3300."""
 USELESS_DEG: Final = 60.0
-"""A heading that may be so far off says nothing that the gyros' equation could use."""
+"""Heading error beyond which the equation of the gyros cannot use the heading."""
 _NINETY_FIVE: Final = 1.96
 
 
@@ -50,7 +50,7 @@ class CompassHeading:
     """True heading, its sigma at an exact tilt, and its gradient by up (3,): zero for a device's own heading."""
 
     heading_rad: float
-    sigma_rad: float  # One sigma at an exact tilt; `heading_by_up` gives the effect of a wrong one
+    sigma_rad: float  # One sigma at an exact tilt; `heading_by_up` gives the effect of a tilt error
     heading_by_up: Array  # Gradient by up in the vehicle's axes, (3,): zero for a device's own heading
     is_usable: bool
     magnetic: Magnetic
@@ -62,7 +62,7 @@ class _MeanField:
     strength_gauss: float | None = None
     inclination_rad: float | None = None
     heading_rad: float | None = None  # Heading of the vehicle by the compass' north, with our tilt compensation
-    bound_deg: float | None = None  # Largest turn of the heading by a disturbance
+    bound_deg: float | None = None  # Bound of the heading error from a disturbance, degrees
 
 
 def assess(
@@ -118,7 +118,7 @@ def assess(
         warnings.append(unknown("heading error", "tilt of the compass field not measured", "no gradienter"))
     return CompassHeading(
         heading_rad=heading + (local.declination_deg * DEG if compass.magnetic else 0.0),
-        # The sigma is never below the bound: a disturbance may last for the whole flight.
+        # Keep sigma at or above the bound: a disturbance may last for the whole flight.
         sigma_rad=max(sigma_deg, bound_deg or 0.0) * DEG,
         heading_by_up=gradient,
         is_usable=not useless,
@@ -156,7 +156,7 @@ def _judge(
         return _MeanField(strength, inclination, own)
     noise = float(np.linalg.norm(field.sigma)) / size
     dip_sigma_rad = math.sqrt((expected.inclination_sigma_deg * DEG) ** 2 + by_up @ up_covariance @ by_up + noise**2)
-    # A device without a unit shows the dip only: its field is taken for as strong as the Earth's.
+    # A device without a unit shows the dip only: assume that its field has the Earth's strength.
     used = expected.strength_gauss if strength is None else strength
     across = used * math.cos(inclination)
     seen = math.hypot(

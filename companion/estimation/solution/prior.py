@@ -1,11 +1,11 @@
 """Prediction of today's bias from earlier calibrations (method 3.3), with a sigma.
 
-Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
+A MEMS bias scatters from run to run (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
 mean of the earlier power-ups, or their cubic over temperature (`curve`). Its sigma is that of *one more*
-power-up: the scatter, widened as Student's for few points, and the error of the mean.
+power-up: the scatter, widened by Student's t for few points, and the error of the mean.
 
-From three power-ups on the prediction guards (`joint`), from five on it may take part in the estimate. Within one
-power-up the bias is the one it started with, moved by temperature and drift: that guards best, and takes no part.
+From three power-ups on, the prediction is a gate for the readings (`joint`); from five on, it may take part in the
+estimate. Within one power-up, the turn-on bias changes by temperature and drift only: the best gate, but no estimate.
 
 An accelerometer's bias depends on the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
 (`align_model`). In one pose u, scale, shear and misalignment times 1 g look like a bias. A calibration finds the
@@ -37,17 +37,17 @@ from companion.samples import Triad, Vector
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
-"""Least effect of the attitude in a warning; a wheel on a stone makes less."""
+"""Least effect of the attitude for a warning; a wheel on a stone causes less."""
 _SIGMAS: Final = 2.0
 _PRIORS: Final = Priors()
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
-"""Temperature change between two calibrations of one power-up, where no temperature is known."""
+"""Assumed temperature change between two calibrations of one power-up without a thermometer."""
 _KNOWN: Final = 0.5
 """Largest sigma of a usable curve's slope, as a share of the catalogue's slope."""
 _UNEXPLAINED: Final = 0.1
-"""Largest unexplained share of the changes within power-ups. With the IMU's own thermometer it is 0.05 and less (except
-for one simulated aircraft in some hundreds); with that of the air, a heater or a processor 0.1 to 1 and more."""
+"""Largest unexplained share of the changes within power-ups. The IMU's own thermometer gives 0.05 or less (except in
+one of some hundred simulated aircraft); that of the air, a heater or a processor gives 0.1 to 1 and more."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -61,20 +61,20 @@ class PoseEffect:
     source: Literal["assumed", "alignment"]
 
     def change(self, gravity_m_s2: float, at: Array, then: Array) -> tuple[Array, Array]:
-        """Give the bias at `at` less the bias at `then`, and one sigma of that; each (3,), m/s^2."""
+        """Return the bias at `at` minus the bias at `then`, and one sigma of the difference; each (3,), m/s^2."""
         by = gravity_m_s2 * (at - then)
         variance = (np.square(self.sigma) + np.square(self.misalignment_sigma)) @ np.square(by)
         return (self.mean + self.misalignment_mean) @ by, np.sqrt(variance)
 
     def _variance(self, gravity_m_s2: float, by: Array) -> Array:
-        """Give the variance of the bias by a change of up, (3,), without misalignment, which turns the axes only.
+        """Return the variance of the bias from a change `by` of up, (3,), without misalignment (a pure rotation).
 
-        The mean is known but not subtracted from what is written, so it counts in full.
+        The mean is known but not subtracted from the offsets to write, so it counts in full.
         """
         return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """Make the entry of the record; `up` (3,) is the attitude of the calibration, `sigma_use_m_s2` (3,) there."""
+        """Make the record entry; `up` (3,): attitude of the calibration; `sigma_use_m_s2` (3,): at that attitude."""
         here = np.square(sigma_use_m_s2)
         scale = np.sqrt(np.diag(np.square(self.mean) + np.square(self.sigma)))
         return Effective(
@@ -85,7 +85,7 @@ class PoseEffect:
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
-        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
+        """Return a warning for a calibration of a tilted aircraft; None: it was about level."""
         moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
             return None
@@ -114,9 +114,9 @@ def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
 class Prediction(msgspec.Struct, frozen=True, kw_only=True):
     """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2.
 
-    The variance is that of today's bias about it, without the gradienter's zero. `limit` of the gate in sigmas: 4, or
-    an equally improbable one where the scatter is known from few points. `same_zero`: share that was measured with
-    today's zero of the gradienter, so that its error is in both; `other_zero_rad`: one sigma of the others' error.
+    The variance is that of today's bias about `value`, without the gradienter's zero. `limit` of the gate in sigmas: 4,
+    or one of equal probability if few points determine the scatter. `same_zero`: share measured with today's zero of
+    the gradienter, whose error is then common to both; `other_zero_rad`: one sigma of the zero's error in the rest.
     """
 
     value: Vector
@@ -144,7 +144,7 @@ class Expectation(msgspec.Struct, frozen=True, kw_only=True):
 
     imus: tuple[ExpectedImu, ...] = ()
     zero_is_known: bool = False
-    """True if the sigma of the gradienter's zero was measured or configured, and is no cautious guess."""
+    """True if the sigma of the gradienter's zero was measured or configured; False: a cautious guess."""
 
 
 _ASSUMED: Final = pose_effect(None)
@@ -153,11 +153,11 @@ _ASSUMED: Final = pose_effect(None)
 def expect(
     points: Sequence[Point], triad: Triad, now: Point, effect: PoseEffect, model: AllanModel
 ) -> Prediction | None:
-    """Predict the bias in the present state, `now`, from the earlier power-ups; None: they are too few."""
+    """Predict the bias in the present state, `now`, from earlier power-ups; None: too few of them."""
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
-    # Where a temperature is missing, all count as measured at the same one.
+    # With a temperature missing, all count as measured at the same one.
     known = None if now.temperature_degc is None else _states(groups)
     nodes, poses = [], []
     for group, states in zip(groups, known or [np.zeros((len(group), 2)) for group in groups], strict=True):
@@ -170,7 +170,7 @@ def expect(
         return None
     degc, k_s = (now.temperature_degc, now.k_s) if known and now.temperature_degc is not None else (0.0, 0.0)
     value, variance = curve.at(degc, k_s)
-    # An error that all power-ups share, of one attitude or one place, does not average out.
+    # An error common to all power-ups, from the same attitude or place, does not average out.
     shared = [point.measured(triad).sigma_shared for group in groups for point in group]
     together = np.square(curve.shares @ np.array(poses)) + np.max(np.square(shared), axis=0)
     same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
@@ -216,7 +216,7 @@ def expect_today(
 
 
 def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
-    """Fit how a bias follows the temperature within a power-up; None: too little is known.
+    """Fit the bias over temperature within a power-up; None: too few data.
 
     An accelerometer's variance grows with the change of attitude from the first point of the power-up.
     """
@@ -237,14 +237,14 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
 
 
 def _states(groups: Sequence[Sequence[Point]]) -> list[Floats] | None:
-    """Give the temperature and its rate of every point by power-up, (n, 2) each; None: one is not known."""
+    """Return temperature and rate of every point, by power-up, (n, 2) each; None: one is unknown."""
     if any(point.temperature_degc is None for group in groups for point in group):
         return None
     return [np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64) for group in groups]
 
 
 def _here(points: Sequence[Point], triad: Triad, up: Vector, effect: PoseEffect) -> tuple[Floats, Floats, Floats]:
-    """Convert biases to the attitude `up`; also give one sigma of that, (points, 3), and the white variance."""
+    """Convert biases to the attitude `up`; also return the conversion's sigma, (points, 3), and the white variance."""
     found = [point.measured(triad) for point in points]
     bias, pose = np.array([one.bias for one in found]), np.zeros((len(points), 3))
     if triad == "accel":

@@ -1,4 +1,4 @@
-"""A solution as a calibration's record, as points of the history, and in words."""
+"""Conversion of a solution to a calibration record, to points of the history, and to text."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def record_of(
 ) -> Record:
     """Build the record of a solution; without a solution it has no IMUs.
 
-    `reason` None: the figures in words. `imus`: their records, where the plain ones of the solution are not all.
+    `reason` None: the figures as text. `imus`: records to use instead of those made from the solution.
     """
     imus = imu_records(solution) if imus is None else tuple(imus)
     standing = None
@@ -137,7 +137,7 @@ def points(
     power_ups: Mapping[str, PowerUp],
     zero: str | None,
 ) -> dict[str, Point]:
-    """Make each IMU's point of the history from the readings alone; what is doubted is marked as suspect."""
+    """Make each IMU's point of the history from the readings alone; triads with a doubt are marked as suspect."""
     shared = solution.shared
     doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
     common = np.diag(shared.covariance).copy()

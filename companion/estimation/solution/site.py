@@ -1,6 +1,6 @@
 """Place of the aircraft, with gravity and the Earth's rotation there, and their sigmas.
 
-What is not known widens the sigmas; it is never silently replaced by a default (each gap leaves a warning).
+Missing data widens the sigmas; a default never replaces it silently (each gap adds a warning).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from companion.messages import message
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
 
-# A gravity anomaly of 30 mGal is what Somigliana's formula leaves (method 2.1).
+# Gravity anomaly of 30 mGal, the error of Somigliana's formula (method 2.1).
 GRAVITY_MODEL_SIGMA_M_S2: Final = 3.0e-4
 GRAVITY_BY_HEIGHT_1_S2: Final = 3.086e-6
 UNKNOWN_HEIGHT_SIGMA_M: Final = 1000.0
-# Declination over the inhabited Earth stays within some 20 degrees: sigma when nobody knows the position.
+# Sigma without a position: declination over the inhabited Earth stays within some 20 degrees.
 UNKNOWN_DECLINATION_SIGMA_DEG: Final = 12.0
 
-# Averages over the sphere, for a latitude nobody knows: sin L is uniform in [-1, 1], E cos L = pi / 4.
+# Averages over the sphere, for an unknown latitude: sin L is uniform in [-1, 1], E cos L = pi / 4.
 _MEAN_COS: Final = math.pi / 4
 _VARIANCE_COS: Final = 2 / 3 - math.pi**2 / 16
 _VARIANCE_SIN: Final = 1 / 3
@@ -34,7 +34,7 @@ _GRAVITY_SIGMA_M_S2: Final = 0.0155
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Remedies:
-    """Words for what is missing: for a configuration, or for a command that asks for an estimate."""
+    """Remedies for missing data: texts for a configuration, or for a command that needs an estimate."""
 
     latitude: str = "set vehicle.latitude_deg or wait for GPS"
     height: str = "set vehicle.height_m or wait for GPS"
@@ -60,7 +60,7 @@ class Whereabouts:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class LocalEarth:
-    """Gravity, Earth rate (NED) and declination at the site, each with its sigma, and what was missing."""
+    """Gravity, Earth rate (NED) and declination at the site, each with its sigma, and warnings on missing data."""
 
     site: SiteRecord
     gravity_m_s2: float
@@ -70,11 +70,11 @@ class LocalEarth:
     declination_deg: float
     declination_sigma_deg: float
     warnings: tuple[str, ...]
-    field: earth.MagneticField | None = None  # The Earth's magnetic field by its model; None without position and date
+    field: earth.MagneticField | None = None  # Magnetic field of the Earth by the model; None without position and date
     remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> tuple[Array, Matrix]:
-        """Return the rate in body axes and its covariance; the horizontal part of an unknown heading is zero mean."""
+        """Return the rate in body axes and its covariance; with an unknown heading, its horizontal part is zero."""
         mean, covariance = self.rate_ned_rad_s, self.rate_ned_covariance
         if not heading_known:
             mean_square_north = mean[0] ** 2 + covariance[0, 0]

@@ -1,10 +1,10 @@
-"""Estimates biases with covariances from the averages of one still stretch.
+"""Estimation of biases and covariances from the means of one still stretch.
 
-A bias is the mean reading less what the attitude, gravity and the Earth's rate make. It is the effective one at this
-pose: in one pose a scale error times 1 g on the vertical axis looks like a bias (method 2.3). The autopilot's offset
-has to carry it here; it is not part of sigma.
+A bias is the mean reading minus the true value from attitude, gravity and the Earth's rate. It is the effective bias at
+this pose: in one pose, a scale error times 1 g on the vertical axis looks like a bias (method 2.3). The autopilot's
+offset has to correct it, too; it is not part of sigma.
 
-The equations are those of the paper with its errata mended (method 1.3): an accelerometer's bias is mean - g * up, a
+The equations are those of the paper with its errata corrected (method 1.3): an accelerometer's bias is mean - g * up, a
 gyro's mean - C_n^b w_ie^n. Everything is FRD and NED; `up` is the unit vector of specific force at rest.
 """
 
@@ -43,12 +43,12 @@ Pair = tuple[Array | None, Array | None]
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuSolution:
-    """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, (3,); None: not asked for or unknown.
+    """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, (3,); None: not requested or unknown.
 
-    The whole bias is that of the sensor without any offset: the residual and what an autopilot has `subtracted`.
+    The whole bias is that of the sensor without any offset: the residual plus the offsets `subtracted` by an autopilot.
     `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, `sigma_stat` (6,)
-    what averaging left. A warm-up is not in it, as that moves the bias under old and new offsets alike.
-    `temperature_degc` and its rate are those of the end. `drifting`: words on its drift, or on its biases when warm.
+    the noise after averaging. The covariance excludes a warm-up, which affects old and new offsets equally.
+    `temperature_degc` and its rate are those of the end. `drifting`: text on its drift, or on its biases when warm.
     """
 
     name: str
@@ -60,7 +60,7 @@ class ImuSolution:
     covariance: Matrix
     warnings: tuple[str, ...]
     subtracted: Array | None = None
-    """Offsets in force, (6,), in the order of the covariance; None: nobody subtracts any from this output."""
+    """Active offsets, (6,), in the order of the covariance; None: no offset is subtracted from this output."""
     drifting: tuple[str, ...] = ()
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     k_s: float = 0.0
@@ -107,9 +107,9 @@ class ImuSolution:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Shared:
-    """The errors that all IMUs of one stretch have in common: one attitude, one gravity, one Earth's rate.
+    """Errors common to all IMUs of one stretch, from the one attitude, gravity and Earth's rate.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of every IMU's own and that of any two.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of every IMU's own, and the covariance of any two IMUs.
     """
 
     up: Array
@@ -122,17 +122,17 @@ class Shared:
 
     @property
     def by_zero(self) -> Matrix:
-        """One sigma of the accelerometer biases by each axis of the gradienter's zero, (3, 2)."""
+        """Return one sigma of the accelerometer biases from each axis of the gradienter's zero, (3, 2)."""
         return self.tilted(self.zero_sigma_rad)
 
     def tilted(self, sigma_rad: float | Array) -> Matrix:
-        """Give the change of the accelerometer biases by each reading of the gradienter, (3, 2)."""
+        """Return the change of the accelerometer biases for an error of each gradienter reading, (3, 2)."""
         return np.zeros((3, 2)) if self.by_reading is None else self.by_reading * sigma_rad
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The biases of all IMUs from one still stretch."""
+    """Biases of all IMUs from one still stretch."""
 
     pose: Pose
     site: SiteRecord
@@ -140,7 +140,7 @@ class Solution:
     warnings: tuple[str, ...]
     shared: Shared
     unknown: tuple[tuple[str, Triad], ...] = ()
-    """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
+    """Requested triads whose readings do not determine a bias; the IMU's warnings give the reason."""
     magnetic: Magnetic | None = None
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
@@ -148,7 +148,7 @@ class Solution:
 
     @property
     def doubted(self) -> dict[tuple[str, Triad], Doubt]:
-        """Contradictions by IMU and triad; a tilt or a turn is in all IMUs, whether each shows it or not."""
+        """Contradictions by IMU and triad; a tilt or a turn affects all IMUs, even those that do not show it."""
         return {
             (name, doubt.triad): doubt
             for doubt in reversed(self.doubts)
@@ -174,13 +174,13 @@ def solve(
     any_bias: bool = False,
     otherwise: Otherwise = NOTHING,
 ) -> Solution:
-    """Work out the biases of every IMU of the window; with `any_bias` also such as no part has.
+    """Estimate the biases of every IMU of the window; `any_bias` allows implausibly large ones.
 
-    What is known `otherwise` of the attitude fills in where there is no gradienter, or no compass.
+    `otherwise` supplies the tilt without a gradienter, and the heading without a compass.
 
     Raises:
-        CalibrationRefusedError: the readings cannot be right together, accelerometers were asked for without
-            a gradienter, or gyros on a deck without a heading.
+        CalibrationRefusedError: the readings are inconsistent, accelerometers were requested without a tilt, or gyros
+            on a deck without a heading.
     """
     warnings = list(local.warnings)
     gradienter = gradienter if window.tilt is not None else None
@@ -191,7 +191,7 @@ def solve(
             raise CalibrationRefusedError(missing)
         warnings.append(missing)
     if platform == "deck":
-        # It turns: of a yaw nobody knows when it was true.
+        # The deck turns, and the yaw has no time of validity.
         otherwise = msgspec.structs.replace(otherwise, heading=None)
     truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
     unknown_heading = None
@@ -201,7 +201,7 @@ def solve(
     believed = window.imus if any_bias else tuple(believable(imu, truth.up, local) for imu in window.imus)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
     shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
-    # A deck may turn, and a steady turn shows in nothing but the heading.
+    # A deck may turn, and only the heading shows a steady turn.
     turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
     if turn_unseen:
         missing = message("sensor_missing", sensor="compass on a deck", sensors="gyros")
@@ -255,9 +255,9 @@ def _pose(truth: Truth) -> Pose:
 
 
 def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
-    """Give the errors of one attitude, gravity, Earth's rate and turn of the platform, common to all; method 2.1.
+    """Return the errors common to all IMUs, from attitude, gravity, Earth's rate and platform turn (method 2.1).
 
-    An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; one tilt error makes both.
+    An attitude error eps causes db_a = eps x f and db_g = eps x w = -[w x] eps; one tilt error causes both.
     """
     (rate, of_rate), up = truth.earth_rate(local), truth.up
     jacobian = np.vstack([-skew(rate + turn_rad_s), -skew(local.gravity_m_s2 * up)])
@@ -275,7 +275,7 @@ def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, 
 
 
 def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
-    """Correct the gyro means of a deck's turn for the axis: the truth differs from the gradienter's readings."""
+    """Return the correction of gyro means for the axis of a deck's turn: true up differs from the raw tilt."""
     if window.turn_rad_s is None or window.tilt is None or gradienter is None:
         return np.zeros(3)
     said = gradienter.up(window.tilt.x_deg, window.tilt.y_deg)
@@ -291,7 +291,7 @@ def _estimate(
     tipped: Array,
     powered_s: float,
 ) -> ImuSolution:
-    """Subtract the Earth's rate and gravity from the means of one IMU; covariances of the sensor, and in common."""
+    """Subtract the Earth's rate and gravity from the means of one IMU; combine sensor and common covariances."""
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
         gyro = np.array(imu.gyro_rad_s) - _earth_seen(imu, truth, local) - tipped
@@ -321,7 +321,7 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
-    """Return the Earth's rate in the gyro means: all of it, or the part left by the turning."""
+    """Return the Earth's rate in the gyro means: all of it, or the part that remains on a turning deck."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
@@ -330,7 +330,7 @@ def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
 
 
 def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
-    """Hide triads with impossible biases, with cause and remedy in words. `up` (3,), vehicle FRD."""
+    """Return the window with impossible triads marked useless, and cause and remedy as warnings; `up`: vehicle FRD."""
     means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
     found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
     hidden = imu.hidden | {triad: f"{words}; {local.remedies.any_bias}" for triad, words in found.items()}
@@ -338,15 +338,15 @@ def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
 
 
 def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:
-    """Name what makes the gyros' sigma wide: an unknown heading, or a part that nobody has named.
+    """Name the causes of a wide gyro sigma: an unknown heading, or a part that the configuration does not name.
 
-    `earth_covariance` (3, 3) is what is not known of the Earth's rate, (rad/s)^2; None where the heading is known.
+    `earth_covariance` (3, 3): uncertainty of the Earth's rate, (rad/s)^2; None: the heading is known.
     """
     earth = 0.0 if earth_covariance is None else float(np.diag(earth_covariance).max())
     by_part = [
         imu.name
         for imu in imus
-        # Where integers hide the mean, that made it, and is said.
+        # Skip means hidden by integers: they are the cause, and have a warning already.
         if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
     ]
     found = [message("gyro_part_unknown", imu=name, remedy=remedies.part) for name in by_part]

@@ -1,8 +1,8 @@
-"""Attitude of the aircraft from everything but its gyros: the reference for every sensor.
+"""Attitude of the aircraft from all sensors except its gyros: the reference for every sensor.
 
-A gradienter measures the tilt, a compass the heading. Without a gradienter, accelerometers show the tilt if their bias,
-scale and shear are known from all sides (`alignment.faces`): f = (I + S)^-1 (read - b). The length of f must still be
-gravity; the tilt of the board in the aircraft stays in it. Without a compass the autopilot's yaw is the heading.
+A gradienter measures the tilt, a compass the heading. Without a gradienter, accelerometers give the tilt if their bias,
+scale and shear are known from all sides (`alignment.faces`): f = (I + S)^-1 (read - b). The length of f must equal
+gravity; this tilt includes that of the board in the aircraft. Without a compass, the autopilot's yaw is the heading.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UNKNOWN_K: Final = 5.0  # Assumed change of an unknown temperature
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
-"""Largest error of the length of gravity; beyond it the figures of the sides are outdated."""
+"""Largest error of the length of gravity, in sigmas; beyond it, the figures from all sides are outdated."""
 
 
 class OwnHeading(msgspec.Struct, frozen=True):
@@ -59,10 +59,10 @@ NOTHING: Final = Otherwise()
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Reference for the sensors: up and attitude error in vehicle FRD, (3, 3).
+    """Reference for the sensors: up, heading and attitude covariance in vehicle FRD.
 
-    `tilt_from` None: from accelerometers of unknown bias. `reading_sigma_rad`: of the gradienter's means, without its
-    zero.
+    `tilt_from` None: from accelerometers of unknown bias. `reading_sigma_rad`: sigma of the gradienter's means, without
+    its zero.
     """
 
     up: Array
@@ -88,7 +88,7 @@ class Truth:
 
 
 def attitude_error_jacobian(up: Array) -> Matrix:
-    """Give the derivative of the attitude by `up`, at a fixed heading: eps = jacobian @ d up, (3, 3).
+    """Return the derivative (3, 3) of the attitude by `up`, at a fixed heading: eps = jacobian @ d up.
 
     Roll turns about the body's x axis, pitch about the horizontal axis (0, cos gamma, -sin gamma).
     """
@@ -107,10 +107,10 @@ def truth_of(
     warnings: list[str],
     otherwise: Otherwise = NOTHING,
 ) -> Truth:
-    """Estimate the attitude from everything but the gyros; `warnings` gets a line for each gap.
+    """Estimate the attitude from all sensors except the gyros; add a line to `warnings` for each gap.
 
     Raises:
-        CalibrationRefusedError: the readings cannot be right together.
+        CalibrationRefusedError: the readings are inconsistent.
     """
     by_reading: Matrix | None = None
     reading_sigma = (0.0, 0.0)
@@ -148,7 +148,7 @@ def truth_of(
         return dataclasses.replace(without, magnetic=found.magnetic)
     if compass.magnetic and local.site.declination_deg is None:
         warnings.append(unknown("declination", "magnetic heading used, sigma widened", "no position or date"))
-    # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
+    # A heading from the field depends on the tilt: one tilt error changes all three angles.
     turned = jacobian - np.outer(up, found.heading_by_up)
     return dataclasses.replace(
         without,
@@ -161,7 +161,7 @@ def truth_of(
 
 
 def _up_by_gradienter(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
-    """Give up in the vehicle's axes, its derivatives by the readings, (3, 2), and its covariance, (3, 3), rad^2."""
+    """Return up in the vehicle's axes, its derivatives by the readings, (3, 2), and its covariance, (3, 3), rad^2."""
     x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
     try:
         up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
@@ -177,7 +177,7 @@ def _up_by_sides(
 ) -> tuple[Array, Matrix] | None:
     """Estimate up, and its covariance, by the first IMU that was measured on all sides and still agrees with gravity.
 
-    Two IMUs are not averaged: their boards may sit differently, and the first one is what the autopilot flies by.
+    Two IMUs are not averaged: their boards may have different tilts, and the autopilot flies with the first one.
     """
     for imu in imus:
         known = otherwise.sides.get(imu.name)
@@ -201,7 +201,7 @@ def _up_by_sides(
 
 
 def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
-    """Give the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
+    """Return the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
     figures, turn = known.figures, known.vehicle_from_sensor
     inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])
@@ -222,7 +222,7 @@ def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> f
     if gap_s is None:
         wander = CATALOGUE_SCATTER["accel"] ** 2
     else:
-        # The sigma of the stands themselves holds what comes within minutes.
+        # The sigma of the stands already includes the change within minutes.
         late, soon = (
             floor_variance(noise.flicker, noise.walk, _MEAN_S, 2.0 * each) for each in (max(gap_s, _SOON_S), _SOON_S)
         )

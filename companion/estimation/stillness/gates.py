@@ -1,9 +1,9 @@
-"""Gates on the motion of the aircraft: one verdict a second for every source, in words that name the device.
+"""Gates on the motion of the aircraft: one verdict per second and source, with a text that names the device.
 
-Motion of an aircraft is slow against the sampling, sensor noise is mostly white. Half the mean square of successive
-differences measures the white part in the batch itself. A gate on the rest of the variance therefore works on a sensor
-of any noise from its first second on. Noise behind a filter is learned (`own_noise`). Every gate is widened by what
-chance does with the number of samples in the batch. A slow steady turn is left to gates on the means, and to `turning`.
+Motion of an aircraft is slow compared with the sampling; sensor noise is mostly white. Half the mean square of
+successive differences measures the white part within the batch. A gate on the rest of the variance therefore works for
+a sensor of any noise from its first second on. Noise behind a filter is learned (`own_noise`). Every gate is widened
+by the chance error for the batch's number of samples. Gates on the means, and `turning`, detect a slow steady turn.
 One set of constants serves all sensors; none is tuned to a recording.
 """
 
@@ -25,41 +25,41 @@ from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
 
 GYRO_MOTION_RAD_S: Final = 0.10 * DEG
-"""rms of the slow part of the rate in one second. A tenth of a degree a second over 10 s is an attitude error of the
-order of the gradienter's own; handling and walking are 10 to 1000 times more, sensors at rest below a half of it."""
+"""Limit for the rms of the slow part of the rate in one second. 0.1 deg/s over 10 s is an attitude error of the order
+of the gradienter's own. Handling and walking cause 10 to 1000 times more, sensors at rest less than half."""
 
 ACCEL_MOTION_M_S2: Final = 10.0 * MG
-"""rms of the slow part of specific force: 10 mg is a tilt of half a degree within a second."""
+"""Limit for the rms of the slow part of specific force: 10 mg is a tilt of half a degree within a second."""
 
 GYRO_VIBRATION_RAD_S: Final = 1.0 * DEG
 ACCEL_VIBRATION_M_S2: Final = 50.0 * MG
-"""rms of everything, what is slow being gated already: three times the noisiest common sensor at its full rate. More
-is a running motor, under which accelerometers rectify: their mean is no bias then."""
+"""Limit for the total rms (another gate covers the slow part): three times the noisiest common sensor at its full rate.
+More shows a running motor; accelerometers rectify its vibration, so their mean is not the bias."""
 
 GYRO_STEP_RAD_S: Final = 0.05 * DEG
-"""A second's mean against the last good ones. A sensor warming up at 3 (deg/h)/s, more than was ever seen, moves by
-0.004 deg/s in their mean age of 5 s."""
+"""Limit for a second's mean minus the last good ones. A warm-up at 3 (deg/h)/s, more than ever seen, changes the rate
+by 0.004 deg/s over their mean age of 5 s."""
 
 ACCEL_STEP_M_S2: Final = 5.0 * MG
-"""A second's mean against the start of the stretch: a tilt of 0.3 deg. Warming by 10 K moves consumer parts 2 mg."""
+"""Limit for a second's mean minus the start of the stretch: a tilt of 0.3 deg. 10 K of warming make 2 mg at most."""
 
-GYRO_BIAS_RAD_S: Final = 10.0 * DEG  # Beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)
+GYRO_BIAS_RAD_S: Final = 10.0 * DEG  # Above any turn-on bias specified for a modern part (typically 0.5 to 3 deg/s)
 
 GRAVITY_M_S2: Final = 9.81
 GRAVITY_GATE_M_S2: Final = 1.5
-"""Uncalibrated parts miss by up to 0.1 g; a mean that is off by more is another unit, a dead axis or a centrifuge."""
+"""Uncalibrated parts are off by up to 0.1 g; a larger error shows a wrong unit, a dead axis or a centrifuge."""
 
 TILT_MOTION_DEG: Final = 0.10
 TILT_STEP_DEG: Final = 0.10  # Ten times a field gradienter's noise, and 1.7 mg on a horizontal accelerometer
 
 HEADING_MOTION_DEG: Final = 2.0
-HEADING_STEP_DEG: Final = 3.0  # The class of field compasses; 3 deg cost 0.6 deg/h on a horizontal gyro
+HEADING_STEP_DEG: Final = 3.0  # Accuracy class of field compasses; 3 deg cause 0.6 deg/h on a horizontal gyro
 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
 _LEAST_RANGE: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
-"""No part's range ends below: integers that pile up there are those of a sway that turns back or comes to rest."""
-STUCK_SAMPLES: Final = 10  # Fewer may well be equal by chance on a quiet sensor with coarse steps
+"""Least range of any part: a pile of integers below it comes from swaying, at its turning points or at rest."""
+STUCK_SAMPLES: Final = 10  # Least equal samples of a stuck sensor; fewer may be chance on a quiet one with coarse steps
 STUCK_S: Final = 60  # Seconds after a change in steps during which a coarse stream may show one value
 
 _TRIADS: Final = (
@@ -67,7 +67,7 @@ _TRIADS: Final = (
     ("accel", slice(3, 6), ACCEL_MOTION_M_S2, ACCEL_VIBRATION_M_S2, MG, "mg"),
 )
 _FEW_LEVELS: Final = 4  # Most levels in one second of a stream whose noise is of the size of its steps
-_TIMES_EACH: Final = 4  # Least readings a level: few samples are never the same, and no steps
+_TIMES_EACH: Final = 4  # Least readings per level: fewer do not show coarse steps
 _COARSE_S: Final = 3  # Seconds of few levels that show a coarse stream
 _RECENT: Final = 10
 _REFERENCE: Final = 5
@@ -76,9 +76,9 @@ _STATIONARY: Final = 2.0  # Largest ratio of noise at rest to its usual variance
 
 
 class GateVerdict(msgspec.Struct, frozen=True):
-    """Verdict of one gate on one second; `words` name the device and are empty when still.
+    """Verdict of one gate on one second; `words` name the device; empty: still.
 
-    `fault`: the device, not the aircraft, blocks the calibration. `what`: the words without figures, for counting.
+    `fault`: the device, not the aircraft, blocks the calibration. `what`: the text without figures, for counting.
     """
 
     still: bool
@@ -91,7 +91,7 @@ STILL: Final = GateVerdict(still=True)
 
 
 def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> GateVerdict:
-    """'gyro fc moves 0.31 deg/s, max 0.10' and a hint, with as many digits as the difference takes."""
+    """Format a verdict as in 'gyro fc moves 0.31 deg/s, max 0.10', with enough digits to show the difference."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
@@ -104,10 +104,10 @@ def _fault(words: str) -> GateVerdict:
 
 
 def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, float]) -> tuple[float, float]:
-    """Rms of the slow part over the channels, and what is allowed: the gate, and chance.
+    """Return the rms of the slow part over the channels, and its limit: the gate, widened for chance.
 
-    The difference of the two variance estimates of white noise has a variance of about sigma^4 / n a channel; that
-    sigma^2 is the batch's own white part within bounds, for fast motion looks white in part.
+    The difference of the two variance estimates of white noise has a variance of about sigma^4 / n per channel. Here
+    sigma^2 is the batch's own white part, limited to `bounds`, because fast motion looks partly white.
     """
     white = batch.white[channels]
     chance = _CHANCE * float(np.clip(white.mean(), *bounds)) / math.sqrt(batch.n * len(white))
@@ -117,7 +117,7 @@ def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, 
 class ImuGate:
     """Gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes.
 
-    `steps`: resolution of a stream of integers, 0 for floats; `own`: its noise, where already learned.
+    `steps`: resolution of a stream of integers, 0 for floats; `own`: its learned noise, if any.
     """
 
     def __init__(
@@ -132,21 +132,21 @@ class ImuGate:
         self._white = profile.gyro.white, profile.accel.white
         self._is_float = np.repeat(steps, 3) == 0.0
         self._few_levels_s = np.zeros(6, dtype=np.int64)
-        """Seconds of few levels since the last one of many, for each channel."""
+        """Seconds with few levels since the last one with many, for each channel."""
         self._coarse_slot = [-math.inf, -math.inf]
         """Latest second in which the gyro, or the accelerometer, changed in coarse steps."""
-        self._whites: deque[Floats] = deque(maxlen=_RECENT)  # of seconds without motion
+        self._whites: deque[Floats] = deque(maxlen=_RECENT)  # white variances of seconds without motion
         self._noise = np.zeros(6)
-        """Variance of one sample's white noise; zero until a second was without motion."""
+        """Variance of one sample's white noise; zero before the first second without motion."""
         self.new_stretch()
 
     def new_stretch(self) -> None:
-        """End the still stretch: references start again. The noise stays known."""
+        """End the still stretch: restart the references, but keep the learned noise."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
 
     def forget_level(self) -> None:
-        """Drop what later readings are not comparable with: an offset was written, the owner restarted."""
+        """Drop references after a write of offsets or a restart: later readings cannot be compared with them."""
         self._own.clear()
         self.new_stretch()
 
@@ -178,10 +178,10 @@ class ImuGate:
         return None
 
     def _watch_steps(self, batch: Batch) -> None:
-        """Find a coarse stream of floats: some logs round, some parts have few digits.
+        """Detect a coarse stream of floats: some logs round, some parts have few digits.
 
-        Where noise is smaller than a step, a second without any change and one that toggles between two values are
-        both rest. One second of few values may be that of a freeze; several are not.
+        If noise is smaller than a step, seconds without a change, or toggling between two values, are both rest. One
+        second of few values may be a frozen sensor; several are not.
         """
         levels = batch.distinct
         few = (levels >= 2) & (levels <= _FEW_LEVELS) & (levels * _TIMES_EACH <= batch.n)
@@ -192,7 +192,7 @@ class ImuGate:
 
     def _moving(self, batch: Batch) -> GateVerdict | None:
         for number, (part, triad, motion, vibration, unit, unit_name) in enumerate(_TRIADS):
-            # What unfiltered white noise of the profile's density makes of one sample at this rate.
+            # Noise of one sample at this rate, if the profile's white noise is unfiltered.
             own, noise = self._own.known[number], self._white[number] * math.sqrt(batch.n)
             shaking = max(vibration, 1.5 * noise, 0.0 if own is None else 1.5 * math.sqrt(own.variance.mean()))
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
@@ -225,7 +225,7 @@ class ImuGate:
             return _words(f"gyro {name} turns or is biased by", turns / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         if not self._recent:
             return None
-        # A few samples say little about their own scatter; what is known says more.
+        # A few samples do not show their own scatter well: use the learned noise as a lower bound.
         scatter = np.maximum(batch.variance, self._noise) / batch.n
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
@@ -241,8 +241,8 @@ class ImuGate:
 
 
 def _beyond(values: Floats, reference: Sequence[Floats], chance: Floats) -> float:
-    """Largest difference of a channel from the mean of the reference, beyond chance."""
-    scatter = math.sqrt(1.0 + 1.0 / len(reference))  # of the difference, over that of one mean
+    """Return the largest difference of a channel from the mean of the reference, beyond chance."""
+    scatter = math.sqrt(1.0 + 1.0 / len(reference))  # sigma of the difference over that of one mean
     return float((np.abs(values - np.mean(reference, axis=0)) - scatter * chance).max())
 
 

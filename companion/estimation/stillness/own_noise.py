@@ -1,17 +1,17 @@
-"""Noise of a still sensor, learned from its stream whatever its spectrum, and told from motion by physics.
+"""Noise of a still sensor of any spectrum, learned from its stream and distinguished from motion by physics.
 
-Behind a low-pass filter the noise of a still sensor is as slow as the motion of an aircraft, and as large. Four facts
-tell them apart:
+Behind a low-pass filter, the noise of a still sensor is as slow and as large as the motion of an aircraft. Four facts
+distinguish them:
 
 - Noise behind any filter is flat down to zero frequency, or rises there (flicker): its density, the Allan variance
   times the averaging time, never grows towards shorter times. A standing aircraft only rocks: its angle is bounded, so
-  that its rate has nothing at zero frequency and stands out at the frequency of rocking. So do speed and acceleration.
+  its rate has no power at zero frequency and a peak at the rocking frequency. The same holds for acceleration.
 - Noise is steady: no second is an outlier among the others.
 - Noise has no favourite axis.
 - No part on the market exceeds a known density.
 
-The density at a second and more says what chance does to a second's mean; with the variance it gives the number of
-independent values in a second, which behind a filter is smaller than that of samples.
+The density at averaging times of a second and more gives the chance error of a second's mean. With the variance, it
+gives the number of independent values in a second, which is smaller than that of samples behind a filter.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 LEARN_S: Final = 30
-"""Seconds without a motion beyond any noise from which it is learned: some 70 degrees of freedom in three axes."""
+"""Seconds, without motion beyond any noise, needed to learn the noise: some 70 degrees of freedom in three axes."""
 KEPT_S: Final = 60
 EVERY_S: Final = 5  # Period of learning until both triads are known, then `LEARN_S`
 MOST: Final = (0.07 * DEG, 1.0 * MG)
-"""Largest believed density of gyro and accelerometer, times sqrt(s): 250 deg/h and three times the noisiest common
-accelerometer; the noisiest common gyro has 150 deg/h."""
+"""Largest plausible density of gyro and accelerometer, times sqrt(s): 250 deg/h (the noisiest common gyro has 150), and
+three times the noisiest common accelerometer."""
 RED: Final = 2.0
-"""Density at averages of several seconds over that at one, and of one over half a one: flicker raises it, warm-up, and
-a filter of 1 Hz. Slow rocking has 8 times as much at twice the time."""
+"""Largest density ratio between averages of several seconds and of one, or of one and half a second. Flicker, warm-up
+and a 1 Hz filter raise it; slow rocking makes it 8 at twice the time."""
 WHITE: Final = 0.8
-"""Share of the variance in successive differences from which noise is white: no filter to reckon with."""
+"""Share of the variance in successive differences above which noise is white, without a filter."""
 ROUND: Final = 40.0
-"""Largest over smallest variance of a second's steps in any direction: some axes are three times as noisy as others."""
+"""Limit for largest over smallest variance of steps in any direction: some axes are three times as noisy as others."""
 _SIGMAS: Final = 2.5
 _OUTLIER_SIGMAS: Final = 4.5
-_BEYOND: Final = 1.6  # A second with more than so many times the largest density is motion
-_GAP: Final = 4  # Largest distance of seconds that still belong together
+_BEYOND: Final = 1.6  # Limit in multiples of the largest density, beyond which a second is motion
+_GAP: Final = 4  # Largest distance of consecutive seconds
 _SPANS: Final = (1, 2, 4, 8)
 _NAMED: Final = 1.5  # Margin over the density of a part that the configuration names
 _AT_REST: Final = 3.0
-_HINT_S: Final = 5  # Seconds without a motion beyond any noise after which it may be noise
+_HINT_S: Final = 5  # Seconds without motion beyond any noise after which a hint may say that it is noise
 _SHARPEST: Final = 1.5
-"""Relative variance of a second's variance, in v / N^2: 1 for white noise and one pole, 1.5 for two, 2 for a wall."""
+"""Relative variance of a second's variance, v / N^2: 1 for white noise or 1 pole, 1.5 for 2 poles, 2 for a wall."""
 
 
 class Known(msgspec.Struct, frozen=True):
@@ -68,25 +68,25 @@ class Known(msgspec.Struct, frozen=True):
 
     @property
     def chance(self) -> float:
-        """Standard deviation of a second's variance, mean of the three axes."""
+        """Return the standard deviation of a second's variance, mean of the three axes."""
         return math.sqrt(_SHARPEST * float(self.variance @ self.density)) / 3.0
 
     @property
     def freedom(self) -> float:
-        """Independent values in a second of one axis."""
+        """Return the number of independent values per axis in a second."""
         return max(float(self.variance.sum() / self.density.sum()) / _SHARPEST, 1.0)
 
 
 class OwnNoise:
-    """Learns the noise of one IMU from its seconds, moving or not; knows nothing until it is certain.
+    """Learns the noise of one IMU from its seconds, moving or not; gives no result before it is certain.
 
-    `white`: N of the profile, gyro and accelerometer, which may name a noisier part than is common. `at_rest`: the
-    operator says that it is; three times as much noise is believed.
+    `white`: N of the profile, gyro and accelerometer; a named part may be noisier than common ones. `at_rest`: the
+    operator confirms rest, so three times as much noise is accepted.
     """
 
     def __init__(self, white: tuple[float, float] = (0.0, 0.0), *, at_rest: bool = False) -> None:
         self.known: list[Known | None] = [None, None]
-        """Gyro, accelerometer; each stays until a newer one is learned."""
+        """Learned noise of gyro and accelerometer; each stays until a newer one is learned."""
         believed = [max(_AT_REST * m if at_rest else m, _NAMED * n) for m, n in zip(MOST, white, strict=True)]
         self._most2 = np.repeat(np.square(believed), 3)
         self._at_rest = at_rest
@@ -94,13 +94,13 @@ class OwnNoise:
         self.clear()
 
     def clear(self) -> None:
-        """Drop readings that later ones are not comparable with; learned noise stays."""
+        """Drop readings that later ones cannot be compared with; keep the learned noise."""
         self._seconds.clear()
         self._since = 0
         self._too_much = [False, False]
 
     def hint(self, triad: int) -> str:
-        """Say that the motion of gyro (0) or accelerometer (1) may be noise; empty where it is not."""
+        """Return a hint that the motion of gyro (0) or accelerometer (1) may be noise; empty if it is not."""
         if self._at_rest or self.known[triad] is not None:
             return ""
         if self._too_much[triad]:
@@ -131,7 +131,7 @@ class OwnNoise:
 
     def _learn(self) -> None:
         seconds = list(self._seconds)
-        # All, or the latest: earlier ones may hold something that is over.
+        # Try the latest seconds, then all: earlier ones may hold a motion that has ended.
         for some in (seconds[-LEARN_S:], seconds):
             for triad, part in enumerate((slice(0, 3), slice(3, 6))):
                 found = _noise(some, part)
@@ -141,7 +141,7 @@ class OwnNoise:
 
 
 def _noise(seconds: list[Batch], part: slice) -> Known | None:
-    """Estimate the noise of three channels; None if anything but noise shows in these seconds."""
+    """Estimate the noise of three channels; None if these seconds show anything but noise."""
     slots = np.array([batch.slot for batch in seconds], dtype=np.int64)
     means = np.array([batch.mean[part] for batch in seconds])
     variances = np.array([batch.variance[part] for batch in seconds])
@@ -176,7 +176,7 @@ def _noise(seconds: list[Batch], part: slice) -> Known | None:
 
 
 def _ratio(first: float, second: float) -> float:
-    """Ratio that chance makes of two estimates of one variance, by their degrees of freedom."""
+    """Return the largest chance ratio of two estimates of one variance, from their degrees of freedom."""
     return math.exp(_SIGMAS * math.sqrt(2.0 / max(first, 1.0) + 2.0 / max(second, 1.0)))
 
 
@@ -185,5 +185,5 @@ def _parts(depth: int) -> Floats:
 
 
 def _freedom(parts: Floats) -> Floats:
-    """Degrees of freedom of the Allan variance of so many parts of a second."""
+    """Return the degrees of freedom of the Allan variance for a number of parts of a second."""
     return np.maximum(0.75 * parts - 1.0, 1.0)

@@ -1,7 +1,7 @@
-"""Readings of an IMU at rest that no bias explains: gravity along the wrong axis, or biases beyond those of any part.
+"""Detection of readings at rest that no bias explains: gravity along the wrong axis, or biases beyond any part's.
 
-Their cause is a mounting, exchanged axes or a unit, which is named with its remedy. The gates, the estimate and
-`companion check` use this.
+The cause is a wrong mounting, exchanged axes or a wrong unit; the text names it with its remedy. The gates, the
+estimate and `companion check` use this.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from companion.samples import Triad
 MOST_GYRO_RAD_S: Final = 30.0 * DEG
 MOST_ACCEL_M_S2: Final = 0.3 * G  # Several times the worst power-up bias in data sheets
 _TILTED_RAD: Final = math.radians(20.0)
-"""Angle between gravity by the IMU and by the tilt; the largest bias turns it by 17 degrees."""
+"""Limit for the angle between gravity by the IMU and by the tilt; the largest bias causes 17 degrees."""
 _FITS_M_S2: Final = 0.2 * G
 _AS_WELL_M_S2: Final = 0.02 * G
-"""Mountings that explain a reading about as well: level, ROLL_180 and PITCH_180 read the same. The simplest counts."""
+"""Difference below which mountings fit equally, as ROLL_180 and PITCH_180 do when level; the simplest counts."""
 _AXES: Final = "xyz"
 _UNITS: Final = {"g": G, "mg": 1e-3 * G, "cm/s^2": 0.01, "ft/s^2": 0.3048}
 _GRAVITY_M_S2: Final = (8.3, 11.3)
@@ -41,10 +41,10 @@ def implausible(
     sensor_to_vehicle: Matrix,
     remedy: str,
 ) -> dict[Triad, str]:
-    """Say by triad why means of one IMU over a still stretch cannot be biased readings.
+    """Return, by triad, the reason why means of one IMU over a still stretch cannot be biased readings.
 
-    The means and `expected_m_s2`, the specific force by the tilt, are (3,) in vehicle FRD; `remedy` says how to
-    configure another mounting, with {} for its name.
+    The means and `expected_m_s2`, the specific force from the tilt, are (3,) in vehicle FRD; `remedy` is the text on
+    how to configure another mounting, with {} for its name.
     """
     if words := misplaced(name, force_m_s2, expected_m_s2, sensor_to_vehicle, remedy):
         return {"gyro": words, "accel": words}
@@ -64,14 +64,14 @@ def implausible(
 
 
 def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehicle: Matrix, remedy: str) -> str | None:
-    """Say why gravity lies along another axis than by the tilt; None where it does not. Arguments: `implausible`."""
+    """Explain gravity along another axis than the tilt gives; None if it agrees. Arguments as in `implausible`."""
     sizes = float(np.linalg.norm(force_m_s2)), float(np.linalg.norm(expected_m_s2))
     if min(sizes) == 0.0:
         return None
     cosine = float(force_m_s2 @ expected_m_s2) / (sizes[0] * sizes[1])
     if cosine > math.cos(_TILTED_RAD):
         return None
-    # The simplest rotation by right angles that brings the reading, in the sensor's axes, to where it should be.
+    # Find the simplest rotation by right angles that maps the reading, in the sensor's axes, to the expected one.
     off = {
         rotation: float(np.linalg.norm(rotation_matrix(rotation) @ sensor_to_vehicle.T @ force_m_s2 - expected_m_s2))
         for rotation, angles in ROTATIONS_DEG.items()

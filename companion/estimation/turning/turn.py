@@ -1,7 +1,7 @@
-"""Angular rate of the platform under a standing aircraft: a quantity with a sigma, not an assumption.
+"""Angular rate of the platform under a standing aircraft: an estimate with a sigma, not an assumption.
 
-A significant rate blocks a calibration. A smaller one is not subtracted, since the ground does not turn, but belongs to
-the sigma of every gyro. So does the slope of gravity, for the level axes; the gates refuse a larger tilt.
+A significant rate blocks a calibration. A smaller one is not subtracted, because the ground does not turn, but adds to
+the sigma of every gyro. The slope of gravity adds to the level axes; the gates refuse a larger tilt.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 LEAST_RAD_S: Final = 0.005 * DEG
-"""A smaller rate never blocks: a compass warms up and wanders by some tenths of a degree in a minute."""
+"""Least rate that blocks: a compass warms up and wanders by some tenths of a degree in a minute."""
 LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
-"""A smaller rate never blocks without compass: a gyro that warms up unevenly shows as much."""
+"""Least rate that blocks without a compass: a gyro that warms up unevenly can show this much."""
 SIGNIFICANT: Final = 4.0
-"""Sigmas; rates are judged every second: 3 would be exceeded by chance in one still minute of a hundred."""
+"""Threshold in sigmas for a rate, checked every second; chance exceeds 3 in one of a hundred still minutes."""
 CHANCE_SIGMAS: Final = 2.0
-EVEN: Final = 0.25  # Share of the rate that each half of the headings must show; after a jump one half does not
+EVEN: Final = 0.25  # Share of the rate that each half of the headings must show; a jump shows in one half only
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True):
     """Angular rate of the platform during a window: clockwise about the vertical, and tilting (level, vehicle FRD).
 
-    Where nothing measures it, `by` is None, and the platform counts as fixed to the Earth. `noise_rad_s`: sigma of the
-    gyros without warm-up. `step_rad_s`: error of the window's mean where a turn may have begun within it. `is_vouched`:
-    a compass has seen the level of the gyros at rest; else that level may hold a turn itself.
+    `by` None: no sensor measures it, and the platform counts as fixed to the Earth. `noise_rad_s`: sigma of the gyros
+    without warm-up. `step_rad_s`: error of the window's mean if a turn may have begun within it. `is_vouched`: a
+    compass has confirmed the gyros' level at rest; else that level may contain a turn.
     """
 
     rate_rad_s: float = 0.0  # About the vertical, clockwise seen from above; never subtracted
@@ -53,7 +53,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def in_words(self) -> str:
-        """'turns 0.15 deg/s to the left'."""
+        """Format the rate, for example 'turns 0.15 deg/s to the left'."""
         size = abs(self.rate_rad_s) / DEG
         digits = max(1, 1 - math.floor(math.log10(size))) if size > 0.0 else 2
         return f"turns {size:.{digits}f} deg/s to the {'right' if self.rate_rad_s > 0.0 else 'left'}"
@@ -73,9 +73,9 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def variance(self) -> float:
-        """Variance of the error in a gyro about the vertical, (rad/s)^2.
+        """Return the variance of a vertical gyro's error from the turn, (rad/s)^2.
 
-        Without compass the ground counts as fixed unless the gyros show more than chance.
+        Without a compass, the ground counts as fixed unless the gyros show more than chance.
         """
         if self.is_told:
             return self.rate_rad_s**2 + self.sigma_rad_s**2 + self.step_rad_s**2
@@ -83,7 +83,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
         return known**2 + self.step_rad_s**2
 
     def covariance(self, up: Array) -> Matrix:
-        """Covariance of the error in every gyro, (3, 3) vehicle FRD; `up` (3,) is the vertical there."""
+        """Return the covariance (3, 3) of every gyro's error from the turn; vehicle FRD, `up` (3,) is the vertical."""
         level = np.eye(3) - np.outer(up, up)
         tilting = level @ np.array(self.tilting_rad_s)
         return np.outer(up, up) * self.variance + np.outer(tilting, tilting) + level * self.tilting_sigma_rad_s**2
@@ -93,7 +93,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def by_compass(headings: Sequence[Batch]) -> Turn | None:
-    """Estimate the rate by the slope of the heading; never significant where it jumps instead of turning."""
+    """Estimate the rate from the slope of the heading; a jump is never significant."""
     if len(headings) < FEWEST:
         return None
     slots = np.array([batch.slot for batch in headings], dtype=np.int64)
@@ -103,7 +103,7 @@ def by_compass(headings: Sequence[Batch]) -> Turn | None:
     )
     step = max(float(np.where(distinct == 2, high - low, 0.0).max()), float(decimal(low, high)[0]))
     hidden = hidden_by_steps(step, float(white.mean()), enough=not few_distinct(distinct)[0])
-    # Few seconds say little about their own noise; the readings within them say more.
+    # Few seconds do not show their own noise well; the readings within them do.
     least = math.sqrt(float(np.mean([batch.white[0] / batch.n for batch in headings])))
     found = fit_slope(slots, turned, white=least, hidden=hidden)
     rate, sigma = float(found.per_s[0]), math.sqrt(float(found.variance[0]))
@@ -124,7 +124,7 @@ def by_gyros(turns: Sequence[Turn]) -> Turn | None:
 
 
 def by_both(gyros: Turn | None, seen: Turn | None) -> Turn:
-    """Combine gyros and compass; where they contradict, gyros at their level are right."""
+    """Combine gyros and compass; if they contradict each other, gyros at their level are right."""
     if gyros is None or seen is None:
         return gyros or seen or Turn()
     if not gyros.is_vouched:

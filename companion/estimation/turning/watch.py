@@ -1,12 +1,12 @@
-"""Watch for a turn of the ground, second by second, by two witnesses.
+"""Detection of a turn of the ground, second by second, from two sources.
 
-The witnesses are the slope of the heading since the last movement, and the gyros against their level at rest. A heading
-that turns while the gyros stay at their level is a magnetic field that turns. Gyros that leave their level while the
-heading stands have changed themselves. One gyro without compass cannot tell a turn from a new bias.
+The sources are the slope of the heading since the last movement, and the gyros relative to their level at rest. If the
+heading turns while the gyros stay at their level, the magnetic field changes. If the gyros leave their level while the
+heading is constant, their bias has changed. One gyro without a compass cannot distinguish a turn from a new bias.
 
-A gyro's bias does not jump; a platform that begins to turn does. The mean rate at rest before the current window
-therefore bounds the turn within it. The bound depends on the part: white noise of both means, flicker and random walk
-in between, and warm-up, from the thermometer or from the slope of the rates.
+A gyro's bias does not jump; the rate of a platform that begins to turn does. The mean rate at rest before the current
+window therefore bounds the turn within it. The bound depends on the part: white noise of both means, flicker and random
+walk in between, and warm-up, from the thermometer or from the slope of the rates.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from companion.estimation.turning.turn import CHANCE_SIGMAS, SIGNIFICANT, Turn, 
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.units import DEG, DEG_H
 
-LEVEL_S: Final = 5  # Least seconds at rest that make a level
+LEVEL_S: Final = 5  # Least seconds at rest for a level
 RESTED_S: Final = 20
-"""Least seconds before a step within a window: just after switching on, a gyro warms up as fast as a step."""
+"""Least seconds before a step within a window: just after power-up, a warm-up looks like a step."""
 NOISE_KNOWN_S: Final = 20
-"""Least seconds that show the white noise of their means; before that, the noise of the last window holds."""
+"""Least seconds that show the white noise of their means; before that, the noise of the last window is used."""
 PER_K_RAD_S: Final = 54.0 * DEG_H  # Bias of a common gyro per kelvin (BMI088, method 2.1)
-PER_G_RAD_S: Final = 0.1 * DEG  # Sensitivity of an uncompensated MEMS gyro to gravity: another tilt gives another level
+PER_G_RAD_S: Final = 0.1 * DEG  # Sensitivity of an uncompensated MEMS gyro to gravity: the level depends on the tilt
 EARTH_RAD_S: Final = 15.04 * DEG_H
 WARMING_S: Final = 120.0
-"""A warm-up that is visible now may have been twice as steep for so long; an invisible one is over after it."""
+"""Time for which a visible warm-up may have been twice as steep before; an invisible one has ended after it."""
 WARMING_RAD_S2: Final = 0.5 * DEG_H  # Drift of an older level without thermometer, at most by `WARMED_RAD_S`
 WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
 RAMP_SIGMAS: Final = 1.5
 STEP_SIGMAS: Final = 5.0
-STEP_CHI_SQUARE: Final = 12.0  # Gain of a step over a cubic, a warm-up, from which it is sure
+STEP_CHI_SQUARE: Final = 12.0  # Threshold of chi-square by which a step fits better than a cubic (a warm-up)
 ACROSS_SHARE: Final = 0.25
-"""Share of a turn about the vertical that an error of the vertical, some degrees, shows in the level plane."""
-STEADY_SIGMAS: Final = 2.5  # Seconds that are farther off do not join the level: a slow turn would become the level
-CLEARED_S: Final = 10  # Seconds after which gyros at their level have not begun to turn with the latest movement
+"""Share of a vertical turn that appears in the level plane if the vertical is wrong by some degrees."""
+STEADY_SIGMAS: Final = 2.5  # Seconds farther off do not join the level, else a slow turn would become the level
+CLEARED_S: Final = 10  # Seconds at the level after which the latest movement has not started a turn
 SMOOTHED_OVER: Final = 5  # Headings in one value of the wander, so that noise does not look like wander
 BLIND_S: Final = 5  # Longest pause, for example while offsets are written, after which headings still belong together
 
@@ -59,15 +59,15 @@ _TURNED: Final = 8  # Variance of the platform's rate by the compass, for second
 
 
 class ImuLevel:
-    """Seconds of one IMU: those of the current window, and those at rest before it, which are its level.
+    """Seconds of one IMU in the current window, and its level: the seconds at rest before that.
 
     `rotation`: sensor to vehicle FRD; `steps`: resolution of its stream, rad/s and m/s^2, 0 for floats.
 
-    Found by `look`: `turn`, the rate about the vertical above the level, None without a level; `has_changed`, part of
-    that rate lies in the level plane, as no turn of the ground does: the sensor itself has changed; `tilting_rad_s`,
-    rotation of the direction of gravity, (3,) horizontal, vehicle FRD; `began`, the first second after a step of the
-    rate that neither the part's noise nor a warm-up explains; `step_rad_s`, the error that the likeliest step leaves in
-    the mean of the window, 0 where it is chance; `white`, the white noise N about the vertical.
+    Results of `look`: `turn`, the rate about the vertical above the level, None without a level. `has_changed`: part of
+    that rate lies in the level plane, which no turn of the ground causes, so the sensor has changed. `tilting_rad_s`:
+    rotation of the direction of gravity, (3,) horizontal, vehicle FRD. `began`: first second after a step of the rate
+    that neither the part's noise nor a warm-up explains. `step_rad_s`: error of the window's mean from the likeliest
+    step, 0 if it is chance. `white`: white noise N about the vertical.
     """
 
     def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
@@ -75,7 +75,7 @@ class ImuLevel:
         self._rotation = np.kron(np.eye(2), rotation)
         self._least = columns(profile)  # N, B and K of its six channels
         self._white = np.zeros(6)
-        """N of the gyros in the last window that was long enough to show it."""
+        """White noise N of the gyros in the last window that was long enough to show it."""
         self.window: deque[Floats] = deque()
         self.rest: deque[Floats] = deque(maxlen=2 * span)
         self.turn: Turn | None = None
@@ -87,16 +87,16 @@ class ImuLevel:
         self.white = 0.0
 
     def add(self, slot: int, batch: Batch, turned: float | None) -> None:
-        """Add a still second; one that leaves the window joins the level, with `turned` as in `end_window`."""
+        """Add a still second; the second that leaves the window joins the level, with `turned` as in `end_window`."""
         degc = math.nan if batch.temperature_degc is None else batch.temperature_degc
         self.window.append(np.array([slot, *self._rotation @ batch.mean, degc, math.nan]))
         self._variance = batch.variance
         self.end_window(turned, self._span)
 
     def end_window(self, turned: float | None, kept: int = 0) -> None:
-        """End the window but for the latest seconds; the others join the level.
+        """End the window except for the latest `kept` seconds; the others join the level.
 
-        `turned`: variance of the platform's rate by the compass, NaN without; None: it turns, and they do not join.
+        `turned`: variance of the platform's rate by compass, NaN without one; None: it turns, so no second joins.
         """
         while len(self.window) > kept:
             second = self.window.popleft()
@@ -120,12 +120,12 @@ class ImuLevel:
         return sum(float(second[_TURNED]) for second in self.rest) / len(self.rest) if self.rest else math.nan
 
     def look(self) -> bool:
-        """Compare the window with the level, if there is one, and with gravity; return False while it is too short."""
+        """Compare the window with the level, if any, and with gravity; return False while it is too short."""
         if len(self.window) < FEWEST:
             return False
         window = np.array(self.window)
         slots, rows = window[:, _SLOT].astype(np.int64), window[:, _READINGS]
-        # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, which is enough here.
+        # Vertical from the accelerometers, (3,) vehicle FRD; its error of some degrees does not matter here.
         force = window[:, _FORCES].mean(axis=0)
         size = float(np.linalg.norm(force))
         down = np.asarray(-force / size)
@@ -154,7 +154,7 @@ class ImuLevel:
         return True
 
     def _above_level(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn, bool]:
-        """Return the rate above the level about the vertical, and whether another part is above it too."""
+        """Return the vertical rate above the level, and whether a horizontal rate above it is significant."""
         count, weight = len(window), len(self.rest)
         level, now = np.array(self.rest).mean(axis=0), window.mean(axis=0)
         off = now[_RATES] - level[_RATES]
@@ -163,21 +163,21 @@ class ImuLevel:
         gap_s = max(age_s - (count + weight) / 2.0, 0.0)
         noise = np.square(slope.white[:3]) * (1.0 / count + 1.0 / weight)
         noise = noise + floor_variance(self._gyro.flicker, self._gyro.walk, weight, count + 2.0 * gap_s)
-        # Warm-up: as fast as the rates show, or as the thermometer says.
+        # Warm-up: from the slope of the rates, or from the thermometer.
         ramp = np.abs(slope.per_s[:3])
         ramp = np.where(ramp > RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
         if math.isfinite(now[_DEGC] - level[_DEGC]):
             warmed = PER_K_RAD_S * float(now[_DEGC] - level[_DEGC])
         else:
             warmed = min(WARMING_RAD_S2 * max(age_s - WARMING_S, 0.0), WARMED_RAD_S)
-        # Integers of the stream hide up to half a step each time.
+        # An integer stream hides up to half a step in each mean.
         hidden = 0.5 * self._steps[0]
         leaned = float(np.linalg.norm(down + level[_FORCES] / np.linalg.norm(level[_FORCES])))
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
         variance = noise + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
         across = np.abs(off - along * down)
-        # The heading may be another one: the Earth's rate then points elsewhere in the level plane.
+        # The heading may have changed: the Earth's rate then has another direction in the level plane.
         limit = SIGNIFICANT * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
         turn = Turn(
             rate_rad_s=along,
@@ -190,7 +190,7 @@ class ImuLevel:
 
 
 def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tuple[int | None, float]:
-    """Return `began` and `step_rad_s` for (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`."""
+    """Return `began` and `step_rad_s` for one-second means (m,), m >= `RESTED_S` + `LEVEL_S`."""
     count = len(values)
     values = values - values.mean()
     before = np.arange(RESTED_S, count - LEVEL_S + 1)
@@ -216,14 +216,14 @@ class TurnWatch:
         self._span = span
         self._levels: dict[str, ImuLevel] = {}
         self._headings: deque[tuple[bool, Batch]] = deque(maxlen=span)
-        """Seconds of the compass since the last movement, and whether each is one of the still stretch."""
+        """Seconds of the compass since the last movement, each with a flag: it belongs to the still stretch."""
         self._last_slot = 0
         self._start: int | None = None  # First second of the still stretch
         self._is_suspect = False
-        """Gyros that have moved or stepped since may be off their level by a turn; else they drift."""
+        """True after a movement or a step: gyros off their level may show a turn; else they drift."""
         self.turn = Turn()  # Rate as of the last second
         self.words = ""
-        """Reason why no calibration is possible, for a pilot; empty without one."""
+        """Reason for the pilot why no calibration is possible; empty: none."""
 
     def set_imu(self, name: str, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float]) -> None:
         self._levels[name] = ImuLevel(rotation, profile, steps, self._span)
@@ -250,17 +250,17 @@ class TurnWatch:
 
     @property
     def wander_deg(self) -> float | None:
-        """Range of the heading since the last movement, in the longest window at most; None until enough is known."""
+        """Range of the heading since the last movement, over the longest window at most; None: too few seconds."""
         turned = np.unwrap([float(batch.mean[0]) for _, batch in self._headings], period=360.0)
         if len(turned) < SMOOTHED_OVER:
             return None
         return float(np.ptp(np.convolve(turned, np.full(SMOOTHED_OVER, 1.0 / SMOOTHED_OVER), "valid")))
 
     def add_second(self, slot: int, imus: Mapping[str, Batch], heading: Batch | None, *, good: bool) -> bool:
-        """Add a second in which nothing but, perhaps, the compass has moved; False where the stretch ends with it.
+        """Add a second without movement (except perhaps of the compass); return False if the stretch ends with it.
 
-        `slot` ascends; `heading` is None without one, or while it still follows a movement; `good`: the second belongs
-        to a still stretch.
+        `slot` ascends; `heading` is None without a compass, or while that settles after a movement. `good`: the second
+        belongs to a still stretch.
         """
         if slot - self._last_slot > BLIND_S:
             self._headings.clear()
@@ -276,9 +276,9 @@ class TurnWatch:
         return self._judge(slot)
 
     def _turned(self) -> float | None:
-        """Variance of the rate by the compass, NaN without; None where seconds cannot join a level at rest."""
+        """Return the variance of the rate by compass, NaN without one; None: seconds must not join a level."""
         turn = self.turn
-        # By gyros alone a gradual change is a drift, and the level follows.
+        # With gyros alone, a gradual change counts as drift, and the level follows it.
         drifts = turn.by == "gyros" and not self._is_suspect
         if self.words or (not drifts and abs(turn.rate_rad_s) > STEADY_SIGMAS * turn.sigma_rad_s):
             return None
@@ -286,7 +286,7 @@ class TurnWatch:
 
     def _judge(self, slot: int) -> bool:
         found = [level for level in self._levels.values() if level.look()]
-        # A turn is in all gyros; the quietest shows its beginning best.
+        # All gyros see a turn; the one with the least noise shows its beginning best.
         quietest = min(found, key=lambda one: one.white, default=None)
         if quietest is not None and quietest.began is not None:
             for level in self._levels.values():
@@ -311,7 +311,7 @@ class TurnWatch:
         return True
 
     def _combined(self, found: list[ImuLevel]) -> Turn:
-        """Combine both witnesses; an IMU that they contradict has changed itself, and its level begins anew."""
+        """Combine both sources; an IMU that contradicts them has changed, and its level restarts."""
         gyros = by_gyros([one.turn for one in found if one.turn is not None and not one.has_changed])
         seen = by_compass([batch for _, batch in self._headings])
         if seen is None or not seen.is_significant:

@@ -1,7 +1,7 @@
 """MAVLink on one link: packing, parsing, sequence numbers, and subscriptions.
 
 The codec is pymavlink's dialect class; `mavutil` blocks, prints, and weighs 41 MiB. A transport hands received bytes
-to `receive` and gives `attach` a function that sends. Frames that nobody wants are told by `kind_at`, not decoded.
+to `receive` and gives `attach` a function that sends. Frames without a subscriber are skipped by `kind_at`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SI
 
 
 def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
-    """Return kind and end of a whole, unsigned, intact frame of version 2; None for anything else."""
+    """Return the kind and end offset of a complete, valid, unsigned MAVLink 2 frame; None for anything else."""
     if len(data) - at < 12 or data[at] != mavlink.PROTOCOL_MARKER_V2 or data[at + 2]:
         return None
     end = at + 12 + data[at + 1]
@@ -40,7 +40,7 @@ def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
 
 
 class MavlinkLink:
-    """One MAVLink connection as one component sees it, under the system id of the autopilot that was latched."""
+    """One MAVLink connection of one component, which sends under the system id of its autopilot."""
 
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
@@ -69,7 +69,7 @@ class MavlinkLink:
         self._codec.srcSystem = autopilot[0]
 
     def is_for_us(self, message: Any) -> bool:
-        """Check a message's target: this component, or 0 for all (older firmware does not say whom it answers)."""
+        """Check a message's target: this component, or 0 for all (older firmware answers to 0)."""
         return message.target_system in (0, self.system_id) and message.target_component in (0, self.component_id)
 
     @property
@@ -91,13 +91,13 @@ class MavlinkLink:
         self.on_bytes.tell("in", None, None)
 
     def settled(self) -> bool:
-        """Receive everything that waits; False: more keeps coming, or something still waits to be sent."""
+        """Receive all waiting data. Return False if more keeps coming or output is still waiting to be sent."""
         return self._settled()
 
     def send(self, message: mavlink.MAVLink_message, allowed: Callable[[], bool] = lambda: True, /) -> bool:
         """Send a message now; False: no transport is attached, or its buffer is full.
 
-        `allowed` is asked last, directly before the bytes leave.
+        `allowed` is called last, directly before the bytes are sent.
         """
         data = message.pack(self._codec)
         if self.signing is not None:
@@ -116,23 +116,23 @@ class MavlinkLink:
         return self._handlers.setdefault(kind.msgname, Listeners()).add(handler)  # type: ignore[arg-type]
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Handle bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        """Handle bytes of a stream that arrived at `t_s` (monotonic). Never raises, whatever the bytes contain."""
         self.on_bytes.tell("in", data, t_s)
         attached = self._attached
         for name, _, message in self._frames(data):
             self._dispatch(name, message, t_s)
             if self._attached != attached:
-                return  # what came over another transport ends here
-        # The codec frees its buffer only when a read happens to end on a frame's end; a busy serial link may not
-        # do that for hours.
+                return  # a handler replaced the transport: drop the remaining bytes of the old one
+        # The codec frees its buffer only when a read happens to end at the end of a frame. On a busy serial link that
+        # may not happen for hours.
         if self._codec.buf_index > _COMPACT_BYTES:
             del self._codec.buf[: self._codec.buf_index]
             self._codec.buf_index = 0
 
     def receive_datagram(self, datagram: bytes, t_s: float, admit: Callable[[Sender], None]) -> None:
-        """Parse a datagram of whole messages; `admit` learns each sender before its message has any effect.
+        """Parse a datagram of whole messages; `admit` gets each sender before its message has any effect.
 
-        A radio's own messages are not admitted by anybody: they come without a signature.
+        `admit` is not called for a radio's own messages: they come without a signature.
         """
         self.on_bytes.tell("in", datagram, t_s)
         frames = list(self._frames(datagram))
@@ -146,9 +146,9 @@ class MavlinkLink:
             self._dispatch(name, message, t_s)
 
     def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
-        """Yield name, sender and message of whole admitted frames; no message where nobody wants it.
+        """Yield name, sender and message of whole admitted frames; the message is None without a subscriber.
 
-        The codec gets everything from the first frame on that `kind_at` does not know.
+        From the first frame that `kind_at` does not recognise, the codec gets all remaining bytes.
         """
         if self._codec.buf:
             data = self.half_received + data
@@ -183,7 +183,7 @@ class MavlinkLink:
         return self.signing is None or self.signing.admits(message.get_msgbuf())
 
     def signed_on(self, message: Message) -> int | None:
-        """Return the sender's link id in a message signed with our key; None for others, or without signing."""
+        """Return the link id of a message that is signed with our key; None for other messages or without signing."""
         return None if self.signing is None else self.signing.link_id_of(message.get_msgbuf())
 
     def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:

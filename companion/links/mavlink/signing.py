@@ -1,6 +1,6 @@
 """MAVLink 2 signing: sign what is sent, verify what is received, refuse old messages.
 
-Specification: mavlink.io, Message Signing. A signature is 13 bytes behind the checksum: link id, 48 bits of time in
+Specification: mavlink.io, Message Signing. A signature is 13 bytes after the checksum: link id, 48 bits of time in
 units of 10 us since 2015, and the first 48 bits of SHA-256 over key, packet, link id and time. Verification is not
 pymavlink's: pymavlink 2.4.50 adopts the time of a packet before it checks the signature, so one forged packet from the
 far future would shut the true sender out. It also keeps a place for every claimed sender, and logs each.
@@ -32,11 +32,11 @@ EPOCH_S: Final = 1420070400
 TICKS_PER_S: Final = 100_000
 LAST: Final = 2**48 - 1
 LATE_TICKS: Final = 60 * TICKS_PER_S
-"""Largest lag of a sender behind our time (the specification's minute for a sender heard for the first time)."""
+"""Largest lag of a sender relative to our time: the specification's minute for a sender's first message."""
 BEHIND_ITSELF_TICKS: Final = 5 * TICKS_PER_S
-"""Largest lag of a sender behind its newest time on any of its links; an older message was held back."""
+"""Largest lag of a message relative to its sender's newest time on any link; an older one was delayed or replayed."""
 MAX_STREAMS: Final = 64
-"""Remembered senders with the key, by system, component and link; later ones are refused."""
+"""Maximum number of remembered senders with the key, by system, component and link; later ones are refused."""
 NEVER_SIGNED: Final = frozenset({mavlink.MAVLINK_MSG_ID_RADIO_STATUS, mavlink.MAVLINK_MSG_ID_RADIO})
 """Messages that a telemetry radio adds by itself, without a key."""
 EARLIEST_S: Final = 1577836800.0  # 2020: an earlier clock has not been set
@@ -47,11 +47,11 @@ _TAIL: Final = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN
 _HASH: Final = 6
 
 Reason = Literal["unsigned", "other key", "old", "no key"]
-"""Why a message is refused. "old": it, or a much later one of its sender, has been received before."""
+"""Cause of a refusal. "old": this message, or a much later one of its sender, was received before."""
 
 
 def uptime_s() -> float:
-    """Return the seconds since the board started, sleep included; never goes back."""
+    """Return the seconds since the board started, including sleep (monotonic)."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -61,7 +61,7 @@ def ticks_of(unix_s: float) -> int:
 
 
 def sign(frame: bytes, crc_extra: int, key: bytes, link_id: int, ticks: int) -> bytes:
-    """Sign an unsigned MAVLink 2 packet; its checksum is made anew, as it covers the flag of signed packets."""
+    """Sign an unsigned MAVLink 2 packet. Its checksum is recomputed, because it covers the flag of signed packets."""
     head = bytearray(frame[:-2])
     head[2] |= _SIGNED
     crc = mavlink.x25crc(head[1:])
@@ -71,17 +71,17 @@ def sign(frame: bytes, crc_extra: int, key: bytes, link_id: int, ticks: int) -> 
 
 
 def _digest(key: bytes, packet: bytes | bytearray) -> bytes:
-    # Not an HMAC: the specification says so.
+    # The specification requires a plain hash, not an HMAC.
     return hashlib.sha256(key + packet).digest()[:_HASH]
 
 
 class SigningClock:
-    """Time for signatures, in ticks: never the same twice, never back, whatever the system's clock does.
+    """Signature time in ticks: strictly increasing, whatever the system's clock does.
 
-    The system's clock sets it once a boot. A later jump of that clock by more than a minute is refused: one wrong
-    clock would stay in the stored time and in every receiver, and true senders would look old for good. A board
-    without a battery-backed clock starts in 1970: the time then continues from `start` (ticks, later than any used
-    before) and adopts the time of the first message signed with our key.
+    The system's clock sets it once per boot. A later jump of the system's clock by more than a minute is refused.
+    Otherwise one wrong clock would stay in the stored time and in every receiver, and true senders would look old for
+    good. A board without a battery-backed clock starts in 1970: signature time then continues from `start` (ticks,
+    later than any used before) and adopts the time of the first message signed with our key.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class SigningClock:
         self._is_set = False
 
     def resume(self, ticks: int, *, is_set: bool) -> None:
-        """Continue behind time used before; `is_set`: in this boot, so the system's clock does not set it again."""
+        """Continue from `ticks`, already used; `is_set`: set in this boot, so the system's clock sets it no more."""
         self._base, self._base_s, self._is_set = ticks, self._uptime_s(), is_set
 
     def now(self) -> int:
@@ -101,7 +101,7 @@ class SigningClock:
         ticks = self._base + int((now_s - self._base_s) * TICKS_PER_S)
         ahead = ticks_of(self._wall_s()) - ticks
         if ahead > 0 and not (self._is_set and ahead > LATE_TICKS):
-            # A new base, so that a clock which then steps back does not take this time with it.
+            # A new base: if the system's clock then steps back, signature time does not.
             ticks += ahead
             self._base, self._base_s, self._is_set = ticks, now_s, True
         return min(max(ticks, self._used), LAST)
@@ -121,7 +121,7 @@ class SigningClock:
 
 
 class Signing:
-    """Sign and verify the messages of one link; with `required` a refused one is dropped, else only counted.
+    """Signing and verification of one link's messages. With `required` a refused message is dropped, else only counted.
 
     Without a key every message is refused.
     """
@@ -145,7 +145,7 @@ class Signing:
         return sign(frame, crc_extra, self.key, link_id=0, ticks=self.clock.next())
 
     def admits(self, frame: bytes | bytearray) -> bool:
-        """Verify a whole packet with a right checksum; whether it may have any effect."""
+        """Verify a whole packet whose checksum is correct; return whether it may have any effect."""
         first = frame[0] == _MARKER_1
         if (frame[5] if first else int.from_bytes(frame[7:10], "little")) in NEVER_SIGNED:
             return True
@@ -194,7 +194,7 @@ MAX_FILE_BYTES: Final = 1024
 
 
 def read_key(path: Path) -> bytes:
-    """Read the 32 bytes of the key; raise LinkError, without any of its content, where the file holds none."""
+    """Read the 32 bytes of the key; raise LinkError, which never quotes the file, if it holds no key."""
     try:
         with path.open("rb") as file:
             rights = os.fstat(file.fileno()).st_mode
@@ -203,7 +203,7 @@ def read_key(path: Path) -> bytes:
         raise _unusable(path, error.strerror or type(error).__name__) from None
     if rights & (stat.S_IROTH | stat.S_IWOTH):
         raise _unusable(path, f"everybody on this computer may open it: chmod 600 {path}")
-    # 32 random bytes look like typed text once in 10^13.
+    # The chance that 32 random bytes all look like typed text is 1 in 10^13.
     typed = all(32 <= byte < 127 or byte in b"\r\n" for byte in content)
     key = content if len(content) == KEY_BYTES and not typed else _from_text(content, path)
     if not any(key):

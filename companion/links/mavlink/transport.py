@@ -1,6 +1,6 @@
-"""Carries a MAVLink link's bytes over UDP, TCP or a serial line, and comes back by itself.
+"""Transports of a MAVLink link over UDP, TCP or a serial line; each reconnects by itself.
 
-The link is attached only while there is somebody, or at least somewhere, to send to.
+The link is attached only while a peer, or at least an address to send to, is known.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from companion.messages import message
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
-"""Newcomers beyond these are heard but not answered; only the autopilot's own address gets the place of another."""
+"""Peers that are sent to. Later ones are received but not answered; only the autopilot's address replaces a peer."""
 MOST_WAITING = 1024
-"""Datagrams that are read at once before something may be written; the kernel keeps some 300."""
+"""Most datagrams read in one pass, before any write; the kernel buffers some 300."""
 MOST_DATAGRAM_BYTES = 65536
-"""UDP carries no more; asyncio makes room for four times that, afresh for every datagram, which costs more than all the
-rest of its reading: so much memory is got from the kernel, and given back, page by page."""
+"""Largest UDP datagram, and our read buffer. asyncio allocates four times as much for every datagram; getting that
+memory from the kernel page by page, and returning it, costs more than the rest of a read."""
 RESOLVE_DEADLINE_S = 5.0
 _TURN_S = 1.0
 _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\d+)")
-# The target's host is up but nobody listens yet (or it restarts): keep sending, it will come.
+# The target's host is up, but no program listens yet (or it restarts): keep sending.
 _PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS})
 
 Peer = tuple[Any, ...]
 
 
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
-    """Keep `link` connected through `url` until cancelled; raise LinkError where the url is wrong."""
+    """Keep `link` connected through `url` until cancelled; raise LinkError if the url is wrong."""
     kind, where, number = parse_url(url)
     if kind in ("udpin", "udpout"):
         await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)
@@ -99,8 +99,8 @@ class _Udp(asyncio.DatagramProtocol):
         self.closed: asyncio.Future[None] = loop.create_future()
         self._failed: asyncio.Future[str] = loop.create_future()
         self._socket: socket.socket | None = None
-        """A second descriptor of the transport's socket: asyncio reads one datagram a turn, and keeps what finds no
-        room in the kernel to send it later."""
+        """A second descriptor of the transport's socket. asyncio reads only one datagram per loop turn, and queues a
+        datagram for which the kernel has no room."""
 
     async def run(self) -> str:
         while not self._failed.done():
@@ -125,12 +125,12 @@ class _Udp(asyncio.DatagramProtocol):
         self._fail(exc)
 
     def error_received(self, exc: Exception) -> None:
-        # Anything else (the network is down, our address is gone) may be for ever for a socket that is bound to it.
+        # Any other error (network down, address gone) may last for ever on a socket bound to that address.
         if not (isinstance(exc, OSError) and exc.errno in _PASSING_ERRORS):
             self._fail(exc)
 
     def settled(self) -> bool:
-        """Receive all datagrams that wait in the kernel; False: more and more come, or the socket is gone."""
+        """Receive all datagrams that wait in the kernel. Return False if more keep coming or the socket is gone."""
         for _ in range(MOST_WAITING):
             if self._socket is None:
                 return False
@@ -171,9 +171,9 @@ class _Speaker(_Udp):
 
 
 class _Listener(_Udp):
-    """udpin: sends to every peer that has a place; with no such peer the link counts as not connected.
+    """Transport for udpin: sends to every registered peer; without one the link counts as not connected.
 
-    A place is for who has sent a message that may have an effect, not for any bytes.
+    A peer is registered once it has sent a message that may have an effect; other bytes do not count.
     """
 
     def __init__(self, link: MavlinkLink) -> None:
@@ -203,7 +203,7 @@ class _Listener(_Udp):
         return True
 
     def error_received(self, exc: Exception) -> None:
-        # One peer that cannot be reached is its own trouble; it is forgotten once silent.
+        # An unreachable peer does not concern the others; it is removed once silent.
         return
 
     def _turn(self) -> None:

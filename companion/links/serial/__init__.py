@@ -1,1 +1,1 @@
-"""Serial ports: opening, reading, and what can be wrong with them."""
+"""Serial ports: opening, reading, and their faults."""

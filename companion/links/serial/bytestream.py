@@ -1,4 +1,4 @@
-"""A serial port or `tcp://` that comes back by itself: one non-blocking descriptor, read on the event loop."""
+"""Byte link over a serial port or `tcp://` that reopens by itself: one non-blocking descriptor on the event loop."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.system.connection import Budget, OnState, Reconnection, connect_tcp, words_of
 from companion.messages import message
 
-READ_BYTES = 4096  # size of a tty's buffer: one read empties the port, so one time stamp holds for it all
+READ_BYTES = 4096  # size of a tty's buffer: one read empties the port, so one time stamp is right for all its bytes
 QUICK_READS = 20
-QUICK_S = 0.0015  # mean interval of `QUICK_READS` reads of a stream whose every byte would wake the loop
+QUICK_S = 0.0015  # mean interval of `QUICK_READS` reads; quicker reads are collected, as each byte would wake the loop
 COLLECT_S = 0.0205
-"""Time for which such a stream is collected before the next read, as behind a USB adapter: a wake-up costs far more
-than its bytes. A little more than the 20 ms within which an autopilot takes one heading (autopilots 6)."""
-FULLEST_LINE = 0.9  # the greatest share of a line's time that a stream may fill to be collected
+"""Pause before the next read of a quick stream, as a USB adapter does: a wake-up costs far more than its bytes.
+Slightly above the 20 ms within which an autopilot accepts one heading (autopilots 6)."""
+FULLEST_LINE = 0.9  # largest load of the line, as a share of its capacity, at which reads are collected
 OUT_BUFFER_BYTES = 16384
 LONGEST_PAUSE_S = 1.0
 BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 FLOOD_PAUSE_S = 0.05
-MOST_READS = 64  # reads of a port before something may be written to it; the kernel keeps less than these bring
+MOST_READS = 64  # most reads of a port before a write; the kernel buffers fewer bytes than these can return
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 WORTH_S = 2.0
@@ -35,7 +35,7 @@ WORTH_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class PortSettings:
-    """A port and its line setting; baud and parity mean nothing for `tcp://HOST:PORT`."""
+    """A port and its line setting; baud and parity are ignored for `tcp://HOST:PORT`."""
 
     url: str
     baud: int
@@ -50,13 +50,13 @@ class PortSettings:
 
     @property
     def seconds_per_byte(self) -> float:
-        """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp://, where unknown."""
+        """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp:// (unknown)."""
         if self.is_tcp:
             return 0.0
         return (10 if self.parity == "none" else 11) / self.baud
 
     def address(self) -> tuple[str, int]:
-        """Return host and port of a tcp:// url; raise LinkError where either is missing or wrong."""
+        """Return host and port of a tcp:// url; raise LinkError if either is missing or wrong."""
         try:
             parts = urlsplit(self.url)
             host, port = parts.hostname, parts.port
@@ -68,10 +68,10 @@ class PortSettings:
 
 
 class ByteLink:
-    """Bytes of one port to `on_bytes(data, t_s)` while `run` runs; opens again after every loss.
+    """Link that passes the bytes of one port to `on_bytes(data, t_s)` while `run` runs; reopens after every loss.
 
-    `on_state(connected, reason)` reports every change, `on_gap` bytes thrown away. Callbacks must neither block nor
-    raise.
+    `on_state(connected, reason)` reports every change of state; `on_gap` reports that bytes were discarded. Callbacks
+    must neither block nor raise.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class ByteLink:
         self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
         self._reconnection = Reconnection(name, worth_s=WORTH_S, cap_s=LONGEST_PAUSE_S, on_state=on_state)
         self._descriptor: int | None = None
-        self._reads = 0  # reads that brought bytes since `_reads_since`, a time and the bytes received by then
+        self._reads = 0  # reads with data since `_reads_since`, which is a time and the bytes received by then
         self._reads_since = (0.0, 0)
         self._collecting: asyncio.TimerHandle | None = None
         self._lost: asyncio.Future[str] | None = None
@@ -134,7 +134,7 @@ class ByteLink:
         return lost.result()
 
     def write(self, data: bytes) -> bool:
-        """Send, or keep in the bounded out-buffer; False when closed or full: then nothing of `data` is sent."""
+        """Send `data` or queue it in the bounded buffer. Return False if closed or full: then nothing of it is sent."""
         if self._descriptor is None or len(self._out) + len(data) > OUT_BUFFER_BYTES:
             return False
         waiting = bool(self._out)
@@ -144,7 +144,7 @@ class ByteLink:
         return self._descriptor is not None
 
     def settled(self) -> bool:
-        """Hand on all that has come; False: more and more comes, something still waits to leave, or it is closed."""
+        """Pass on all received bytes. Return False if more keep coming, output is waiting, or the link is closed."""
         now_s = asyncio.get_running_loop().time()
         emptied = any(not self._read(now_s) for _ in range(MOST_READS))
         return emptied and self._descriptor is not None and not self._out
@@ -182,7 +182,7 @@ class ByteLink:
     def _collected(self) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        # First of all: whatever happens in this turn, there will be another.
+        # Schedule the next turn first, so that it comes whatever happens in this one.
         self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
         goes_on = self._read(now_s) and self._fits_the_line(now_s)
         if self._descriptor is None or self._paused is not None:
@@ -198,13 +198,13 @@ class ByteLink:
             self._collecting = None
 
     def _fits_the_line(self, now_s: float) -> bool:
-        """Return whether the line could have carried the bytes since `_reads_since`; on USB it need not."""
+        """Return whether the line could carry the byte rate since `_reads_since`; USB may exceed the line rate."""
         since_s, bytes_then = self._reads_since
         carried = self.bytes_received - bytes_then
         return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)
 
     def _read(self, now_s: float) -> bool:
-        """Read once and hand on the bytes; return whether any came. A dead port is closed."""
+        """Read once, pass on the bytes, and return whether there were any. Close a dead port."""
         if self._descriptor is None:
             return False
         try:
@@ -215,7 +215,7 @@ class ByteLink:
             self._lose(self._explain(error))
             return False
         if not data:
-            # A tty that was hung up is readable for ever and yields nothing: closing is the only way out of the spin.
+            # A tty after a hang-up is always readable and returns nothing: only closing it ends the busy loop.
             self._lose(self._explain(None))
             return False
         self.bytes_received += len(data)
@@ -240,10 +240,10 @@ class ByteLink:
             for _ in range(DISCARD_READS):
                 data = os.read(self._descriptor, DISCARD_BYTES)
                 if not data:
-                    break  # the reader will find it, and what it means
+                    break  # the next read gets the error and explains it
                 self.bytes_received += len(data)
         except OSError:
-            pass  # empty, or gone: the reader will find it
+            pass  # empty, or gone: the next read handles it
         self._on_gap()
         self._reads, self._reads_since = 0, (loop.time(), self.bytes_received)
         loop.add_reader(self._descriptor, self._readable)
@@ -271,7 +271,7 @@ class ByteLink:
         return message("no_connection", url=url, reason=reason)
 
     def _lose(self, reason: str) -> None:
-        # At once, not when `run` gets to it: while a dead descriptor is open, the device comes back under another name.
+        # Close at once, not in `run`: while a dead descriptor is open, the device returns under another name.
         self._close()
         if self._lost is not None and not self._lost.done():
             self._lost.set_result(reason)

@@ -1,6 +1,6 @@
-"""Listening to a port at one line setting after another until a device is understood; sends nothing.
+"""Detection of a port's device: listen at one line setting after another until a decoder accepts it; send nothing.
 
-Opening raises DTR, which restarts boards like the Arduino: a port is listened to on request only, and never if held.
+Opening raises DTR, which restarts boards like the Arduino: listen on request only, and never on a port in use.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from companion.protocols.guess import (
 )
 
 SILENT_S: Final = 3.0
-"""Wait at the first setting before a port is called silent: a talker is seen at every speed."""
+"""Wait at the first setting before a port is called silent: a device that sends shows bytes at any speed."""
 LINE_S: Final = 1.0
 LINE_MOST_S: Final = 2.5
 FEW_BYTES: Final = 100
@@ -52,7 +52,7 @@ class Heard:
 
 
 def ports_to_try(found: Sequence[SerialPort]) -> list[str]:
-    """All ports, each by its best name, but a console's: what is said there is a login, and no sensor."""
+    """Return the best name of each port, without consoles: those carry a login, not a sensor."""
     return [port.stable_name or port.device for port in found if not port.is_console]
 
 
@@ -89,7 +89,7 @@ async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> He
             data = await _bytes_at(path, line, most_s=LINE_MOST_S if number else SILENT_S)
         except LinkError as error:
             if DRIVER_REFUSES in str(error):
-                continue  # a speed that this driver does not know
+                continue  # the driver does not support this speed
             raise
         heard += len(data)
         if senders := heartbeats(data):
@@ -128,7 +128,7 @@ async def _bytes_at(path: str, line: Line, most_s: float) -> bytes:
                 found = None if mavlink else likeliest(heard)
                 if not mavlink and (found.sure if found is not None else looked >= ENOUGH_BYTES):
                     break
-            # An autopilot's heartbeat comes once a second, however much else it says.
+            # An autopilot sends its heartbeat only once a second, whatever else it sends.
             if past_s >= most_s or (past_s >= LINE_S and len(data) >= FEW_BYTES and not mavlink):
                 break
     finally:

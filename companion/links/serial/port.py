@@ -1,6 +1,6 @@
-"""Opening a serial port exclusively, and the cause in one line where that failed.
+"""Exclusive opening of a serial port, with the cause of a failure in one line.
 
-pyserial opens; TIOCEXCL, parity checking and VMIN = 1 are added here. Only the descriptor is kept.
+pyserial opens the port; this module adds TIOCEXCL, parity checking and VMIN = 1, and keeps only the descriptor.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from companion.links.serial.ports import find_holders, in_use
 from companion.messages import message
 
 OPEN_DEADLINE_S = 5.0
-"""A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
+"""Timeout of an open: a healthy USB port opens in some milliseconds; a hung driver must not hang the daemon."""
 
 DRIVER_REFUSES = "the driver refuses"
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
-    """Open a port raw, 8 data bits, one stop bit, no flow control, non-blocking; blocks while the driver does."""
-    import serial  # 10 ms that a daemon without serial ports need not spend
+    """Open a port raw, non-blocking, 8 data bits, one stop bit, no flow control. This call blocks with its driver."""
+    import serial  # costs 10 ms: imported only if there is a serial port
 
     try:
         port = serial.Serial(path, baud, parity=parity[0].upper(), timeout=0, exclusive=True)
     except (OSError, ValueError, OverflowError, termios.error) as error:
         raise LinkError(explain(path, baud, error)) from None
     try:
-        # The lock of exclusive=True stops only those who ask for it; TIOCEXCL stops everyone but root.
+        # The lock of exclusive=True stops only programs that check it; TIOCEXCL stops everyone but root.
         fcntl.ioctl(port.fd, termios.TIOCEXCL)
         _finish_settings(port.fd, parity)
         try:
             port.set_low_latency_mode(True)
         except (ValueError, NotImplementedError, OSError):
-            pass  # only UARTs and some USB bridges have such a mode; `companion ports` shows an FTDI's timer
-        # The lock belongs to the open file, which a duplicate shares: pyserial's four pipe ends need not stay.
+            pass  # only UARTs and some USB bridges have a low-latency mode; `companion ports` shows an FTDI's timer
+        # A duplicate shares the open file and so its lock; pyserial's four pipe ends can then be closed.
         descriptor = os.dup(port.fd)
         os.set_blocking(descriptor, False)
     except (OSError, termios.error) as error:
@@ -55,7 +55,7 @@ def open_serial(path: str, baud: int, parity: Parity) -> int:
 
 
 def close_serial(descriptor: int) -> None:
-    """Close a port, without the exclusive lock that a pseudo-terminal would keep while its other end is open."""
+    """Unlock and close a port: a pseudo-terminal would keep the exclusive lock while its other end is open."""
     with contextlib.suppress(OSError):  # gone already, or a socket
         fcntl.ioctl(descriptor, termios.TIOCNXCL)
     os.close(descriptor)
@@ -63,11 +63,11 @@ def close_serial(descriptor: int) -> None:
 
 def _finish_settings(descriptor: int, parity: Parity) -> None:
     settings = termios.tcgetattr(descriptor)
-    # A byte that fails its parity or its stop bit is then read as NUL, so a decoder can tell it from data.
+    # A byte with a wrong parity or stop bit is then read as NUL, so that a decoder can recognise it.
     settings[0] &= ~(termios.IGNPAR | termios.BRKINT | termios.INPCK)
     if parity != "none":
         settings[0] |= termios.INPCK
-    # With pyserial's VMIN = 0 a read without data returns 0 bytes, the very sign of a device that has gone.
+    # With pyserial's VMIN = 0 a read without data returns 0 bytes, which also means that the device is gone.
     settings[6][termios.VMIN] = 1
     settings[6][termios.VTIME] = 0
     termios.tcsetattr(descriptor, termios.TCSANOW, settings)
@@ -78,7 +78,7 @@ def explain(path: str, baud: int, error: Exception) -> str:
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return message("no_device", port=path)
     if number == errno.EPERM:
-        # Not the file's mode: systemd's device control, which knows the classes of the drivers loaded at its start.
+        # The file's mode allows it, but systemd's device control knows only the drivers loaded when it started.
         return message("port_access_denied", port=path, why="the service's unit does not allow this kind of port")
     if number == errno.EACCES:
         return message("port_access_denied", port=path, why=_who_may(path))
@@ -99,7 +99,7 @@ def _errno_of(error: Exception) -> int | None:
     if isinstance(number, int):
         return number
     first = error.args[0] if error.args else None
-    return first if isinstance(first, int) else None  # termios.error is no OSError but carries the same pair
+    return first if isinstance(first, int) else None  # termios.error is not an OSError, but has the same arguments
 
 
 def _who_may(path: str) -> str:
@@ -131,9 +131,9 @@ def _is_character_device(path: str) -> bool:
 
 
 class SerialOpener:
-    """Opens one port without ever holding up the event loop or the exit of the process.
+    """Opens one port without blocking the event loop or the exit of the process.
 
-    An open may hang with its driver for ever, so each attempt runs in a daemon thread: asyncio would wait for its own.
+    A hung driver may block for ever, so each attempt runs in a daemon thread: asyncio would wait for its own threads.
     """
 
     def __init__(self, path: str, baud: int, parity: Parity) -> None:
@@ -141,7 +141,7 @@ class SerialOpener:
         self._thread: threading.Thread | None = None
 
     async def open(self) -> int:
-        """Return the descriptor of the opened port, none when cancelled; raise LinkError with port and cause."""
+        """Open the port and return its descriptor; raise LinkError with port and cause."""
         if self._thread is not None and self._thread.is_alive():
             raise LinkError(message("port_cannot_be_opened", port=self._path, reason="the driver hangs"))
         loop = asyncio.get_running_loop()
@@ -158,7 +158,7 @@ class SerialOpener:
             reason = f"no answer of the driver within {OPEN_DEADLINE_S:g} s"
             raise LinkError(message("port_cannot_be_opened", port=self._path, reason=reason)) from None
         finally:
-            # Cancelled between the thread's word and our turn: it is nobody's otherwise.
+            # Cancelled after the thread's result and before our turn: nobody else would close the descriptor.
             if descriptor is None and opened.done() and not opened.cancelled() and opened.exception() is None:
                 close_serial(opened.result())
         return descriptor
@@ -169,7 +169,7 @@ class SerialOpener:
             found = open_serial(self._path, self._baud, self._parity)
         except LinkError as error:
             found = error
-        except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
+        except Exception as error:  # noqa: BLE001 - otherwise the thread dies silently and its caller waits for ever
             found = LinkError(message("port_cannot_be_opened", port=self._path, reason=repr(error)))
 
         def hand_over() -> None:

@@ -32,11 +32,11 @@ class Holder:
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """One serial port as found; what is unknown is None, or an empty tuple."""
+    """One serial port of the system; an unknown value is None or an empty tuple."""
 
     device: str
     stable_name: str | None
-    """The name for a configuration: by-id with a serial number, else by-path; None for a USB port without udev."""
+    """Name to use in a configuration: by-id with a serial number, else by-path; None for a USB port without udev."""
     by_id: tuple[str, ...]
     by_path: tuple[str, ...]
     aliases: tuple[str, ...]
@@ -67,7 +67,7 @@ def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
 
 
 def in_use(port: str, holders: Sequence[Holder]) -> str:
-    """Return the message that other programs have the port open; their names are unknown to some users."""
+    """Return the message that other programs have the port open; without rights their names are unknown."""
     programs = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
     return message("port_in_use", port=port, programs=f" ({programs})" if programs else "")
 
@@ -79,7 +79,7 @@ def _describe(
     usb = _node_with(root, hardware, "idVendor")
     serial_number = read_attribute(usb / "serial") if usb else None
     by_id, by_path = (tuple(link for link in links if link.startswith(folder)) for folder in (_BY_ID, _BY_PATH))
-    # Chips without a serial number (CH340, PL2303) of one kind all claim the same by-id name; the last one gets it.
+    # All chips of a model without serial numbers (CH340, PL2303) claim the same by-id name; the last one gets it.
     names = by_id + by_path if serial_number else by_path + by_id
     driver = _driver(hardware)
     description = f"on-board port ({driver})" if driver else "on-board port"
@@ -104,12 +104,12 @@ def _describe(
 
 
 def _has_hardware(entry: Path) -> bool:
-    """Virtual consoles and ptys have no device; the 8250 driver registers ports that are not there as type 0."""
+    """Check for hardware: virtual consoles and ptys have no device; the 8250 driver lists absent ports as type 0."""
     return (entry / "device").exists() and _number(entry / "type", 10) != 0
 
 
 def _driver(hardware: Path) -> str | None:
-    """The driver that serves the hardware; newer kernels put two nodes of the serial core's own in between."""
+    """Return the hardware's driver; newer kernels insert two nodes of the serial core in the path."""
     for node in (hardware, *hardware.parents[:2]):
         link = node / "driver"
         if link.is_symlink() and link.resolve().name not in ("port", "ctrl"):
@@ -137,7 +137,7 @@ def _links_by_device(root: Path) -> dict[str, list[str]]:
 
 
 def resolve(root: Path, name: str) -> str:
-    """Return the device that a name leads to, without `root`: links are followed below it."""
+    """Follow the links of a name below `root`; return the device's path without `root`."""
     for _ in range(8):
         path = root / name.lstrip("/")
         try:
@@ -173,7 +173,7 @@ def _consoles(root: Path) -> set[str]:
 
 
 def entries(folder: Path) -> Iterator[Path]:
-    """Yield the entries of a folder by name; none where it cannot be read."""
+    """Yield the entries of a folder, sorted by name; none if it cannot be read."""
     try:
         yield from sorted(folder.iterdir())
     except OSError:
@@ -181,7 +181,7 @@ def entries(folder: Path) -> Iterator[Path]:
 
 
 def read_attribute(path: Path, limit: int = _TEXT_LIMIT) -> str | None:
-    """Read a one-line attribute, cut and cleaned: a device may say anything of itself."""
+    """Read a one-line attribute, shortened and without control characters: a device may report any text."""
     try:
         raw = path.read_bytes()[:limit]
     except OSError:
@@ -204,7 +204,7 @@ _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 @dataclass(frozen=True, slots=True)
 class PortFault:
-    """One fault of a port in words, and the command that mends it; `good`: a warning."""
+    """One fault of a port as text, and the command that repairs it; `good`: it is only a warning."""
 
     words: str
     remedy: str
@@ -247,7 +247,7 @@ def port_faults(
 
 
 def same_ports(configured: dict[str, str], root: Path = ROOT) -> list[tuple[str, str, str]]:
-    """List pairs of names whose ports are one device under two names, and that device."""
+    """List pairs of configured ports that are one device under two names, each with that device."""
     seen: dict[str, str] = {}
     found = []
     for name, port in configured.items():
@@ -263,7 +263,7 @@ def _console(device: str, port: SerialPort | None, holders: Sequence[Holder], ro
     disable = f"sudo systemctl disable --now serial-getty@{name}.service"
     boot = f"remove console={name},... from the kernel's command line (cmdline.txt), then a reboot"
     is_console = port is not None and port.is_console
-    # Another user's process shows by its command line only.
+    # Another user's process can be recognised by its command line only.
     gettys = [holder for holder in holders if _GETTY.fullmatch(holder.name)] or list(_gettys_on(name, root))
     if gettys:
         console = f"a login console ({gettys[0].name}, process {gettys[0].pid})"

@@ -1,1 +1,1 @@
-"""TCP, retries, budgets, the service manager: the common parts of all links."""
+"""Common parts of all links: TCP, retries, budgets, the service manager."""

@@ -1,4 +1,4 @@
-"""Connections that come back by themselves, TCP, requests to the daemon's control socket, and limits on what comes in.
+"""Automatic reconnection, TCP, requests to the daemon's control socket, and limits on incoming bytes.
 
 The server of the control socket is `daemon/interfaces/control.py`; its clients are the command line and the daemon's
 own child processes.
@@ -31,10 +31,10 @@ OnState = Callable[[bool, str], object]
 
 
 class Reconnection:
-    """One connection that is opened again after every loss; a loss is warned of once, until it is back.
+    """Retry loop of one connection. It is reopened after every loss and logs one warning per outage.
 
-    The pauses double from `first_s` to `cap_s`; a connection that lasted `worth_s`, or `reset`, begins again at the
-    first. No jitter: there is no herd.
+    The backoff doubles from `first_s` to `cap_s`. It restarts at `first_s` after a connection that lasted `worth_s` or
+    after `reset`. There is no jitter: each end has few clients.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Reconnection:
         self._notified: tuple[bool, str] | None = None
 
     async def keep(self, once: Callable[[], Awaitable[str]]) -> NoReturn:
-        """Run `once` again and again; it calls `up`, and returns why it ended or raises LinkError."""
+        """Run `once` repeatedly. `once` calls `up`, then returns the reason of its end or raises LinkError."""
         loop = asyncio.get_running_loop()
         while True:
             self._up_s = math.inf
@@ -94,12 +94,12 @@ CONNECT_DEADLINE_S: Final = 2.0
 
 
 def words_of(error: OSError) -> str:
-    # Not asyncio's text, which is "Connect call failed" and an address.
+    # asyncio's own text is only "Connect call failed" and an address.
     return os.strerror(error.errno) if error.errno else str(error)
 
 
 async def connect_tcp(url: str, address: tuple[str, int]) -> int:
-    """Connect to the first address of a host that answers and return the descriptor; raise LinkError with the cause."""
+    """Connect to the first address of a host that answers; return the descriptor or raise LinkError with the cause."""
     host, port = address
     loop = asyncio.get_running_loop()
     reason = "the host has no address"
@@ -123,8 +123,8 @@ async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, add
     try:
         endpoint.settimeout(0)
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # A peer that vanished without a word (power cut, Wi-Fi gone) is noticed within 5 + 3 * 2 s; and within 10 s
-        # while something that we sent is not acknowledged, when no keepalive is sent.
+        # Detect a peer that vanished (power cut, Wi-Fi gone) within 5 + 3 * 2 s. While sent data is unacknowledged no
+        # keepalive is sent; then the user timeout of 10 s applies.
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
@@ -138,12 +138,12 @@ async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, add
 
 
 BYTES_PER_S: Final = 262144.0
-"""More than any sensor sends: an IMU at 1 kHz with frames of 200 bytes, with some to spare; a line at 2.6 Mbaud."""
+"""Limit above the rate of any sensor: an IMU at 1 kHz with frames of 200 bytes, plus a margin; 2.6 Mbaud."""
 BURST_BYTES: Final = 65536.0
 
 
 class Budget:
-    """A bucket of bytes that fills steadily, and that every read empties by its size."""
+    """Token bucket of bytes: fills at a constant rate; every read withdraws its size."""
 
     def __init__(self, bytes_per_s: float = BYTES_PER_S, burst_bytes: float = BURST_BYTES) -> None:
         self._bytes_per_s, self._burst_bytes = bytes_per_s, burst_bytes
@@ -168,7 +168,7 @@ READ_TIMEOUT_S: Final = 10.0
 
 
 async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
-    """Send one request and yield the replies; raise DaemonUnreachableError where no daemon answers to the end."""
+    """Send one request and yield the replies; raise DaemonUnreachableError unless a daemon answers completely."""
     try:
         reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
     except OSError as error:
@@ -197,7 +197,7 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
 
 
 async def write_line(writer: asyncio.StreamWriter, reply: Object) -> None:
-    """Send one JSON object; raise ConnectionError where the peer is gone or does not read."""
+    """Send one JSON object; raise ConnectionError if the peer is gone or does not read."""
     writer.write(msgspec.json.encode(reply) + b"\n")
     try:
         async with asyncio.timeout(READ_TIMEOUT_S):

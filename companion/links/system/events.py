@@ -44,7 +44,7 @@ class Listeners(Generic[P]):
 
 
 async def comes(event: asyncio.Event, within_s: float) -> bool:
-    """Wait until an event is set; False: it was not in time."""
+    """Wait until an event is set; return False on timeout."""
     if event.is_set():
         return True
     # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4: clean-ups wait here too.

@@ -1,4 +1,4 @@
-"""A process of the companion and the system: its log, the service manager, and the frame of a child process.
+"""Common parts of the companion's processes: logs, the service manager, and the main function of a child process.
 
 A child of the daemon (`daemon/interfaces/child.py`) reads its settings from stdin, one line of JSON, and ends when
 stdin ends. It writes its status to stdout, one JSON object a line, at least every `REPORT_EVERY_S`, and its log to the
@@ -32,7 +32,7 @@ from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
-# The journal reads the level from "<N>" at the beginning of a line, so that `journalctl -p warning` finds it.
+# The journal reads the level from "<N>" at the beginning of a line; `journalctl -p warning` needs it.
 _PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 
 LINES_PER_S: Final = 0.1
@@ -40,7 +40,7 @@ BURST: Final = 10.0
 
 
 class LimitedHandler(logging.StreamHandler[TextIO]):
-    """Writes what the budgets allow; the clock is in seconds and never goes back."""
+    """Log handler with a rate limit per call site and level; `clock`: monotonic seconds."""
 
     def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(stream)
@@ -64,7 +64,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
 
 
 class OneLineFormatter(logging.Formatter):
-    """A message is one line, whatever has come over a wire into it; only a traceback has more."""
+    """Formatter of one line per message, whatever received bytes it quotes; only a traceback has more lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         said = copy.copy(record)
@@ -73,7 +73,7 @@ class OneLineFormatter(logging.Formatter):
 
 
 class JournalFormatter(OneLineFormatter):
-    """Lines as journald wants them; it stamps the time itself."""
+    """Formatter for journald, which adds the time itself."""
 
     def format(self, record: logging.LogRecord) -> str:
         prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
@@ -90,7 +90,7 @@ def set_up_logs(level: str) -> None:
 
 
 def goes_to_journal(stream: TextIO) -> bool:
-    """Return whether JOURNAL_STREAM names this stream; the variable alone is inherited by any redirection."""
+    """Return whether JOURNAL_STREAM names this stream; a redirected process inherits the variable too."""
     named = os.environ.get("JOURNAL_STREAM")
     if named is None:
         return False
@@ -102,7 +102,7 @@ def goes_to_journal(stream: TextIO) -> bool:
 
 
 class ServiceManager:
-    """Notify the service manager at a path or "@" name, if any; `watchdog_s`: longest time between two WATCHDOG=1."""
+    """Client of the service manager at a path or "@" name, if any; `watchdog_s`: longest time between WATCHDOG=1."""
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
         self._address = address or ""
@@ -112,7 +112,7 @@ class ServiceManager:
         self._warned = False
         if address is not None:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-            # A manager that does not read must not stop us.
+            # A service manager that does not read must not block the daemon.
             self._socket.settimeout(0.0)
 
     @classmethod
@@ -152,7 +152,7 @@ class ServiceManager:
     def notify(self, line: str) -> bool:
         if self._socket is None:
             return False
-        # A name that begins with "@" is in no folder, and begins with a zero to the kernel.
+        # A name with "@" is an abstract socket; for the kernel it begins with a zero byte.
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
             self._socket.sendto(line.encode(), address)
@@ -165,16 +165,16 @@ class ServiceManager:
 
 
 REPORT_EVERY_S: Final = 1.0
-NICENESS: Final = 19  # the daemon answers an arming request within 20 ms whatever its children are busy with
+NICENESS: Final = 19  # the daemon must answer an arming request within 20 ms, however busy its children are
 OUT_OF_MEMORY: Final = 12  # exit code of a child that needed more than its limit: ENOMEM
 STACK_BYTES: Final = 1024 * 1024
-"""Stack of a thread: it counts as data, and the usual 8 MiB would use up the limit."""
+"""Stack of a thread. It counts as data; the default of 8 MiB would use up the memory limit."""
 OOM_SCORE: Final = "900"
-"""Score by which the kernel, out of memory, ends a child before anything else on the board."""
+"""Score at which the kernel, out of memory, kills a child before any other process."""
 
 
 class ChildSettings(msgspec.Struct, frozen=True):
-    """Settings that the daemon hands to a child: the configuration in force, and the level of the log."""
+    """Settings that the daemon sends to a child process: the active configuration and the log level."""
 
     config: Config
     log_level: str = "INFO"
@@ -188,7 +188,7 @@ class ChildWork(Protocol):
         """Work until cancelled."""
 
     def status(self) -> Object:
-        """Return `good`, `summary` and whatever else `companion status --json` shows."""
+        """Return `good`, `summary` and the other values that `companion status --json` shows."""
 
 
 def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) -> None:
@@ -196,7 +196,7 @@ def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) ->
     limit = memory_mib * 1024 * 1024
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     threading.stack_size(STACK_BYTES)
-    # The service's unit, or a container, may forbid either.
+    # The service's unit or a container may forbid the niceness or the score.
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
     with contextlib.suppress(OSError):
@@ -210,7 +210,7 @@ def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) ->
         try:
             asyncio.run(_run(make(settings)))
         except* MemoryError:
-            # Nothing that allocates may follow.
+            # Out of memory: no allocation is possible from here on.
             os._exit(OUT_OF_MEMORY)
     except Exception:
         logger.exception("the process failed")
@@ -238,7 +238,7 @@ async def _run(work: ChildWork) -> None:
 
 
 def _on_error(loop: asyncio.AbstractEventLoop, context: Object) -> None:
-    """Log an error that reached the event loop; end where memory ran out, in whichever callback."""
+    """Log an error that reached the event loop; end the process if any callback ran out of memory."""
     if isinstance(context.get("exception"), MemoryError):
         os._exit(OUT_OF_MEMORY)
     loop.default_exception_handler(context)

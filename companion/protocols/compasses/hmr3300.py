@@ -3,10 +3,10 @@ r"""Honeywell HMR3300 (three axes) and HMR3200 (two): lines of numbers, no check
     123.4, 18.6, -0.5\r\n      heading, pitch, roll in degrees (HMR3300, mode *H)
     235.6\r\n                  heading only (HMR3200, mode *H)
     1256, -234, -1894\r\n      magnetometer counts (mode *M): no decimal point in any field
-    #I\r\n                     the answer to a command that it does not know
+    #I\r\n                     the answer to an unknown command
 
 Source: Honeywell's HMR3200/HMR3300 data sheet: 19200 baud 8N1, 8 lines/s. Since nothing marks a line's start, a line
-is believed only if it follows a whole line end: the rest "3.4, 18.6, -0.5" of a line is as good a line as any.
+is accepted only after a whole line end: the remainder "3.4, 18.6, -0.5" of a line looks like a valid line.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _COUNTS = re.compile(rb"[+-]?\d{1,6}")
 _FRAGMENT = re.compile(rb"[-+0-9., ]+")
 _COUNTS_LIMIT = 32768
 _SURE = 3
-"""After so many three-number lines running, one lone number is the debris of two lines, until it has company."""
+"""After this many lines of three numbers in a row, a single number is rejected as a fragment until more follow."""
 
 
 class Hmr3300Decoder(LineDecoder):
@@ -43,14 +43,14 @@ class Hmr3300Decoder(LineDecoder):
         if cut:
             raise RejectedError("too long")
         if not line.strip(b"\r"):
-            # A bare line feed in mid-stream may have been a line's first digit; after a gap it is the end of the CR LF.
+            # A bare line feed in mid-stream may be a damaged first digit; after a gap it is the end of a CR LF.
             self._follows_line_end = bool(line) or not follows_line_end
             return None
         if DAMAGED.search(line):
             raise RejectedError("parity")
         text = line.removesuffix(b"\r")
         if text == line or b"\r" in text:
-            # A digit damaged into a line end leaves a rest that looks whole.
+            # If damage changes a digit into a line end, the remainder looks like a whole line.
             self._follows_line_end = _FRAGMENT.fullmatch(line) is None
             raise RejectedError("line end")
         if not follows_line_end:

@@ -1,8 +1,8 @@
-r"""Compasses that speak NMEA 0183, and the Honeywell HMR3000's own sentences. A checksum is demanded.
+r"""NMEA 0183 sentences of compasses, and the Honeywell HMR3000's own sentences. A checksum is required.
 
     $HCHDG,271.1,10.7,E,12.2,W*52          the sensor's own reading, deviation, variation: magnetic is 271.1 + 10.7
     $HCHDM,093.8,M*2B                      magnetic heading
-    $HEHDT,86.2,T*13    $HETHS,86.2,A*39   true heading; THS with a status, of which V, S and M are no measurement
+    $HEHDT,86.2,T*13    $HETHS,86.2,A*39   true heading; THS has a status: V, S and M mean no measurement
     $HCXDR,A,1.6,D,PITCH,A,-0.3,D,ROLL*65  transducers: PTCH or PITCH, ROLL, and the HMR3000's MAGX, MAGY, MAGZ in mG
     $PTNTHPR,91.7,N,-0.0,N,1.6,N*21        heading, pitch, roll, each with a status (HMR3000)
     $PTNTCCD,522,-472,109,1841,677,1964,86.3*44    tangents of the tilt times 32768, field, heading (HMR3000)
@@ -10,11 +10,11 @@ r"""Compasses that speak NMEA 0183, and the Honeywell HMR3000's own sentences. A
 Sources: NMEA 0183 as the Furuno FR-1500 manual gives it (8.6, from IMO A.382), for THS the JRC JLR-30 manual (appendix
 2-2), Honeywell's HMR3000 manual (900240 rev. B, p. 11 to 13, later edition p. 16). Talkers are any two characters.
 
-One compass may send several of them for one reading, and to different norths. Only one sentence gives headings at a
-time, the first of this list that comes: HPR, HDG, HDM, CCD, THS, HDT; the others count as duplicates. One further down
-takes over when the first has not been heard for `HOLD_S`, but never one to another north: that would be a jump by the
-declination in the middle of a stream. Tilt likewise: HPR, CCD, XDR. So a `CompassSample` says which north it means, but
-for HPR: that one is corrected for whatever has been entered in the device.
+One compass may send several sentences for one reading, and with different norths. Only one sentence is used for
+headings at a time, in this order of precedence: HPR, HDG, HDM, CCD, THS, HDT. The others count as duplicates. A later
+one takes over after `HOLD_S` without the one in use, but only with the same north: otherwise the heading would jump by
+the declination. The order for tilt is HPR, CCD, XDR. A `CompassSample` names its north, except from HPR, whose heading
+is corrected for any values entered in the device.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _PLAIN: Final[dict[bytes, tuple[int, int, tuple[bytes, ...] | None, North]]] = {
     # Autonomous, estimated; M was typed in, S is simulated, V not valid.
     b"THS": (_THS, 3, (b"A", b"E"), "true"),
 }
-"""Sentences with nothing but a heading: precedence, number of fields, what the third may be (None: a deviation)."""
+"""Sentences with only a heading: precedence, number of fields, allowed values of the third (None: a deviation)."""
 
 _ALARMS: Final = frozenset((b"L", b"P"))
 _STATUSES: Final = frozenset((b"L", b"M", b"N", b"O", b"P", b"C"))
@@ -55,9 +55,9 @@ _FIELDS: Final = (b"MAGX", b"MAGY", b"MAGZ")
 
 
 class NmeaDecoder(SentenceDecoder):
-    """Sentences of compasses; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
+    """Decoder of NMEA sentences into `CompassSample`, `TiltSample` if there is no heading, and `MagSample`."""
 
-    _heading_from = _tilt_from = _NOBODY  # The sentences that give headings and tilts, and when they were last heard
+    _heading_from = _tilt_from = _NOBODY  # Sentences in use for headings and tilts, and the time of their last one
     _heading_s = _tilt_s = 0.0
 
     def interrupted(self) -> None:
@@ -102,7 +102,7 @@ class NmeaDecoder(SentenceDecoder):
         if len(fields) != 7:
             raise RejectedError("field count")
         _, heading, magnetic, pitch, pitch_status, roll, roll_status = fields
-        # Even an alarm keeps the precedence: then the device says that it has no heading, whatever else it sends.
+        # A sentence with an alarm keeps its precedence: the device then has no heading, whatever else it sends.
         self._heading_from, self._heading_s = _HPR, t_s
         self._tilt_from, self._tilt_s = _TILT_HPR, t_s
         no_heading = False
@@ -131,7 +131,7 @@ class NmeaDecoder(SentenceDecoder):
         if b"." not in fields[7]:
             heading_deg *= _DEGREES_PER_MIL
         if self._tilt_from > _TILT_CCD and t_s - self._tilt_s <= HOLD_S:
-            raise RejectedError("duplicate")  # of HPR, whose heading comes first too
+            raise RejectedError("duplicate")  # of HPR, which has precedence for headings too
         self._tilt_from, self._tilt_s = _TILT_CCD, t_s
         try:
             self._claim_heading(_CCD, t_s)
@@ -194,6 +194,6 @@ def _tilt(field: bytes) -> float:
     return value
 
 
-# For an HMR3000, which comes with all its sentences switched off; an unknown sentence to others. It measures 13.75
-# times a second (HMR3000 manual, p. 8). To stream it would have to keep the rates of its sentences in EEPROM (3.8).
+# For an HMR3000, which is delivered with all sentences switched off; for others the sentence is unknown. It measures
+# 13.75 times a second (HMR3000 manual, p. 8). Streaming would need the rates of its sentences in EEPROM (3.8).
 Hmr3000Dialogue = functools.partial(PollDialogue, b"$PTNT,HPR*78\r\n", "$PTNT,HPR*78", period_s=0.1)

@@ -1,12 +1,12 @@
-r"""OceanServer OS5000 family of compasses (OS4000 to OS5500): tagged fields after `$C`, with a checksum.
+r"""OceanServer OS5000 family of compasses (OS4000 to OS5500): tagged fields after `$C`, and a checksum.
 
     $C320.5P0.2R-18.3T19.0*3C\r\n                            heading, pitch, roll, temperature
     $C212.4P2.5R-14.0T28.4Mx107977.90My-79422.00Mz173.27Ax0.045Ay-0.245Az0.977*3A\r\n
 
-Which fields there are is set in the device. Source: OS5000 user's guide, format type 0x01 (rev. 3.6, p. 12): heading is
-"corrected for declination if one is entered", so which north it means is the configuration's. Magnetic fields are in
+The device's settings select the fields. Source: OS5000 user's guide, format type 0x01 (rev. 3.6, p. 12): the heading is
+"corrected for declination if one is entered", so the configuration must name its north. Magnetic fields are in
 milligauss only after a calibration with the local horizontal field entered; the manual's own example shows 108 gauss.
-So a field that no place on Earth has is left out.
+A field stronger than any on Earth is therefore left out.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _VECTOR: Final = re.compile(rb"Mx%bMy%bMz%b" % ((_NUMBER,) * 3))
 
 
 class Os5000Decoder(SentenceDecoder):
-    """`$C` sentences; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
+    """Decoder of `$C` sentences into `CompassSample`, `TiltSample` if there is no heading, and `MagSample`."""
 
-    LIMIT = 250  # bytes from the "$" on; with every field that can be switched on there are some 150
+    LIMIT = 250  # bytes from the "$" on; a sentence with all possible fields has some 150
 
     def _read(self, body: bytes, t_s: float) -> list[Sample]:
         match = _TAGS.fullmatch(body)

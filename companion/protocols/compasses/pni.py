@@ -3,13 +3,13 @@
     00 10 | 05 | 02 | 05 43 B3 F3 33 | 18 41 28 00 00 | 5C 2D      kGetDataResp: heading 359.9, pitch 10.5
 
 A frame is its whole length (16 bits, big-endian), a frame id, a payload, and a CRC-16/XMODEM, big-endian, over all
-before it. Nothing marks its beginning: each offset is tried that has a length and an id that can be. A data frame names
+before it. Nothing marks its beginning: each offset with a possible length and id is tried. A data frame lists
 its own components. Sources: PNI TCM3/TCM5 manual r12 p. 33-43, TCM manual r06 p. 36-47, TRAX manual r06 p. 10 and
 36-50; PNI's own pni-sdk-rs for component 88. Pitch is positive nose up, roll right side down (TRAX p. 10).
 
-Floats are big-endian as the device comes (kBigEndian, TRAX p. 42), but that can be set otherwise and saved, and a
-little-endian heading may read as a small number that looks like one. So both orders are tried on all floats of a frame:
-what is a measurement in only one of them says which it is, twice running before the other is believed.
+Floats are big-endian by default (kBigEndian, TRAX p. 42), but the device can save the other order. A little-endian
+heading, read as big-endian, may be a small number that looks valid. So both orders are tried on all floats of a frame:
+a frame that is valid in one order only decides, and two such frames in a row are needed to change the order.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ SHORTEST: Final = 5
 LONGEST: Final = 200
 
 DISTORTION: Final = "magnetic distortion"
-"""The device says that its magnetometer is beyond its range (80 to 150 uT by model): its heading is worth nothing."""
+"""Rejection: the device reports its magnetometer out of range (80 to 150 uT by model), so its heading is invalid."""
 HEADING_UNSURE: Final = "heading unsure"
-"""The device says that its heading is wrong by more than 10 degrees (TRAX p. 49, kHeadingStatus 3)."""
+"""Rejection: the device reports a heading error of more than 10 degrees (TRAX p. 49, kHeadingStatus 3)."""
 NOT_CALIBRATED: Final = "not calibrated by the user"
 BYTE_ORDER: Final = "byte order"
 
@@ -47,8 +47,8 @@ _QUATERNION, _HEADING_STATUS, _MAG_ACCURACY = 77, 79, 88
 _BYTES: Final = frozenset((_DISTORTION, _CALIBRATED, _HEADING_STATUS))
 
 _LIMITS: Final[dict[int, tuple[float, float, float]]] = {
-    # Least and greatest value, and the least magnitude but zero that a device would print: what is smaller is a float
-    # of the other byte order.
+    # Least and greatest value, and the least magnitude besides zero that a device sends. A smaller number is a float in
+    # the other byte order.
     _HEADING: (0.0, 360.0, 1e-6),
     _PITCH: (-90.0, 90.0, 1e-6),
     _ROLL: (-180.0, 180.0, 1e-6),
@@ -64,7 +64,7 @@ _UT_PER_GAUSS: Final = 100.0
 
 
 class PniDecoder(Decoder):
-    """Frames of a PNI compass; gives `CompassSample`, `MagSample`, and `TiltSample` where there is no heading."""
+    """Decoder of PNI frames into `CompassSample`, `MagSample`, and `TiltSample` if there is no heading."""
 
     _little = False
     _contrary = 0
@@ -98,7 +98,7 @@ class PniDecoder(Decoder):
         samples: list[Sample] = []
         heading_deg, pitch_deg, roll_deg = (values.get(part) for part in (_HEADING, _PITCH, _ROLL))
         if roll_deg is not None and abs(roll_deg) > 90.0:
-            raise RejectedError("out of range")  # upside down, where its heading is not specified
+            raise RejectedError("out of range")  # upside down: the heading is not specified there
         if heading_deg is not None:
             samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
         elif pitch_deg is not None and roll_deg is not None:
@@ -138,7 +138,7 @@ def _possible(names: list[int], values: tuple[float, ...]) -> bool:
 
 
 def _components(frame: bytes, size: int) -> list[tuple[int, int]]:
-    """List the components of a frame of `size` bytes, as far as it has come, and where their values begin."""
+    """List the components in the received part of a frame of `size` bytes, with the offsets of their values."""
     here, last = 4, size - 2
     parts: list[tuple[int, int]] = []
     for _ in range(frame[3] if len(frame) > 3 else 0):
@@ -161,8 +161,8 @@ def frame(frame_id: int, payload: bytes = b"") -> bytes:
     return body + struct.pack(">H", binascii.crc_hqx(body, 0))
 
 
-# The components chosen are forgotten with the power: kSave is "the ONLY command that causes the device to save
-# information" (TRAX p. 46), and it is never sent. Question and answer have 57 bytes, 15 ms at 38400 baud.
+# The device loses the selection of components with its power: kSave is "the ONLY command that causes the device to
+# save information" (TRAX p. 46), and it is never sent. Question and answer have 57 bytes, 15 ms at 38400 baud.
 PniDialogue = functools.partial(
     PollDialogue,
     frame(_GET_DATA),

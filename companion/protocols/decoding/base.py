@@ -1,7 +1,7 @@
-"""Framing of lines, sentences and binary frames, counting, and checks, for all decoders.
+"""Base classes of decoders: framing of lines, sentences and binary frames, counters, and checks.
 
-A decoder never raises for the bytes it is fed. Their splits change neither samples nor counts, and what waits for its
-end is bounded. A false frame costs only its first byte: in it a good frame may begin.
+A decoder never raises, whatever its input. Samples and counts do not depend on how the stream is split into reads. The
+buffer of an unfinished frame is bounded. Only the first byte of a false frame is skipped: a good one may begin in it.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
 AHEAD_S = 0.5
-"""Largest lead of a stream over its line; beyond, the baud rate means nothing (USB without a UART)."""
+"""Largest lead of a stream over its line time; a faster stream has no real baud rate (USB without a UART)."""
 _STALL_S = 10.0
 
 NO_FRAME: Final = 0
 WAIT: Final = -1
-ECHO: Final = "echo of a command"  # a command of ours, or of another master, on a line that both sides hear
+ECHO: Final = "echo of a command"  # own command, or one of another master, on a line shared by both directions
 
 
 class RejectedError(Exception):
-    """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Never leaves the decoders."""
+    """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Decoders always catch it."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -36,11 +36,11 @@ class RejectedError(Exception):
 
 
 class Decoder(ABC):
-    """Finds frames in the bytes of one device; a subclass checks and reads each.
+    """Finds frames in the bytes of one device; a subclass checks and decodes each frame.
 
-    `seconds_per_byte` is the line time of one byte, 0 where unknown (sockets, USB). `ImuSample.t_device_s` starts again
-    at 0 after `device_clock_wraps_s`, `ImuSample.sequence` after `sequence_modulus`; None where there is none, or it
-    never wraps.
+    `seconds_per_byte` is the line time of one byte, 0 if unknown (sockets, USB). `ImuSample.t_device_s` wraps to 0
+    after `device_clock_wraps_s`, `ImuSample.sequence` after `sequence_modulus`; None: the protocol has no such value,
+    or it never wraps.
     """
 
     START: ClassVar[re.Pattern[bytes]]  # The bytes that may begin a frame
@@ -52,7 +52,7 @@ class Decoder(ABC):
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
         self.frame_bytes = self._earlier_bytes = 0
-        """Length of the latest frame, and of earlier ones that belong to its reading."""
+        """Length of the latest frame, and of earlier frames of the same reading."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0
@@ -61,7 +61,7 @@ class Decoder(ABC):
         self._buffer = b""  # bytes of a possible frame; never longer than the longest frame
         self._received = self._origin = 0  # stream positions of the last byte and of the buffer
         self._chunks: deque[tuple[int, float]] = deque()
-        """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""
+        """End of each chunk (as a stream position) that still has bytes in the buffer, and the time of its read."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
         samples = self.feed(data, t_s)
@@ -109,7 +109,7 @@ class Decoder(ABC):
         self._chunks.clear()
 
     def _take(self, buffer: bytes, at: int, samples: list[Sample]) -> int:
-        """Append the samples of the frame at `at`, if it is one; return the bytes to pass over, or `WAIT`."""
+        """Append the samples of the frame at `at`, if there is one; return the bytes to skip, or `WAIT`."""
         try:
             size = self._size(buffer, at)
             if size <= 0:  # NO_FRAME or WAIT
@@ -139,15 +139,15 @@ class Decoder(ABC):
     def _size(self, buffer: bytes, at: int) -> int:
         """Return the length of the frame at `at`, `NO_FRAME`, or `WAIT`.
 
-        Raise IndexError to wait too, RejectedError to count it and to pass over its first byte only.
+        IndexError means `WAIT` too; RejectedError counts the frame and skips only its first byte.
         """
 
     def _check(self, frame: bytes) -> None:  # noqa: B027 - lines and sentences are checked as they are read
-        """Check a whole frame; raise RejectedError to count it and to pass over its first byte only."""
+        """Check a whole frame; raise RejectedError to count it and skip only its first byte."""
 
     @abstractmethod
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
-        """Read a whole frame; raise RejectedError to count it as giving no sample."""
+        """Decode a whole frame; raise RejectedError to count it as a frame without a sample."""
 
     def _time_of(self, end: int) -> float:
         chunks = self._chunks
@@ -179,11 +179,11 @@ GYRO_LIMIT_RAD_S = 100.0  # 5730 deg/s; the widest ranges sold are 4000 deg/s
 ACCEL_LIMIT_M_S2 = 2000.0  # 204 g; the widest range of a part with a gyro in it is 200 g
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Limit for an IMU, in kelvin or tenths too: `estimation/collector/intake.py:Thermometer` names what cannot be degC."""
+"""Limit for an IMU, also in kelvin or tenths: `estimation/collector/intake.py:Thermometer` reports impossible degC."""
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:
-    """Raise RejectedError where a value of an IMU is not finite, or beyond what any IMU can measure."""
+    """Raise RejectedError if a value of an IMU is not finite or beyond the range of any IMU."""
     temperature = temperature_degc or 0.0
     if not math.isfinite(sum(gyro_rad_s) + sum(accel_m_s2) + temperature):
         raise RejectedError("non-finite")
@@ -193,7 +193,7 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
 
 
 DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
-"""Bytes that text never holds: read with the wrong parity, or at the wrong speed."""
+"""Bytes that text never contains: the parity or the baud rate is wrong."""
 
 
 def out_of_range(value: float) -> RejectedError:
@@ -201,7 +201,7 @@ def out_of_range(value: float) -> RejectedError:
 
 
 def full_circle(heading_deg: float) -> float:
-    """Return the heading, with 360.0 (359.96 rounded) as 0; raise RejectedError beyond a circle."""
+    """Return the heading, with 360.0 (359.96 rounded) as 0; raise RejectedError outside 0 to 360 deg."""
     if heading_deg == 360.0:
         return 0.0
     if not 0.0 <= heading_deg < 360.0:
@@ -210,13 +210,13 @@ def full_circle(heading_deg: float) -> float:
 
 
 def check_vector(vector: Vector) -> None:
-    """Raise RejectedError where a component is not finite."""
+    """Raise RejectedError if a component is not finite."""
     if not math.isfinite(sum(vector)):
         raise RejectedError("non-finite")
 
 
 class LineDecoder(Decoder):
-    r"""Lines that end in "\n"; a longer line is given as its last `LIMIT` bytes, marked as cut."""
+    r"""Decoder of lines that end in "\n". From a longer line it passes on the last `LIMIT` bytes, marked as cut."""
 
     START = re.compile(rb".", re.DOTALL)
     LIMIT: ClassVar[int] = 80
@@ -245,15 +245,15 @@ class LineDecoder(Decoder):
 
     @abstractmethod
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
-        r"""Read one line, without its "\n"; None: right, but no sample (yet). Raise RejectedError to count it."""
+        r"""Decode one line, without its "\n"; None: valid, but no sample (yet). Raise RejectedError to count it."""
 
 
 class SentenceDecoder(Decoder):
-    r"""Sentences `$...` that end in "\r" or "\n"; one that the next "$" ends is cut short."""
+    r"""Decoder of sentences `$...` that end in "\r" or "\n"; an earlier "$" means that the sentence is cut short."""
 
     START = re.compile(rb"\$")
     END: ClassVar[re.Pattern[bytes]] = re.compile(rb"[\r\n$]")
-    LIMIT: ClassVar[int] = 160  # the most bytes of a sentence, from the "$" to before the line end
+    LIMIT: ClassVar[int] = 160  # most bytes of a sentence between the "$" and the line end
 
     def _size(self, buffer: bytes, at: int) -> int:
         limit = at + 1 + self.LIMIT
@@ -274,4 +274,4 @@ class SentenceDecoder(Decoder):
 
     @abstractmethod
     def _read(self, body: bytes, t_s: float) -> list[Sample]:
-        """Return the samples of a body with a right checksum; RejectedError or ValueError reject it."""
+        """Return the samples of a body whose checksum is right; RejectedError or ValueError reject it."""

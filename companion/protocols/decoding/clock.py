@@ -1,9 +1,9 @@
-"""Times of samples on the host's clock, by a device's own clock and its counter.
+"""Times of samples on the host's clock, from a device's own clock and its counter.
 
-A read comes late by the line, a USB adapter, or a busy host. The offset between the two clocks is the running minimum
+A read is delayed by the line, a USB adapter, or a busy host. The offset between the two clocks is the running minimum
 of (read - device), which may creep upwards as two crystals drift apart: causal, and immune to stalls (sensors 4.4).
-A clock that went back or fell behind belongs to a device that restarted; one that jumped forward to another device,
-or the host slept. Either way it is mapped afresh.
+If the clock went back or fell behind, the device has restarted. If it jumped forward, the device was replaced or the
+host slept. Both start a new mapping.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ import msgspec
 from companion.samples import ImuSample, Sample
 
 CREEP: Final = 100e-6
-"""Rate at which the minimum may rise: two crystals of 50 ppm. A ceramic resonator is followed in steps of `STEP_S`."""
+"""Largest rise of the minimum, s/s: two crystals of 50 ppm. A ceramic resonator needs steps of `STEP_S` as well."""
 
 STEP_S: Final = 0.005
-"""When all samples of a `SPAN_S` came later than this, the offset itself has changed."""
+"""Delay, s: if all samples of a `SPAN_S` exceed it, the offset itself has changed."""
 SPAN_S: Final = 1.0
-SPAN_SAMPLES: Final = 20  # the fewest samples in a span: of a few all may have had to wait for the adapter
+SPAN_SAMPLES: Final = 20  # fewest samples in a span: a USB adapter may delay all of a smaller number
 
 LATE_S: Final = 1.0
-"""A sample that seems later than this is dropped: too old to be of use, or its clock is wrong."""
+"""Largest delay of a sample, s; a later one is dropped: it is too old, or its clock is wrong."""
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
-"""A clock that wraps has advanced as the host's has, but for a stall and for what the two differ by."""
+"""Tolerance to recognise a wrap: largest stall, and share by which the rates of the two clocks may differ."""
 LATE: Final = "late"
 
 
 class DeviceClock:
-    """Maps one device's clock to the host's; it starts again at 0 after `wraps_s`, by its format, or never."""
+    """Map from one device's clock to the host's. The device's clock wraps to 0 after `wraps_s`; None: never."""
 
     def __init__(self, wraps_s: float | None) -> None:
-        self.breaks = 0  # samples before and after a break need not be from one device without a pause
-        self.device_s = 0.0  # The clock as of the last sample, unwrapped
+        self.breaks = 0  # number of breaks: restarts, replacements or pauses of the device
+        self.device_s = 0.0  # Device time of the last sample, unwrapped
         self._wraps_s = wraps_s
         self._raw_s = self._arrival_s = self._offset_s = math.nan
         self._new_span(math.nan)
@@ -56,14 +56,14 @@ class DeviceClock:
         return arrival_s
 
     def remap(self) -> None:
-        """Forget the offset: the times at which samples arrived so far were wrong."""
+        """Discard the offset: the arrival times of earlier samples were wrong."""
         self._offset_s = math.nan
 
     def host_s(self, raw_s: float, arrival_s: float) -> float | None:
-        """Return the host's time of a finite device time, at most `arrival_s`; None for a sample that is too late.
+        """Convert a finite device time to host time, at most `arrival_s`; None for a sample later than `LATE_S`.
 
-        That lasts while samples come `LATE_S` or more after their time: at most `SPAN_S` when the clock has changed,
-        else until a backlog is read.
+        After a change of the device's clock, None is returned for at most `SPAN_S`; after a stall, until the backlog
+        has been read.
         """
         if math.isnan(self._offset_s):
             return self._start(raw_s, arrival_s)
@@ -109,7 +109,7 @@ class DeviceClock:
 
 
 class SampleTimes:
-    """Gives the samples of one device their times, and unwraps its counter."""
+    """Time stamps for the samples of one device, and its unwrapped counter."""
 
     def __init__(self, clock_wraps_s: float | None = None, sequence_modulus: int | None = None) -> None:
         self.clock = DeviceClock(clock_wraps_s)
@@ -120,7 +120,7 @@ class SampleTimes:
         self._newest_s = -math.inf
 
     def place(self, samples: list[Sample], read_s: float, frame_s: float = 0.0) -> list[Sample]:
-        """Place the samples of one feed, timed at their frame's last byte; `frame_s`: line time of a frame."""
+        """Return one feed's samples with host times; `frame_s`, the line time of a frame, is subtracted from each."""
         placed: list[Sample] = []
         frame_at_s, frame_t_s = math.nan, math.nan
         clock = self.clock
@@ -140,7 +140,7 @@ class SampleTimes:
                 t_s = self._in_order(t_s, read_s)
                 gyro, accel, warm = sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc
                 placed.append(ImuSample(t_s, gyro, accel, warm, sequence, device_s, clock.breaks))
-                # Whatever else the same frame brought was taken at the same time.
+                # Other samples of the same frame have the same time.
                 frame_at_s, frame_t_s = at_s, t_s
             else:
                 t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, read_s)
@@ -148,14 +148,14 @@ class SampleTimes:
         return placed
 
     def _in_order(self, t_s: float, read_s: float) -> float:
-        """Keep times ascending: bytes that came faster than their line time would go back."""
+        """Keep times ascending: bytes that arrive faster than their line time would give earlier times."""
         if t_s < self._newest_s <= read_s:
             return self._newest_s
         self._newest_s = t_s
         return t_s
 
     def _counted(self, raw: int, *, anew: bool) -> int:
-        """Unwrap the counter; one that went back counts on by one, so that nothing seems lost."""
+        """Unwrap the counter; after a step back continue with the next number, so that no sample seems lost."""
         last, self._raw_sequence = self._raw_sequence, raw
         if last is None:
             self._sequence = raw

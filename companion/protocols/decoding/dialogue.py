@@ -1,6 +1,6 @@
-"""Polls, and commands to start a stream that has been stopped. Pure: time comes in, bytes go out.
+"""Polls, and commands that start a stopped stream. Pure: the caller passes the time and sends the bytes.
 
-Nothing is sent that a device stores or toggles, nothing while it streams, nothing with `read_only = true`.
+No command is sent that a device stores or toggles, none while it streams, and none with `read_only = true`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ LONGEST_PAUSE_S: Final = 64.0
 
 
 class Dialogue(ABC):
-    """The companion's half of the conversation with one device, on one opened port after another."""
+    """Questions and commands to one device; it continues when the port is opened again."""
 
     words = ""
 
     @abstractmethod
     def opened(self, t_s: float) -> None:
-        """Begin anew: the port was opened (again)."""
+        """Reset the dialogue: the port was opened (again)."""
 
     @abstractmethod
     def heard(self, data: bytes, samples: int, t_s: float) -> None:
@@ -36,15 +36,15 @@ class Dialogue(ABC):
 
 
 class PollDialogue(Dialogue):
-    """Poll one reading after another, each after the answer to the last; silent while the device streams by itself."""
+    """Poll of single readings: the next question follows the last answer; none while the device streams by itself."""
 
     def __init__(self, question: bytes, name: str, *, period_s: float, set_up: bytes = b"") -> None:
         self.period_s = period_s
         self._question, self._name = question, name
         self._first = set_up + question
-        """Sent first, and after a question in vain: the device may have been without power."""
+        """First question, with the set-up; also sent after an unanswered one: the device may have lost its power."""
         self._quiet_until_s = self._next_s = 0.0
-        self._asked_s: float | None = None  # Time of the question that has not been answered yet
+        self._asked_s: float | None = None  # Time of the pending question; None: answered
         self._since_asked = self._unanswered = 0
         self._set_up = False
 
@@ -52,7 +52,7 @@ class PollDialogue(Dialogue):
         self._quiet_until_s, self._asked_s, self._set_up, self._unanswered = t_s + SILENT_S, None, False, 0
 
     def heard(self, data: bytes, samples: int, t_s: float) -> None:
-        if not data.strip(b"\r\n"):  # the rest of a line that is known already
+        if not data.strip(b"\r\n"):  # line end of an answer that was already decoded
             return
         if self._asked_s is None:
             self._quiet_until_s = t_s + SILENT_S
@@ -66,7 +66,7 @@ class PollDialogue(Dialogue):
                 return b""
             self._asked_s, self._set_up = None, False
             self._unanswered += 1
-            if self._since_asked > len(self._first):  # more than an echo: it speaks, if not to us
+            if self._since_asked > len(self._first):  # more than an echo: the device sends, though no answer
                 self._quiet_until_s = t_s + SILENT_S
         if t_s < max(self._quiet_until_s, self._next_s):
             return b""
@@ -79,7 +79,7 @@ class PollDialogue(Dialogue):
 
 
 class WakeDialogue(Dialogue):
-    """Sends one command after another to a silent device, with doubling pauses; leaves one that speaks alone."""
+    """Commands that wake a silent device, sent in turn with doubling pauses; none while the device sends anything."""
 
     SAYINGS: ClassVar[tuple[tuple[bytes, str], ...]]
     _quiet_since_s: float | None = None

@@ -1,4 +1,4 @@
-r"""The project's own line for an IMU behind a microcontroller; defined in docs/imu_line.md.
+r"""Text line of this project for an IMU on a microcontroller; defined in docs/imu_line.md.
 
     $IMU,<seq>,<t_us>,<gx>,<gy>,<gz>,<ax>,<ay>,<az>,<T>*hh\r\n
 
@@ -15,7 +15,7 @@ from companion.samples import ImuSample, Sample
 
 
 class ImuLineDecoder(SentenceDecoder):
-    """Lines of `$IMU`, of which the longest sensible one has some 110 bytes; gives `ImuSample`."""
+    """Decoder of `$IMU` lines into `ImuSample`; the longest sensible line has some 110 bytes."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / 1e6
     sequence_modulus: ClassVar[int | None] = 2**16

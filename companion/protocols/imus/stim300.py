@@ -5,20 +5,20 @@ r"""Sensonor (Safran) STIM300 and STIM318: gyros, accelerometers, inclinometers 
 Source: TS1524 rev. 31. Scales: rate 2^-14 deg/s, inclination 2^-22 g, temperature 2^-8 degC; acceleration 2^-19 g for
 a unit of 10 g, which is assumed, 2^-20 for 5 g, 2^-18 for 30 g, 2^-16 for 80 g (2^-21 for the former 2 g).
 
-*Which range* a unit has, only its configuration datagram tells (table 5-16), sent at power-on. One that has been
-running is judged by gravity: a second at rest shows 1 g in one of the ranges and no other, as they are a factor of two
-apart. Until either is known, samples that are far from 1 g in the assumed range are withheld, not passed on wrong.
+*Range*: only the configuration datagram (table 5-16), sent at power-on, names the unit's range. The range of a unit
+that already runs is found from gravity: a second at rest shows 1 g in one range only, because ranges differ by factors
+of two. Until the range is known, samples far from 1 g in the assumed range are withheld.
 
 *Time*: a sample is older than its datagram by the latency. *Counter*: internal samples, 2000 a second, modulo 256.
 
 *Axes* are those of figure 6-4; a cluster reads +1 g on the axis that points up. The inclinometers become a
 `TiltSample` of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity. So y,
-nose up, is asin(X / |g|). And x, right side down, is -asin(Y / |g|) with Z down, where Y is right, or +asin(Y / |g|)
-with Z up, where Y is left. The unit may lie on either side, with X forward. Beyond 60 degrees it gives none. Rates and
+nose up, is asin(X / |g|). And x, right side down, is -asin(Y / |g|) with Z down (Y right), or +asin(Y / |g|) with Z up
+(Y left). The unit may lie on either side, with X forward. Beyond 60 degrees there is no `TiltSample`. Rates and
 forces stay in the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
 
-Datagrams: tables 5-13 to 5-23. Those with AUX (0x98 to 0x9C, 0xAD to 0xAF) are those
-of earlier revisions, which rev. 31 calls PPS (0xF0 to 0xF7); both add one cluster of a 24-bit value and a status byte.
+Datagrams: tables 5-13 to 5-23. Earlier revisions have datagrams with AUX (0x98 to 0x9C, 0xAD to 0xAF), rev. 31 has PPS
+instead (0xF0 to 0xF7); both add one cluster of a 24-bit value and a status byte.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SPECIAL_BYTES: Final[dict[int, int]] = {
     **dict.fromkeys((0xBE, 0xBF), 21),  # extended error
     **dict.fromkeys((0xD1, 0xD2), 40),  # bias trim
 }
-"""Sizes, with the CRC, of the datagrams that are sent at start-up or on demand; the second of each ends in CR LF."""
+"""Sizes, CRC included, of the datagrams sent at start-up or on demand; the second id of each pair ends in CR LF."""
 
 _VECTOR = "bHbHbHB"
 """Three 24-bit numbers, each as its signed first byte and the rest, and the cluster's status byte."""
@@ -83,9 +83,9 @@ FRAME_BYTES: Final = {name: values.size + CRC_BYTES for name, (values, _) in NOR
 
 
 def is_whole(frame: bytes) -> bool:
-    """Return whether the CRC-32/MPEG-2 at the end of a datagram, padded with zeros to whole words, is right.
+    """Check the CRC-32/MPEG-2 at the end of a datagram, which is padded with zeros to whole words.
 
-    It is zlib's CRC with all bits in the other order and without the last inversion: zlib works on mirrored bytes.
+    CRC-32/MPEG-2 is zlib's CRC with reversed bit order and no final inversion: so zlib runs over mirrored bytes.
     """
     mirrored = frame.translate(_REVERSED)
     body = mirrored[:-CRC_BYTES]
@@ -105,7 +105,7 @@ REST_DEG_S: Final = 3.0  # the fastest rate that counts as "at rest"; a turn-on 
 _ASSUMED_BITS = 19
 _BITS = (16, 18, 19, 20, 21)
 _RANGE_CODES = {0: 19, 2: 21, 3: 20, 4: 18, 6: 16}
-"""Nibbles of bytes 17 and 18 of the configuration datagram, and the bits after the point that they mean."""
+"""Fraction bits of the acceleration by range code: a nibble of bytes 17 and 18 of the configuration datagram."""
 _GYRO_SCALE: Final = DEG / 2**14
 _GYRO_UNIT, _ACCEL_UNIT, _INCLINATION_UNIT, _ACCEL_RANGE = 5, 8, 11, 17
 
@@ -114,10 +114,10 @@ _IDENTIFIERS = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in 
 
 
 class Stim300Decoder(Decoder):
-    """STIM300 datagrams; gives `ImuSample` where they hold acceleration, `TiltSample` where they hold inclination.
+    """Decoder of STIM300 datagrams into `ImuSample` (if they hold acceleration) and `TiltSample` (inclination).
 
-    There is no start mark: after a loss the next datagram is the next one whose CRC is right. A tilt that cannot be
-    used is counted, though the datagram may have given an `ImuSample`.
+    Datagrams have no start mark: after a loss, decoding continues at the next right CRC. An unusable tilt counts as
+    rejected even if its datagram gave an `ImuSample`.
     """
 
     START = _IDENTIFIERS
@@ -155,7 +155,7 @@ class Stim300Decoder(Decoder):
         bits = [each for each in known if each is not None]
         if len(bits) == 3:
             self._accel_bits, self._range_known = bits, True
-        # Of the low nibble 0 is a rate and 2 its average, 8 and 10 the same delayed; the rest are angles or velocities.
+        # Low nibble: 0 rate, 2 average rate, 8 and 10 their delayed forms; other codes are angles or velocities.
         self._imu_unit_right = frame[_GYRO_UNIT] & 0x05 == 0 and frame[_ACCEL_UNIT] & 0x0D == 0
         self._inclination_unit_right = frame[_INCLINATION_UNIT] & 0x0D == 0
 

@@ -1,4 +1,4 @@
-r"""VectorNav VN-100 and relatives: ASCII and binary asynchronous outputs on one port, in any mixture.
+r"""VectorNav VN-100 and relatives: ASCII and binary asynchronous outputs on one port, in any mix.
 
     $VNYMR,yaw,pitch,roll,mag x 3,accel x 3,gyro x 3*hh\r\n            degrees, gauss, m/s^2, rad/s
     $VNIMU,mag x 3,accel x 3,gyro x 3,temperature,pressure*hh\r\n      uncompensated; degrees Celsius, kPa
@@ -9,8 +9,8 @@ Source: VectorNav UM001. Axes are X forward, Y right, Z down; level and at rest 
 A binary frame is 0xFA, a byte with one bit a group, and one little-endian 16-bit mask of fields a group. The fields
 follow in ascending order of their bits, then a CRC-16/XMODEM, big-endian, over all but the first byte ("Binary Output
 Messages").
-Only groups 1 (common) and 3 (IMU) are known here. The length of an unknown field is unknown, and so is everything
-after it; older firmware gave some bits other meanings, which then fails the CRC. Nothing is guessed.
+Only groups 1 (common) and 3 (IMU) are decoded. An unknown field has an unknown length, so its whole frame is rejected.
+Older firmware gave some bits other meanings; such frames fail the CRC.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
 _GROUPS: Final[dict[int, tuple[str, dict[int, dict[str, int]]]]] = {
-    # Times since start, by GPS and of a sync pulse; yaw, pitch, roll; quaternion; rate (5), position, velocity,
+    # Times since start, of GPS and since a sync pulse; yaw, pitch, roll; quaternion; rate (5), position, velocity,
     # acceleration (8); uncompensated acceleration and rate (9); field, temperature, pressure (10); increments; states.
     0x01: (
         "Q Q Q 3f 4f 3f 3d 3f 3f 6f 5f 7f H I Q",
@@ -52,15 +52,15 @@ _GROUPS: Final[dict[int, tuple[str, dict[int, dict[str, int]]]]] = {
         },
     ),
 }
-"""Known groups: the formats of their fields by bit, and the places of the used values in a field."""
+"""Known groups: the formats of their fields by bit, and the positions of the used values in a field."""
 _KNOWN_GROUPS: Final = 0x05
-# Rate and acceleration that belong together first: compensated ones, as $VNYMR has them, before uncompensated ones.
+# Preferred order: rate and acceleration from one group first, and compensated values (as in $VNYMR) before raw ones.
 _SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
 
 
 @functools.lru_cache(maxsize=16)
 def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
-    """Return the layout of a frame before its CRC, and the places of the used values; raise RejectedError."""
+    """Return the layout of a frame before its CRC, and the positions of the used values; raise RejectedError."""
     places: dict[str, int] = {}
     code, count = f"<{len(header)}x", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
@@ -95,11 +95,11 @@ _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR"
 
 
 class VectorNavDecoder(SentenceDecoder):
-    """VectorNav outputs; gives `ImuSample`."""
+    """Decoder of VectorNav outputs into `ImuSample`."""
 
     START = re.compile(rb"\xfa|\$(?:V(?:N|\Z)|\Z)")
     END = re.compile(rb"[^ -#%-~]")
-    """The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
+    """First byte that cannot be inside a sentence: a line end, a "$", or an unprintable byte."""
     LIMIT = 250  # the longest asynchronous sentence has some 200 bytes
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
     clock_from_start: ClassVar[bool] = True
@@ -157,7 +157,7 @@ _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
     b"VNYMR": (12, slice(6, 12), slice(0, 0)),
     b"VNIMU": (11, slice(3, 9), slice(9, 10)),
 }
-"""Count of numbers, and the places of force and rate, and of the temperature."""
+"""Count of numbers, and the positions of force and rate, and of the temperature."""
 
 
 def _command(body: bytes) -> bytes:
@@ -165,11 +165,11 @@ def _command(body: bytes) -> bytes:
 
 
 class VectorNavDialogue(WakeDialogue):
-    """First end a pause of the outputs, then choose the factory's output, $VNYMR, on the port that we speak on.
+    """Commands that end a pause of the outputs, then select the factory's output, $VNYMR, on the port in use.
 
     UM001: p. 56 (a pause changes no register), p. 63 (register 6 without a port is that of the port in use), p. 54
-    (registers are kept over a reset only by $VNWNV, which is never sent from here). A device without any output set is
-    rare; binary outputs (register 75) are not touched, as they name a port by its number, which is not known here.
+    (registers survive a reset only after $VNWNV, which is never sent). A device without any output is
+    rare; binary outputs (register 75) stay unchanged, because they name a port by its number, which is unknown.
     """
 
     SAYINGS = (

@@ -7,15 +7,15 @@
 Little-endian 16-bit numbers, and the low byte of the sum of the ten bytes before it. Sources: WitMotion's WT901 data
 sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 as it comes).
 
-0x55 stands in data too and the sum is weak: a frame is believed only in company, that is when another good one follows
-at once. Alone one place in 10^6 of noise would pass, and one in 256 of the frames that have lost a byte; so it is one
-in 10^12. The price is that the last frame of an epoch waits for the next epoch; its time does not suffer. The packets
+0x55 also occurs in data, and the sum is weak. So a frame is accepted only if another good frame follows at once. A
+single frame would pass at one offset in 10^6 of noise, and for one in 256 frames with a lost byte; a pair passes at one
+in 10^12. The cost: the last frame of an epoch waits for the next epoch; its time stays right. The packets
 of Bluetooth models (0x61) have no checksum and are not read.
 
 The axes are the device's own, and Z is up. The angles turn Z-Y-X about these axes (WT901 p. 12), so with X forward and
 Y left roll is right side down and pitch nose down: as a gradienter it gives x = roll and y = -pitch, law "euler",
-forward being the device's X. The temperature is as these documents have it; six-axis models (BWT61CL, JY61) count
-1/340 degree from 36.53 instead, and theirs comes out wrong.
+with the device's X forward. The temperature scale is that of these documents. Six-axis models (BWT61CL, JY61) use
+1/340 degree from 36.53 instead; their temperature is wrong.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _LEAST, _GREATEST = -32768, 32767
 
 
 class WitMotionDecoder(Decoder):
-    """Frames of a WitMotion device; gives `ImuSample`, of neighbouring acceleration and rate, and `TiltSample`."""
+    """Decoder of WitMotion frames into `ImuSample` (from adjacent acceleration and rate) and `TiltSample`."""
 
     _good_at = -1
-    """Stream position of a frame that was found good when it followed another, or that waits for one to follow."""
+    """Stream position of a good frame that followed another, or that waits for the next one."""
     _accel: tuple[int, Vector, float] | None = None
-    """End of the last acceleration's frame, which waits for its rate; m/s^2, degrees Celsius."""
+    """Acceleration that waits for its rate: end of its frame, m/s^2, degrees Celsius."""
 
     def interrupted(self) -> None:
         super().interrupted()
@@ -77,9 +77,9 @@ class WitMotionDecoder(Decoder):
             self._drop_accel()
             accel = None
         if kind == _FIELD:
-            self.accepted += 1  # not used, but it shows whose frames these are
+            self.accepted += 1  # not used, but it confirms the protocol
         if not _ACCEL <= kind <= _ANGLE:
-            return []  # field, time, ports, pressure, position, quaternion: right, but nothing for us
+            return []  # field, time, ports, pressure, position, quaternion: valid, not used
         x, y, z, last = _NUMBERS.unpack_from(frame, 2)
         if kind == _ANGLE:
             if max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
@@ -103,7 +103,7 @@ class WitMotionDecoder(Decoder):
 
 
 def _good(buffer: bytes, at: int) -> int:
-    """Return `FRAME_BYTES` where a frame begins, or `NO_FRAME`; raise RejectedError for a wrong sum."""
+    """Return `FRAME_BYTES` if a frame begins at `at`, else `NO_FRAME`; raise RejectedError for a wrong sum."""
     if buffer[at] != 0x55 or not _FIRST_TYPE <= buffer[at + 1] <= _LAST_TYPE:
         return NO_FRAME
     last = at + FRAME_BYTES - 1

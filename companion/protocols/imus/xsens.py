@@ -3,13 +3,13 @@
     FA FF 36  length  (id, size, data)...  checksum        big-endian; all bytes after FA sum to 0 modulo 256
 
 A length of 255 means that the true one follows in 16 bits. The low nibble of an id names the number format: 0 float32,
-1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Used are 0x1020 packet counter,
+1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Fields used: 0x1020 packet counter,
 0x1060 SampleTimeFine (ticks of 0.1 ms), 0x0810 temperature (sent once a second at most, and held), 0xE020 status word.
 Also 0x4020 acceleration in m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate). Sources:
 MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
 
-Axes: X forward, Y left, Z up; level and at rest it reads z = +9.8. The axes are the device's own: an MTi that lies on
-its base with X forward becomes forward, right, down by the mounting ROTATION_ROLL_180.
+Axes: X forward, Y left, Z up; level and at rest z reads +9.8. Samples keep the device's own axes: for an MTi on its
+base with X forward, the mounting ROTATION_ROLL_180 makes them forward, right, down.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _FLOAT32 = struct.Struct(">3f")
 
 
 class XsensDecoder(Decoder):
-    """MTData2 messages; gives `ImuSample`."""
+    """Decoder of MTData2 messages into `ImuSample`."""
 
     START = re.compile(rb"\xfa(?:\xff|\Z)")
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
@@ -132,9 +132,9 @@ def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
 
 
 class XsensDialogue(WakeDialogue):
-    """GoToMeasurement: from the config state back to sending (MT0605P.E, p. 53).
+    """GoToMeasurement: switch a device from the config state to sending (MT0605P.E, p. 53).
 
-    A device that has just got power says WakeUp. It is not answered: WakeUpAck would put it into the config state.
+    After power-on a device sends WakeUp. It gets no answer: WakeUpAck would put it into the config state.
     """
 
     SAYINGS = ((bytes.fromhex("FAFF1000F1"), "measurement started with GoToMeasurement"),)

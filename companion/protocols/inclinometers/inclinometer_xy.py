@@ -4,8 +4,8 @@ r"""Fluid gradienters that send `X=...` and `Y=...` as two lines: MEAS DPG2 and 
     X=+++++++\r\n                   over range (or X=-------)
 
 Sources: MEAS DPG2 manual p. 10, P-series manual p. 13, BEI INC manual p. 10. Serial settings differ: DPG2 9600 8N1,
-P-series 2400 8N1, BEI 9600 8E1. There is no checksum. A reading counts only as a pair of neighbouring lines, X
-first. Commands are single letters that the device echoes; an echo in front of a line is passed over.
+P-series 2400 8N1, BEI 9600 8E1. There is no checksum. A reading is a pair of adjacent lines, X first. Commands are
+single letters that the device echoes; an echo in front of a line is skipped.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _DEGREES = re.compile(rb"[+-]\d\d\.(\d{2,3})")
 _SENTINEL = re.compile(rb"\+{3,}|-{3,}")
 _SINGLE_AXIS = re.compile(rb"[+-]\d\d\.\d{2,3}")
 _ECHO = re.compile(rb"[A-Za-z*]{1,8}")
-_SURE = 4  # readings in a row with fewer decimals that make them the device's format; fewer have lost a digit
+_SURE = 4  # readings in a row with fewer decimals that redefine the format; a shorter run has lost digits
 
 _SPOILED: Literal["spoiled"] = "spoiled"
 
 
 class InclinometerXyDecoder(LineDecoder):
-    """Pairs of lines of an `X=.../Y=...` gradienter; gives `TiltSample`, timed at the end of the Y line."""
+    """Decoder of `X=.../Y=...` line pairs into `TiltSample`, timed at the end of the Y line."""
 
     LIMIT: ClassVar[int] = 64
     _x_deg: float | Literal["spoiled"] | None = None
-    """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
+    """X that waits for its Y; "spoiled": rejected, so its Y is rejected too."""
     _decimals = _fewer_running = 0
 
     def interrupted(self) -> None:
@@ -86,7 +86,7 @@ class InclinometerXyDecoder(LineDecoder):
     def _y(self, text: bytes, t_s: float) -> TiltSample | None:
         x_deg, self._x_deg = self._x_deg, None
         if x_deg == _SPOILED:
-            return None  # the pair has been counted with its X
+            return None  # the pair was counted as rejected with its X
         y_deg = self._degrees(text)
         if not isinstance(x_deg, float):
             raise RejectedError("orphan")
@@ -110,7 +110,7 @@ class InclinometerXyDecoder(LineDecoder):
         return degrees
 
     def _check_decimals(self, decimals: int) -> None:
-        """A device prints always as many decimals: `+00.30` after many `+00.430` has lost a digit on the way."""
+        """Reject a lost digit: a device always prints equally many decimals, so `+00.30` after `+00.430` is damaged."""
         if decimals < self._decimals:
             self._fewer_running += 1
             if self._fewer_running < _SURE:
@@ -118,6 +118,6 @@ class InclinometerXyDecoder(LineDecoder):
         self._decimals, self._fewer_running = decimals, 0
 
 
-# One reading, which all of them give while their stream is stopped (DPG2 p. 11, BEI p. 12). The letter that starts the
-# stream differs, and a BEI in its setup level would store it.
+# Command for one reading; all models answer it while their stream is stopped (DPG2 p. 11, BEI p. 12). The letter that
+# starts the stream differs, and a BEI in its setup level would store it.
 InclinometerXyDialogue = functools.partial(PollDialogue, b"R", "R", period_s=0.2)

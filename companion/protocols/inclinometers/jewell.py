@@ -2,14 +2,14 @@ r"""Jewell Instruments (Applied Geomechanics) electrolytic tiltmeters: Tuff Tilt
 
     $-00.619,000.023,018.910,N0000\r\n                                    SIM (default): X, Y, temperature, serial
     $YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000*47\r\n         XDR: Y (N, north) first, then X (E, east)
-    $PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346\r\n        ASH: the same, without a checksum
+    $PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346\r\n        ASH: as XDR, without a checksum
     $P-00.907R002.186*1C\r\n                                              TCM: pitch is Y, roll is X
 
 Sources: Tuff Tilt Digital manual B-06-1006 rev. E, p. 12 and 15; D700 manual B-03-1006 rev. K, p. 14. Tilts are degrees
-(unit D) or microradians (M) in XDR and ASH; SIM does not say its unit and is read as degrees, its default: a device set
-to microradians has to send XDR.
+(unit D) or microradians (M) in XDR and ASH. SIM has no unit and is read as degrees, the default: a device set to
+microradians must send XDR.
 
-Where there is no checksum the shape of a line must be whole: all numbers padded with zeros, or none.
+A line without a checksum must have a uniform format: all its numbers are padded with zeros, or none.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ _START: Final = re.compile(rb".*(?=\$)", re.DOTALL)
 
 
 class JewellDecoder(LineDecoder):
-    """Lines of a Jewell tiltmeter, in whichever of its formats; gives `TiltSample`."""
+    """Decoder of Jewell lines in any of these formats into `TiltSample`."""
 
     LIMIT: ClassVar[int] = 90
 
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> TiltSample | None:
         text = line.removesuffix(b"\r")
-        if text.rfind(b"$") == 0 and not cut:  # nearly every line
+        if text.rfind(b"$") == 0 and not cut:  # usual case
             return _reading(text, t_s)
         if not cut and not text:
             return None
         match = _START.match(text)
         if match is None:
             raise RejectedError(_why(text, cut=cut))
-        if match.end() or cut:  # something in front that has lost its line end
+        if match.end() or cut:  # bytes before the "$": an earlier line without its line end
             self.rejected[_why(text[: match.end()], cut=cut)] += 1
         return _reading(text[match.end() :], t_s)
 
@@ -106,6 +106,6 @@ def _sample(t_s: float, x_deg: float, y_deg: float, temperature_degc: float | No
     return TiltSample(t_s, x_deg, y_deg, temperature_degc)
 
 
-# One reading in the format that is set, of any target (99). It could be told to stream, but keeps its output settings
-# (Tuff Tilt Digital manual, p. 15).
+# Command for one reading in the current format, to any address (99). A command to stream exists, but the device would
+# store it as an output setting (Tuff Tilt Digital manual, p. 15).
 JewellDialogue = functools.partial(PollDialogue, b"*9900XY\r\n", "*9900XY", period_s=0.2)

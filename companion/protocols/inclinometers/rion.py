@@ -3,13 +3,13 @@
     68 0D 00 84 | 00 10 50 | 10 10 05 | 01 04 01 | 1C      pitch +10.50, roll -10.05, heading 104.01
 
 After 0x68: length (from itself through the sum), address, command, data, and the low byte of the sum of all from the
-length on. An angle is a sign (0 or 1) and hundreds, then tens and units, then tenths and hundredths. A sum of eight
-bits is weak, but so few bytes are digits of angles that can be that one place in 10^16 of noise passes for them.
+length on. An angle is a sign (0 or 1) and hundreds, then tens and units, then tenths and hundredths. The 8-bit sum is
+weak, but few byte values are valid digits of angles: noise passes at one offset in 10^16.
 
 Sources: HCM370B/375B manual p. 11-12, HCM705B manual p. 12-17 (9600 8N1; "heading no negative"). The frame of 16 bytes
-with two angles of seven digits is the HCA726's, known from a public driver only, which does not look at the command;
-that it answers 0x84 like the others is assumed. Of the SCA and ACA inclinometers no document was found: their frame is
-said to be the compass', and is read as that. Records of floats (0x94) are not asked for and not read.
+with two angles of seven digits is the HCA726's, known only from a public driver, which ignores the command byte; its
+answer is assumed to be 0x84 as for the others. No document of the SCA and ACA inclinometers was found; they reportedly
+use the compass' frame, and are decoded so. Records of floats (0x94) are neither requested nor read.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _LENGTHS: Final[dict[int, frozenset[int]]] = {
     0x94: frozenset(range(10, LONGEST, 5)),
     _ANSWER: frozenset((_ANGLES_LENGTH, _LONG_ANGLES_LENGTH)),
 }
-"""The lengths that a command or an answer may have; for most no more is documented than that they are short."""
+"""Allowed lengths of commands and answers; for most, the documents show only that they are short."""
 
 
 class RionDecoder(Decoder):
-    """Frames of a RION device; gives `CompassSample`, or `TiltSample` for the inclinometer's longer frame."""
+    """Decoder of RION frames into `CompassSample`, or `TiltSample` for the inclinometer's longer frame."""
 
     START = re.compile(b"\x68")
 
@@ -51,7 +51,7 @@ class RionDecoder(Decoder):
         if sum(frame[1:-1]) & 0xFF != frame[-1]:
             raise RejectedError("checksum")
         if frame[3] == _ANSWER:
-            _measurement(frame, 0.0)  # without angles it is rather no frame, with a sum that is right by chance
+            _measurement(frame, 0.0)  # without valid angles the sum is probably right by chance: no frame
 
     def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
         if frame[3] != _ANSWER:
@@ -80,5 +80,5 @@ def _degrees(digits: bytes, per_degree: int) -> float:
     return -value if text[0] == "1" else value
 
 
-# The mode it comes in (HCM370B p. 11, HCM705B p. 12). Question and answer have up to 21 bytes, 97 ms at 2400 baud.
+# Polling is the default mode (HCM370B p. 11, HCM705B p. 12). Question and answer: up to 21 bytes, 97 ms at 2400 baud.
 RionDialogue = functools.partial(PollDialogue, bytes((0x68, 4, 0, _READ, 4 + _READ)), "68 04 00 04 08", period_s=0.2)
