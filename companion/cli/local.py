@@ -180,7 +180,7 @@ async def lua(options: argparse.Namespace) -> int:
 async def explain(options: argparse.Namespace) -> int:
     found = messages.search(" ".join(options.words))
     lines = show.explained_lines(found)
-    reason = "" if found else "no message is like this; docs/messages.md lists all of them"
+    reason = "" if found else messages.NO_MATCH
     entries = [{"id": name, **msgspec.to_builtins(entry)} for name, entry in found]
     answer = {"state": "done" if found else "failed", "reason": reason, "messages": entries}
     return conclude(options, answer, lines or [reason], good=bool(found))

@@ -5,6 +5,7 @@ The TOML files beside this module hold one table for each message, by identifier
 - `text`: the text, with named fields (`"IMU {imu} moves {rate} deg/s"`), which `message` fills in. The caller formats
   the values: a field has no format specification, so that no text of the catalogue can fail;
 - `also`: equivalent texts of the arming script, the log or the autopilot; `…` stands for any value;
+- `words`: more words by which a person may search for the message;
 - `do`: the kind of remedy, a key of `KINDS`;
 - `cause`, `remedy`: one or two sentences; no remedy if there is nothing to do; `see`: a page of the documents, such
   as `"arming.md#the-gate"`.
@@ -39,6 +40,7 @@ KINDS: Final[Mapping[Kind, str]] = {
     "report": "Report a fault of the program",
 }
 ANY: Final = "…"
+NO_MATCH: Final = "Type the line from the screen, or find the topic in docs/index.md"
 _CERTAIN_LETTERS: Final = 8  # Fewest letters of a pattern that identify a message in a longer line
 _SIMILAR: Final = 0.8  # Least ratio of `difflib` at which a word counts as misspelt
 _LEAST_SCORE: Final = 0.4  # Least share of the searched words' weight that an entry must contain
@@ -53,6 +55,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     remedy: str = ""
     text: str = ""
     also: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
     see: str = ""
 
     @property
@@ -125,7 +128,7 @@ def _words(text: str) -> Iterable[str]:
 @functools.cache
 def _index() -> dict[str, frozenset[str]]:
     return {
-        name: frozenset(_words(" ".join((name.replace("_", " "), *entry.patterns, entry.cause))))
+        name: frozenset(_words(" ".join((name.replace("_", " "), *entry.patterns, entry.cause, *entry.words))))
         for name, entry in catalogue().items()
     }
 
