@@ -187,7 +187,9 @@ class Align(Command, frozen=True, tag="align"):
     headings: Annotated[
         Literal[2, 4] | None,
         Field(
-            "2: there, turned by 180 deg, on the same way (zero without it); 4: every 90 deg (turn without it)", by=by
+            "2 (default for zero): turn by 180 deg, then on the same way to the start;"
+            " 4 (default for turn): every 90 deg",
+            by=by,
         ),
     ] = None
     level: Annotated[bool, Field("turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)", by=by)] = False
@@ -203,12 +205,12 @@ class Cancel(Command, frozen=True, tag="cancel"):
 
 
 class Undo(Command, frozen=True, tag="undo"):
-    help = "put the autopilot's values from before the last calibration back"
+    help = "restore the autopilot's values from before the last write"
     by = _ALL
     force: Annotated[
         bool,
         Field(
-            "leave what somebody else has changed since, and put the rest back",
+            "keep values that another program changed; restore the others",
             by=_SHELL | Interface.MQTT | Interface.PAGE,
         ),
     ] = False
@@ -239,7 +241,7 @@ class Temperature(Command, frozen=True, tag="temperature"):
         Field(
             flags={
                 "write": "write the curves into the autopilot (disarmed and still)",
-                "undo": "put back what was there before the curves",
+                "undo": "restore the values from before the curves",
             },
             group="action",
         ),

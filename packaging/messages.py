@@ -10,8 +10,8 @@ from companion.messages import KINDS, Entry, catalogue
 _HEAD: Final = """\
 # Messages: what the companion says, and what to do
 
-Type `companion explain WORDS` with some words of the line, or search this page for them. `…` is a name or a number.
-`status`, `check`, failed commands and the page show the remedy too.
+Type `companion explain WORDS` with some words of the line; it knows more phrases than this page. `…` is a name or a
+number. `status`, `check`, failed commands and the page show the remedy too.
 
 A line often has a speaker and a reason: in `Not armed: hold still 6 s` look up the part behind the colon. A line
 that begins with `... ` continues the one before.

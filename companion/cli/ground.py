@@ -57,7 +57,7 @@ def add_ground(commands: argparse._SubParsersAction[Parser], common: Parser) -> 
     for name, words in (
         ("status", "what the companion is doing, its last result and its settings"),
         ("cancel", "cancel what runs, whoever asked for it"),
-        ("undo", "put the autopilot's values from before the last calibration back"),
+        ("undo", "restore the autopilot's values from before the last write"),
     ):
         add(name, partial(_on_the_link, work=methodcaller(name)), words)
 

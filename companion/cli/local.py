@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 def add_setup(add: AddCommand) -> None:
     parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
     option = parser.add_argument
-    option("ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)")
+    option("ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all free ports)")
     option("--page", metavar="ADDRESS:PORT", help="ask on a page there, such as 0.0.0.0:8191 for a phone")
     option("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
     option("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
@@ -49,7 +49,7 @@ def add_setup(add: AddCommand) -> None:
     option("--udp", type=within(1, 65535, int), action="append", metavar="PORT", help=words)
     option("--platform", metavar="WHERE", help="ground or deck")
     option("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
-    words = "of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_..."
+    words = "of gradienter, compass or imu: degrees clockwise (90 becomes ROTATION_YAW_90), ROLL,PITCH,YAW or ROTATION_"
     option("--mounting", action="append", default=[], metavar="DEVICE=HOW", help=words)
     words = "of an IMU by its name: fc=icm42688p (bmi088, adis16470, adis16405, unknown)"
     option("--part", action="append", default=[], metavar="IMU=PART", help=words)
@@ -70,9 +70,8 @@ def add_commands(add: AddCommand) -> None:
     option = add("check", check, "check configuration, ports, sensors and autopilot; say what is wrong").add_argument
     option("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
     option = add("ports", ports, "list serial ports with their stable names").add_argument
-    words = "tell who speaks on these ports (default: all that nobody holds and no console uses) by listening at the"
-    words += " usual speeds, up to half a minute; not a byte is sent, but opening a port raises DTR, which starts an"
-    option("--listen", nargs="*", metavar="PORT", help=f"{words} Arduino anew")
+    words = "listen on these ports and name the devices (default: all free ports), for up to half a minute; sends"
+    option("--listen", nargs="*", metavar="PORT", help=f"{words} nothing, but opening a port restarts an Arduino")
     words = "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it"
     add("lua", lua, words)
     installer = add("install-service", install, "start the companion at every boot: unit, udev rules, configuration")
