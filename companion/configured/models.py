@@ -298,12 +298,13 @@ def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | Co
 
 
 def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
-    """Predict one sigma of the gyro bias, deg/h, for each part in the catalogue, "unknown" last.
+    """Predict one sigma of the gyro bias, deg/h, for each part in the catalogue.
 
     The figure is the estimator's own V(T, H) for the longest window. A warm-up and integer telemetry add to it.
     """
     mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
-    return {name: predicted_sigma(one.gyro, mean_s, horizon_s) / DEG_H for name, one in PROFILES.items()}
+    known = {name: one.gyro for name, one in PROFILES.items() if one.is_named}
+    return {name: predicted_sigma(gyro, mean_s, horizon_s) / DEG_H for name, gyro in known.items()}
 
 
 class Profiles:
@@ -354,6 +355,5 @@ class Profiles:
 
     @functools.cached_property
     def _price_of_unknown(self) -> str:
-        *known, (_, unknown) = gyro_sigmas_deg_h(self._config).items()
-        others = ", ".join(f"{part} {sigma:.0f}" for part, sigma in known)
-        return f"gyros known to {unknown:.0f} deg/h at best ({others})"
+        known = ", ".join(f"{part} {sigma:.0f}" for part, sigma in gyro_sigmas_deg_h(self._config).items())
+        return f"its noise is learned at rest; a named part has a surer sigma (gyros, deg/h: {known})"

@@ -183,13 +183,14 @@ class Draft:
             key, now = part_key(name), imu.get("profile", UNKNOWN)
             if "profile" not in imu:
                 self.guessed.add(key)
-            choices = list(dict.fromkeys((*sigmas, now)))
+            choices = list(dict.fromkeys((*sigmas, UNKNOWN, now)))
             whose = f"IMU {imu.get('instance', 1)} of the autopilot" if imu["source"] == "autopilot" else "the own IMU"
             yield Question(
                 f"Which part is {whose} ({name})?",
                 now,
                 functools.partial(self._put_part, imu, key, choices),
-                f"Its board's data sheet says; any other part: {UNKNOWN}. Gyros known, at best, to: {price} deg/h.",
+                f"Its board's data sheet says; any other part: {UNKNOWN}, whose noise is learned at rest. Gyros known,"
+                f" at best, to: {price} deg/h.",
                 choices,
                 key,
             )

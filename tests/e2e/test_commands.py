@@ -185,7 +185,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             gone = await companion("-c", config, "status", "--json")
             assert gone.code == NO_DAEMON
             assert "the companion is not running" in gone.json["reason"]
-            assert gone.err.count("\n") == 1
+            assert gone.err.count("\n") == 2, "the line, and what to do"
 
     asyncio.run(main())
 

@@ -105,7 +105,10 @@ def test_the_part_named_by_the_autopilot_brings_its_profile(tmp_path: Path) -> N
     unnamed = gyros(tmp_path / "a", None)
     by_itself = gyros(tmp_path / "b", None, parameters=parameters)
     configured = gyros(tmp_path / "c", "bmi088")
-    price = "part unknown: gyros known to 49 deg/h at best (icm42688p 5, bmi088 7, adis16470 13, adis16405 55)"
+    price = (
+        "part unknown: its noise is learned at rest; a named part has a surer sigma"
+        " (gyros, deg/h: icm42688p 5, bmi088 7, adis16470 13, adis16405 55)"
+    )
     assert unnamed.summary == price
     assert by_itself.summary == "bmi088, of the catalogue, by its device id"
     assert configured.summary == "bmi088, of the catalogue"

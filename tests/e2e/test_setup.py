@@ -152,7 +152,7 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             await answered(terminal, "", "eu", "180", "0", "yaw 90")
             await terminal.says("IMU 1: its device id tells no part of the catalogue")
             await terminal.answer("It has IMU 2 too", "")
-            await terminal.answer(r"IMU 1 of the autopilot \(fc\).*unknown 47 deg/h", "ICM-42688-P")
+            await terminal.answer(r"IMU 1 of the autopilot \(fc\).*adis16470 13", "ICM-42688-P")
             await terminal.answer(r"the own IMU \(own\)", "bmi")
             await terminal.answer(r"IMU 2 of the autopilot \(fc2\)", "")
             assert made.left() == set()
@@ -176,9 +176,7 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             assert (first["source"], second) == ("autopilot", {"name": "fc2", "source": "autopilot", "instance": 2})
             assert (first["profile"], own["profile"]) == ("icm42688p", "bmi088")
             assert re.search("^ok +profile fc +icm42688p", checked, re.MULTILINE)
-            assert re.search(
-                "^warning +profile fc2 +part unknown: gyros known to 47 deg/h at best", checked, re.MULTILINE
-            )
+            assert re.search("^warning +profile fc2 +part unknown: its noise is learned at rest", checked, re.MULTILINE)
             assert re.search(r"ok +fc2 +autopilot IMU 2", checked), "what is there, and nothing of the third"
             assert "IMU 3" not in terminal.screen
             assert made.left() == {"companion.toml"}

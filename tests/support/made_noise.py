@@ -37,15 +37,16 @@ def slow(rng: np.random.Generator, seconds: int, flicker: float, walk: float, wh
 def adis16405(seconds: int, rate_hz: int, seed: int) -> tuple[Floats, Floats]:
     """Times and readings (n, 6) of a part with the figures measured of the ADIS16405 (method 2.2).
 
-    Gyros: N 141 to 152 deg/h sqrt(s), floor 25 to 29 deg/h, steps of 0.05 deg/s. Accelerometers: a velocity random walk
-    of 0.2 m/s/sqrt(h), 0.2 mg in-run. K as in the catalogues: it reaches the floor at 1000 s.
+    Gyros: N 141 to 152 deg/h sqrt(s), floor 25 to 29 deg/h, steps of 0.05 deg/s, a walk that reaches the floor at
+    1000 s. Accelerometers: N 669 ug sqrt(s), floor 269 ug, K 58 ug / sqrt(s).
     """
     rng = np.random.default_rng(seed)
-    whites = [141.0 * DEG_H, 146.0 * DEG_H, 152.0 * DEG_H, *[0.34 * MG] * 3]
-    floors = [25.0 * DEG_H, 27.0 * DEG_H, 29.0 * DEG_H, *[0.2 * MG] * 3]
+    whites = [141.0 * DEG_H, 146.0 * DEG_H, 152.0 * DEG_H, *[0.669 * MG] * 3]
+    floors = [25.0 * DEG_H, 27.0 * DEG_H, 29.0 * DEG_H, *[0.269 * MG] * 3]
     readings = np.empty((seconds * rate_hz, 6))
-    for column, (white, floor) in enumerate(zip(whites, floors, strict=True)):
-        path = slow(rng, seconds, floor * FLICKER_OF_FLOOR, floor * math.sqrt(3.0 / 1000.0))
+    walks = [*(floor * math.sqrt(3.0 / 1000.0) for floor in floors[:3]), *[0.058 * MG] * 3]
+    for column, (white, floor, walk) in enumerate(zip(whites, floors, walks, strict=True)):
+        path = slow(rng, seconds, floor * FLICKER_OF_FLOOR, walk)
         noise = rng.normal(0.0, white * math.sqrt(rate_hz), seconds * rate_hz)
         readings[:, column] = np.repeat(path, rate_hz) + noise
     readings += [0.3 * DEG, -0.2 * DEG, 0.1 * DEG, 0.2, -0.1, -9.8]

@@ -26,6 +26,7 @@ from companion.estimation.noise.allan import (
     allan_variance,
     columns,
     floor_variance,
+    learned_floor,
     slope_variance,
     white_noise,
 )
@@ -39,12 +40,17 @@ from companion.samples import TRIADS, Triad, Vector, rows_of
 WHITE_SHARE: Final = 0.09
 """White over floor variance below which more averaging gains nothing: the white sigma is 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
-RAW_BATCHES: Final = 10  # Least seconds of raw means (floats) to show their scatter
-RAW_STEP: Final = 1e-5  # Rounding of raw means: five decimals, rad/s and m/s^2
+RAW_BATCHES: Final = 10  # Seconds of floats beside integers that say enough of their own scatter
+RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
+SPOT_WALK: Final = np.repeat([0.0, 0.04 * MG], 3)
+"""Walk of an unknown accelerometer by the ground's tilt and the temperature, unit / sqrt(s): 8 arcsec in a second.
+Recordings of a VN-100 and of ten Movella DOT on desks have 30 to 50 ug; the part's own is learned."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
-"""Share of the usual sample count below which a second has lost samples; above, it is the phase of the grid."""
+"""Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
+_LINE_TAKES: Final = 2.56  # Variance of a slope by an unknown part's wander over that of the wander about the line
+_MOST_WANDER: Final = 0.5  # Of the wander about a ramp, over what the ramp itself makes in the same time
 _ALLAN_SIGNIFICANT: Final = 3.0
 """Allan variance at T/5 over that of white noise: upper 5 % point for about four degrees of freedom."""
 
@@ -161,20 +167,27 @@ def estimate(
     else:
         values = np.array([batch.mean for batch in batches])
         quantum, half_step = _quantisation(batches, rounding)
-    # The profile of an unknown part has the worst floor, which would mask every warm-up.
-    wander = slope_variance(flicker, walk, end_s - slots[0]) if imu.profile.is_named else np.zeros(6)
+    wander = slope_variance(flicker, walk, float(end_s - slots[0]))
     mean, leverage = robust_mean(values, huber_c, least), np.full(6, 1.0 / seconds)
+    half_s = (end_s - slots[0]) / 2.0
     slope, ramp, level = np.zeros(6), np.zeros(6), values
     if is_long := len(slots) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s, huber_c, least)
-        ramps = is_ramp(line, len(slots), wander)
+        if not imu.profile.is_named:
+            # About the line, as a ramp would count as wander; the line takes the slowest of that with it.
+            floors = _learned(slots, values - line.slope * times[:, None], least)
+            wander = _LINE_TAKES * slope_variance(*floors, 2.0 * half_s)
+        ramps = is_ramp(line, len(slots), wander) & _dominates(slots, values, line.slope)
         slope, ramp = line.slope, np.where(ramps, line.slope, 0.0)
         level = values - ramp * (times - times.mean())[:, None]
         mean, leverage = np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage)
     measured = np.maximum(white_noise(slots, level), least)
     white = np.maximum(measured, profile_white)
-    flicker = _flicker(slots, level, measured, flicker)
+    if imu.profile.is_named:
+        flicker = _flicker(slots, level, measured, flicker)
+    else:
+        flicker, walk = _learned(slots, level, least)
     quantum = np.sqrt(np.square(quantum) + np.mean([batch.shared_variance for batch in batches], axis=0))
     # A ramp may end now or go on for the next H seconds: the error of the mean over them is uniform between 0 and
     # slope * H / 2.
@@ -182,7 +195,7 @@ def estimate(
     white_part = np.square(white) * leverage
     rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
     of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0)
-    of_line = of_line + 3.0 * np.square(quantum / (end_s - slots[0])) + wander
+    of_line = of_line + 3.0 * np.square(quantum / (2.0 * half_s)) + wander
     rate, path = temperature(batches)
     return Estimate(
         mean=mean,
@@ -196,7 +209,7 @@ def estimate(
             variance=np.minimum(of_line, UNKNOWN) if is_long else np.full(6, UNKNOWN),
             level_variance=np.square(white) / seconds + rest,
             warm_up=imu.profile.warm_up or WARM_UP,
-            half_s=(end_s - slots[0]) / 2.0,
+            half_s=half_s,
             rate=rate,
             path=path,
         ),
@@ -204,6 +217,24 @@ def estimate(
         undecided=undecided,
         useless=useless,
     )
+
+
+def _dominates(slots: NDArray[np.int64], values: Floats, slope: Floats) -> NDArray[np.bool_]:
+    """(c,) True where a line is more than the wander about it, over a fifth of the window: a step is no ramp."""
+    left = values - slope * (slots - slots.mean())[:, None]
+    span = max(int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS, 2)
+    variance, _ = allan_variance(slots, left, span)
+    explained = np.square(white_noise(slots, left)) / span
+    wander = np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0)
+    return np.asarray(wander < np.square(slope * span * _MOST_WANDER))
+
+
+def _learned(slots: NDArray[np.int64], values: Floats, least: Floats) -> tuple[Floats, Floats]:
+    """Return B and K of every column of a part that nobody named; its N is `least` or more."""
+    white = np.maximum(white_noise(slots, values), least)
+    parts = [learned_floor(slots, values[:, part], white[part]) for part in (slice(0, 3), slice(3, 6))]
+    flicker, walk = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return flicker, np.hypot(walk, SPOT_WALK)
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:

@@ -34,39 +34,42 @@ WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
 """Warm-up bias change of an unknown part: a BMI088's gyro and a BMI160's accelerometer (table in method 2.1)."""
 
 
-def allan_model(white: float, floor: float) -> AllanModel:
-    """Make a model from a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""
-    return AllanModel(white, floor / FLOOR_OF_FLICKER, floor * math.sqrt(3.0 / _FLOOR_REACHED_S))
+def allan_model(white: float, floor: float, walk: float | None = None) -> AllanModel:
+    """Make a model of white noise N, the Allan floor A (0.664 B) and the walk K, which data sheets do not give."""
+    walk = floor * math.sqrt(3.0 / _FLOOR_REACHED_S) if walk is None else walk
+    return AllanModel(white, floor / FLOOR_OF_FLICKER, walk)
 
 
 def _profile(
     name: str,
     gyro_deg_h: tuple[float, float],
-    accel_ug: tuple[float, float],
+    accel_ug: tuple[float, float] | tuple[float, float, float],
     per_kelvin: tuple[float, float] | None = None,
 ) -> NoiseProfile:
-    """Make a profile from a data sheet's figures; `per_kelvin` in deg/h and mg, None if it gives none."""
+    """Make a profile of N and A, and K where it was measured; `per_kelvin` in deg/h and mg, None where unknown."""
+    accel = [figure * 1e-3 * MG for figure in accel_ug]
     return NoiseProfile(
         name,
         allan_model(gyro_deg_h[0] * DEG_H, gyro_deg_h[1] * DEG_H),
-        allan_model(accel_ug[0] * 1e-3 * MG, accel_ug[1] * 1e-3 * MG),
+        allan_model(*accel),
         warm_up=None if per_kelvin is None else (WARM_UP_K * per_kelvin[0] * DEG_H, WARM_UP_K * per_kelvin[1] * MG),
     )
 
 
-# N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug: the table of method 2.2. The ADIS16405 gyro carries
-# the figures measured over six sessions of 2.8 h (upper ends), not the catalogue's; its accelerometer is a datasheet
-# velocity random walk of 0.2 m/s/sqrt(h) and in-run stability of 0.2 mg.
-# "unknown" is for a part that the configuration does not name. Its floors are those of the worst common parts, so that
-# sigma_use is not too small for any MEMS. Its white noise is that of the best part, because every window measures white
-# noise and the larger figure counts. Temperature coefficients: method 2.1, which has none for the two ADIS.
+# N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug, K in ug/sqrt(s): the table of method 2.2. The ADIS16405 has the
+# figures measured at rest over sessions of 2.8 h: the gyro's six (upper ends), the accelerometer's three (tilt and
+# temperature of the bench included), not those of its data sheet.
+# "unknown" is for a part that nobody named. On the ground a window shows its noise, and its floors are estimated
+# (`learned_floor`); on a deck they are those of the worst common parts. Its white noise is that of the best: white
+# noise is measured in every window, and the larger figure counts. Temperature coefficients: method 2.1, which has none
+# of the two ADIS.
 PROFILES: Final[dict[str, NoiseProfile]] = {
     profile.name: profile
     for profile in (
         _profile("icm42688p", (7.1, 3.0), (49.5, 10.0), (18.0, 0.15)),
         _profile("bmi088", (35.6, 2.0), (124.0, 20.0), (54.0, 0.2)),
         _profile("adis16470", (20.4, 8.0), (63.0, 13.0)),
-        _profile("adis16405", (152.0, 29.0), (340.0, 200.0)),
+        _profile("adis16405", (152.0, 29.0), (669.0, 269.0, 58.0)),
         _profile("unknown", (7.1, 30.0), (49.5, 200.0)),
     )
 }
@@ -169,6 +172,43 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
         freedom = float(len(values) - 1)
         variance = values.var(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
     return np.asarray(np.sqrt(variance) * student_ratio(freedom))
+
+
+# --- of an unknown part
+
+_FLOOR_MEDIAN: Final = 0.2  # Allan floor A over white noise N of common parts, 1 / sqrt(s): 0.06 to 0.55
+_FLOOR_SPREAD: Final = math.log(2.0)
+_FLOOR_RATIOS: Final = np.geomspace(0.03, 3.0, 21)
+_TINY: Final = 1e-30  # (rad/s)^2 or (m/s^2)^2: less than any noise, for readings that never change
+_WALKS_S: Final = np.array([30.0, 100.0, 300.0, 1000.0])  # Averaging times at which the walk reaches the floor
+
+
+def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, Floats]:
+    """Estimate B and K of a triad of an unknown part, (3,) each, from a window of its readings.
+
+    One ratio A / N holds for all three axes. Its prior is that of common parts; the likelihood is that of the window's
+    Allan variances. V(T, H) is linear in B^2 and K^2, so their posterior means suffice.
+
+    Args:
+        slots: (m,) ascending seconds.
+        values: (m, 3) means of those seconds.
+        white: (3,) N of the readings.
+    """
+    ratio2, walk_s = (each.ravel() for each in np.meshgrid(np.square(_FLOOR_RATIOS), _WALKS_S))
+    log_weight = -0.5 * np.square((np.log(ratio2) / 2.0 - math.log(_FLOOR_MEDIAN)) / _FLOOR_SPREAD)
+    length, span = int(slots[-1] - slots[0]) + 1, 2
+    while span <= length // _LONGEST_SHARE:
+        variance, freedom = allan_variance(slots, values, span)
+        model = 1.0 / span + ratio2 * (1.0 + span / walk_s)
+        if freedom > 0.0:
+            found = float((variance / np.maximum(np.square(white), _TINY)).sum())
+            freedom = len(slots) / (2.0 * span)
+            log_weight = log_weight - freedom / 2.0 * (3.0 * np.log(model) + found / model)
+        span *= 2
+    weight = np.exp(log_weight - log_weight.max())
+    weight = weight / weight.sum()
+    flicker2, walk2 = float(weight @ ratio2) / FLOOR_OF_FLICKER**2, float(weight @ (3.0 * ratio2 / walk_s))
+    return white * math.sqrt(flicker2), white * math.sqrt(walk2)
 
 
 # --- from recordings

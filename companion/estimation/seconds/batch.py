@@ -26,8 +26,8 @@ _EVEN: Final = 1.4999  # Counter steps within this ratio of each other count as 
 _OFF_BEAT: Final = 0.25
 """Largest distance of a step from a multiple of the usual one that shows a loss: lost samples skip whole steps."""
 _MOST_OFF_BEAT: Final = 0.2
-"""Largest share of off-beat steps; beyond it the stamps do not count samples, because the sender picks some of them."""
-_LEAST_OF_A_PART: Final = 4
+"""Largest share of irregular steps; beyond, stamps show no losses, because the sender sends only some samples."""
+_LEAST_OF_A_PART: Final = 3
 _FINEST: Final = 5  # Halvings of a second, down to 1/32 s; anything faster is vibration
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
@@ -50,10 +50,10 @@ class Batch(msgspec.Struct, frozen=True):
     """One second of one source; arrays are (c,) over its channels, in the source's units.
 
     `white`: half the mean square of successive differences (von Neumann), the white part of the variance. `missing`:
-    samples lost, from the device's counter or clock; None without one that counts samples. `counts`: None for
-    floats, and for a second that spans more than `MAX_LEVELS`. `allan`: (k, c) Allan variances at averaging times of
-    1/2, 1/4 ... 1/32 of the second, each of four samples or more. `shared_variance`: (6,) variance of an error common
-    to all samples of an IMU, also of other seconds.
+    samples lost, from the device's counter or clock; None without one that counts samples. `counts`: histogram of
+    integers; None for floats, and for a second that spans more than `MAX_LEVELS`. `allan`: (k, c) Allan variances at
+    averaging times of 1/2, 1/4 ... 1/32 of the second, each of three samples or more. `shared_variance`: (6,)
+    variance of an error that all samples of an IMU have in common, in this second and others.
     """
 
     slot: int
@@ -111,7 +111,7 @@ def summary(
 
 
 def _allan_within(off: Floats) -> Floats:
-    """Return Allan variances of rows (n, c) of one second, for halves, quarters ... of at least four samples each."""
+    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of three rows or more each."""
     firsts, sizes = _parts_of(len(off))
     depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))

@@ -22,6 +22,7 @@ from companion.estimation.seconds.batch import Batch
 from companion.estimation.stillness.own_noise import OwnNoise
 from companion.estimation.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
 from companion.physics.frames import Floats
+from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 GYRO_MOTION_RAD_S: Final = 0.10 * DEG
@@ -72,6 +73,10 @@ _COARSE_S: Final = 3  # Seconds of few levels that show a coarse stream
 _RECENT: Final = 10
 _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
+_CHANCE_OF_FIVE: Final = 3.5  # The same for the largest of five averaging times
+COMMON: Final = (0.045 * DEG, 0.7 * MG)
+"""Density of the noisiest common gyro and accelerometer (ADIS16405), times sqrt(s): believed from the first second."""
+_LEAST_HALVINGS: Final = 4  # Of a second: 1/16 s of three samples or more, from 48 Hz on
 _STATIONARY: Final = 2.0  # Largest ratio of noise at rest to its usual variance
 
 
@@ -114,6 +119,26 @@ def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, 
     return math.sqrt(max(batch.variance[channels].mean() - white.mean(), 0.0)), math.hypot(gate, math.sqrt(chance))
 
 
+def _beyond_noise(batch: Batch, channels: slice, gate: float, density: float) -> tuple[float, float]:
+    """Rms of the slow part over the channels, and what the gate and chance allow by the second's Allan variances.
+
+    Noise behind a filter above some 10 Hz has one density, Allan variance times averaging time, at all times; behind a
+    lower one it falls towards short times. Motion adds to the long ones.
+    """
+    parts = np.exp2(np.arange(1.0, len(batch.allan) + 1.0))
+    noise = density * parts
+    freedom = (channels.stop - channels.start) * np.maximum(0.75 * parts - 1.0, 1.0)
+    allowed = gate**2 + noise * (chi_square_ratio(freedom, _CHANCE_OF_FIVE) - 1.0)
+    beyond = float(((batch.allan[:, channels].mean(axis=1) - noise) / allowed).max())
+    slow = math.sqrt(max(float((batch.variance - batch.white)[channels].mean()), 0.0))
+    return slow, max(gate, slow / math.sqrt(beyond)) if beyond > 0.0 else math.inf
+
+
+def _shortest_density(batch: Batch) -> Floats:
+    """Return the density (6,) at the shortest averaging time: N^2 where no filter acts on it."""
+    return batch.allan[-1] / 2.0 ** len(batch.allan) if len(batch.allan) >= _LEAST_HALVINGS else batch.white / batch.n
+
+
 class ImuGate:
     """Gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes.
 
@@ -135,9 +160,9 @@ class ImuGate:
         """Seconds with few levels since the last one with many, for each channel."""
         self._coarse_slot = [-math.inf, -math.inf]
         """Latest second in which the gyro, or the accelerometer, changed in coarse steps."""
-        self._whites: deque[Floats] = deque(maxlen=_RECENT)  # white variances of seconds without motion
-        self._noise = np.zeros(6)
-        """Variance of one sample's white noise; zero before the first second without motion."""
+        self._densities: deque[Floats] = deque(maxlen=_RECENT)  # of seconds without motion
+        self._density = np.zeros(6)
+        """Density of the noise, N^2, from these seconds; zero before the first."""
         self.new_stretch()
 
     def new_stretch(self) -> None:
@@ -191,26 +216,35 @@ class ImuGate:
                 self._coarse_slot[number] = batch.slot
 
     def _moving(self, batch: Batch) -> GateVerdict | None:
+        shortest = _shortest_density(batch)
         for number, (part, triad, motion, vibration, unit, unit_name) in enumerate(_TRIADS):
             # Noise of one sample at this rate, if the profile's white noise is unfiltered.
             own, noise = self._own.known[number], self._white[number] * math.sqrt(batch.n)
             shaking = max(vibration, 1.5 * noise, 0.0 if own is None else 1.5 * math.sqrt(own.variance.mean()))
-            # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
-            known = float(self._noise[triad].mean())
-            bounds = (known, _STATIONARY * known if known > 0.0 else shaking**2)
-            found, allowed = _slow_part(batch, triad, max(motion, noise), bounds)
-            if own is not None:
-                allowed = math.sqrt(
-                    motion**2 + max(float((own.variance - own.white).mean()), 0.0) + _CHANCE * own.chance
-                )
+            known = float(self._density[triad].mean())
+            if len(batch.allan) >= _LEAST_HALVINGS:
+                # Noise between neighbouring samples is white whatever its size; fast motion looks white in part.
+                white = min(float(batch.white[triad].mean()), vibration**2) / batch.n
+                most = max(COMMON[number] ** 2, self._white[number] ** 2, white)
+                most = min(most, _STATIONARY * known) if known > 0.0 else most
+                density = min(float(shortest[triad].mean()), most) if own is None else float(own.density.mean())
+                found, allowed = _beyond_noise(batch, triad, motion, density)
+            else:
+                bounds = (known * batch.n, _STATIONARY * known * batch.n if known > 0.0 else shaking**2)
+                # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
+                found, allowed = _slow_part(batch, triad, max(motion, noise), bounds)
+                if own is not None:
+                    allowed = math.sqrt(
+                        motion**2 + max(float((own.variance - own.white).mean()), 0.0) + _CHANCE * own.chance
+                    )
             hint = self._own.hint(number)
             if found > allowed:
                 return _words(f"{part} {self._name} moves", found / unit, allowed / unit, unit_name, hint)
             found = math.sqrt(batch.variance[triad].mean())
             if found > shaking:
                 return _words(f"{part} {self._name} shakes", found / unit, shaking / unit, unit_name, hint)
-        self._whites.append(batch.white)
-        self._noise = np.mean(self._whites, axis=0)
+        self._densities.append(shortest)
+        self._density = np.median(self._densities, axis=0)
         return None
 
     def _displaced(self, batch: Batch) -> GateVerdict | None:
@@ -225,8 +259,8 @@ class ImuGate:
             return _words(f"gyro {name} turns or is biased by", turns / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         if not self._recent:
             return None
-        # A few samples do not show their own scatter well: use the learned noise as a lower bound.
-        scatter = np.maximum(batch.variance, self._noise) / batch.n
+        # A few samples say little about their own scatter; what is known says more.
+        scatter = np.maximum(batch.variance / batch.n, self._density)
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
                 scatter[triad] = np.maximum(scatter[triad], own.density)

@@ -13,11 +13,12 @@ from companion.config import parse
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.configured.models import gyro_sigmas_deg_h
 from companion.estimation.means.pose import heading_window, tilt_window
-from companion.estimation.means.windows import ImuInput, estimate, imu_window
-from companion.estimation.noise.allan import noise_profile, predicted_sigma
+from companion.estimation.means.windows import SPOT_WALK, ImuInput, estimate, imu_window
+from companion.estimation.noise.allan import PROFILES, noise_profile, predicted_sigma
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H
+from companion.samples import TRIADS, Triad, rows_of
 from tests.support.made_noise import slow
 from tests.support.still_aircraft import QUIET, imu
 
@@ -190,21 +191,43 @@ def test_a_slope_of_the_parts_own_flicker_is_no_warm_up_and_a_real_one_is() -> N
     rng = np.random.default_rng(9)
     model = AllanModel(0.1, 5.0, 0.05)
     source, nobody = imu("fc", NoiseProfile("made", model, model)), imu("fc", noise_profile("unknown"))
-    flagged = blind = 0
+    flagged = learned = 0
     for _ in range(60):
         bias = np.stack([slow(rng, 4096, model.flicker, model.walk) for _ in range(6)], axis=1)[2000:2060]
         readings = bias + rng.normal(0.0, model.white, (60, 6))
         flagged += any("warm-up" in line for line in window_of(source, batches_of(readings)).drifting)
-        # Whose part nobody knows, its wander cannot be told from a warm-up.
-        blind += any("warm-up" in line for line in window_of(nobody, batches_of(readings * DEG_H)).drifting)
+        # The wander of an unknown part is learned from the window itself.
+        learned += any("warm-up" in line for line in window_of(nobody, batches_of(readings * DEG_H)).drifting)
     assert flagged <= 4
-    assert blind > 20
+    assert learned <= 4
     slope = 1.5
     warm = batches_of(slope * np.arange(0.5, 60.0)[:, None] + rng.normal(0.0, model.white, (60, 6)))
     assert window_of(source, warm).gyro_rad_s == pytest.approx([60.0 * slope] * 3, abs=0.5)
 
 
-@pytest.mark.parametrize("part", ["icm42688p", "bmi088", "adis16470", "unknown"])
+@pytest.mark.parametrize("seconds", [10, 60])
+@pytest.mark.parametrize(("part", "triad"), [(p, t) for p in PROFILES if p != "unknown" for t in ("gyro", "accel")])
+def test_sigma_of_an_unknown_part_is_learned_from_its_noise(part: str, triad: Triad, seconds: int) -> None:
+    """For every part: sigma covers the next three minutes, and is not much wider than the errors.
+
+    Accelerometers stand on ground that tilts as it does under real ones.
+    """
+    rng, model, next_s, rows = np.random.default_rng(3), PROFILES[part].of(triad), 180, rows_of(triad)
+    walk = math.hypot(model.walk, SPOT_WALK[rows][0])
+    misses = []
+    for _ in range(30):
+        whole = [slow(rng, 512, model.flicker, walk)[-seconds - next_s :] for _ in range(3)]
+        bias = np.stack(whole, axis=1)
+        triads = [bias[:seconds] + rng.normal(0.0, model.white, (seconds, 3)) for _ in TRIADS]
+        batches = batches_of(np.hstack(triads))
+        nobody, end_s = imu("fc", noise_profile(None)), batches[-1].slot + 1.0
+        found = estimate(nobody, batches, end_s=end_s, horizon_s=float(next_s))
+        misses.append((found.mean[rows] - bias[seconds:].mean(axis=0)) / np.sqrt(found.use_variance[rows]))
+    assert np.mean(np.abs(misses) < 2.0) >= 0.85
+    assert 0.4 < math.sqrt(np.mean(np.square(misses))) < 1.6
+
+
+@pytest.mark.parametrize("part", ["icm42688p", "bmi088", "adis16470"])
 def test_the_price_of_a_part_is_the_sigma_that_the_estimator_gives(part: str) -> None:
     """The figures that setup and check show beside the parts, against windows of 60 s of the part's white noise."""
     config = parse('[mavlink]\nurl = "udpin:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n', "x.toml")

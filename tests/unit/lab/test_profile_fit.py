@@ -136,8 +136,20 @@ class Misses:
     def __init__(self) -> None:
         self.miss, self.use, self.seen = (np.zeros((0, 6)) for _ in range(3))
 
-    def add(self, batches: list[Batch], profile: NoiseProfile, mean_s: int, next_s: int, every_s: int = 0) -> None:
-        """Predict by windows without a hole through the estimator: one after another, or one every `every_s`."""
+    def add(
+        self,
+        batches: list[Batch],
+        profile: NoiseProfile,
+        mean_s: int,
+        next_s: int,
+        every_s: int = 0,
+        *,
+        cold: bool = False,
+    ) -> None:
+        """Predict by windows without a hole through the estimator: one after another, or one every `every_s`.
+
+        `cold`: sigma allows for a warm-up since the start of the recording, as in a record of a calibration.
+        """
         length = mean_s + next_s
         starts = range(0, len(batches) - length + 1, every_s or mean_s)
         whole = [k for k in starts if batches[k + length - 1].slot - batches[k].slot == length - 1]
@@ -148,7 +160,11 @@ class Misses:
         found = [estimate(imu, each, end_s=each[-1].slot + 1.0, horizon_s=float(next_s)) for each in past]
         means = np.array([[batch.mean for batch in each] for each in coming])
         self.miss = np.vstack([self.miss, np.array([each.mean for each in found]) - means.mean(axis=1)])
-        self.use = np.vstack([self.use, np.array([each.use_variance for each in found])])
+        unseen = [
+            one.warming.unseen(each[-1].slot + 1.0) if cold else np.zeros(6)
+            for one, each in zip(found, past, strict=True)
+        ]
+        self.use = np.vstack([self.use, np.array([each.use_variance for each in found]) + unseen])
         # The mean of the next seconds has white noise of its own.
         self.seen = np.vstack([self.seen, np.square(np.diff(means, axis=1)).mean(axis=1) / 2.0 / next_s])
 
@@ -167,11 +183,12 @@ def test_a_night_s_profile_keeps_its_word_in_the_other_half() -> None:
     """2.8 h, as the recordings of the ADIS16405 were, at a tenth of their rate: noise does not care."""
     t_s, readings = adis16405(10080, 10, seed=12)
     stretches, _, _ = rests(t_s, readings, "adis", UNKNOWN)
-    assert seconds_at_rest(stretches) > 10070
+    # An accelerometer that walks leaves the gate of 5 mg now and then.
+    assert seconds_at_rest(stretches) > 9900
     profile, _, _ = fit_profile("adis", stretches, UNKNOWN)
     assert profile.gyro.white / DEG_H == pytest.approx(152.0, rel=0.04)
     assert 23.0 < profile.gyro.floor / DEG_H < 34.0
-    assert 0.17 < profile.accel.floor / MG < 0.23
+    assert 0.22 < profile.accel.floor / MG < 0.34
     half, _, _ = rests(t_s[: len(t_s) // 2], readings[: len(t_s) // 2], "adis", UNKNOWN)
     learned, _, _ = fit_profile("adis", half, UNKNOWN)
     later = seconds_of(t_s[len(t_s) // 2 :], readings[len(t_s) // 2 :])
@@ -273,7 +290,7 @@ def test_of_real_recordings_the_next_seconds_are_where_they_were_promised_to_be(
         readings = np.hstack([played.gyro, played.accel])
         slots = {slot for within, _ in rests(played.t_s, readings, "own", UNKNOWN)[0] for slot in within}
         still = [batch for batch in seconds_of(played.t_s, readings) if batch.slot in slots]
-        misses.add(still, UNKNOWN, 10, next_s)
+        misses.add(still, UNKNOWN, 10, next_s, cold=True)
     assert len(misses.miss) >= 12
     assert misses.share(slice(0, 3)) >= 0.90
     assert misses.share(slice(3, 6)) >= 0.90

@@ -65,11 +65,11 @@ def test_a_sigma_that_is_too_small_shows(
     """A bias that jumps by 0.03 deg/s and 4 mg every other minute: within no sensor's noise, below every gate."""
     t_s, readings = hour
     odd = np.floor(t_s / 60.0)[:, None] % 2.0
-    changed = readings + odd * [108.0 * DEG_H, 0, 0, 0, 2.5 * MG, 0]
+    changed = readings + odd * [108.0 * DEG_H, 0, 0, 0, 3.3 * MG, 0]
     _, answer = run(capsys, write_csv(tmp_path / "jumps.csv", t_s, changed), "--profile", "adis16405")
     axes = by_axis(answer, 60.0)
     assert axes["gyro x"]["share"] < 0.75
     assert axes["gyro x"]["ratio"] > 1.6
     assert axes["accel y"]["share"] < 0.1
-    assert axes["accel y"]["rms"] == pytest.approx(2.5 * MG, rel=0.1)
+    assert axes["accel y"]["rms"] == pytest.approx(3.3 * MG, rel=0.1)
     assert axes["gyro y"]["share"] > 0.85
