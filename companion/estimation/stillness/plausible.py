@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.messages import message
 from companion.physics.frames import Array, Matrix, rotation_matrix
 from companion.physics.units import DEG, G
 from companion.rotations import ROTATIONS_DEG
@@ -19,7 +20,9 @@ from companion.samples import Triad
 MOST_GYRO_RAD_S: Final = 30.0 * DEG
 MOST_ACCEL_M_S2: Final = 0.3 * G  # Several times the worst power-up bias in data sheets
 _TILTED_RAD: Final = math.radians(20.0)
-"""Limit for the angle between gravity by the IMU and by the tilt; the largest bias causes 17 degrees."""
+"""Angle between gravity by the IMU and by the tilt; the largest bias turns it by 17 degrees."""
+_COMMON_BIAS_M_S2: Final = 0.05 * G  # Most parts' bias at power-up is below: 0.02 to 0.05 g in data sheets
+_EXPLAINED: Final = 0.3  # Share of a difference that is left where a turned tilt sensor explains it
 _FITS_M_S2: Final = 0.2 * G
 _AS_WELL_M_S2: Final = 0.02 * G
 """Difference below which mountings fit equally, as ROLL_180 and PITCH_180 do when level; the simplest counts."""
@@ -49,6 +52,8 @@ def implausible(
     if words := misplaced(name, force_m_s2, expected_m_s2, sensor_to_vehicle, remedy):
         return {"gyro": words, "accel": words}
     found: dict[Triad, str] = {}
+    if (deg := _turned(force_m_s2, expected_m_s2)) is not None:
+        found["accel"] = message("tilt_sensor_turned", imu=name, deg=deg)
     bias, rate = np.abs(force_m_s2 - expected_m_s2), np.abs(rate_rad_s)
     if bias[axis := int(bias.argmax())] > MOST_ACCEL_M_S2:
         found["accel"] = (
@@ -85,6 +90,16 @@ def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehi
     if axis == by_tilt:
         return f"accel {name}: gravity is {math.degrees(math.acos(cosine)):.0f} deg off the tilt: {what}"
     return f"accel {name}: {axis}, by the tilt {by_tilt}: {what}"
+
+
+def _turned(force_m_s2: Array, expected_m_s2: Array) -> int | None:
+    """Return the turn about z, degrees, by which a tilt sensor explains a reading that no common bias does."""
+    off = float(np.linalg.norm(force_m_s2 - expected_m_s2))
+    if off > _COMMON_BIAS_M_S2:
+        for deg in (180, 90, 270):
+            if np.linalg.norm(force_m_s2 - rotation_matrix(f"ROTATION_YAW_{deg}") @ expected_m_s2) < _EXPLAINED * off:
+                return deg
+    return None
 
 
 def _pointing(force: Array) -> str:

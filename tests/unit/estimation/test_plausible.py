@@ -60,6 +60,17 @@ def test_what_really_lies_so_and_what_parts_really_have_is_believed() -> None:
             assert implausible("imu", np.full(3, 0.05), biased, expected, np.eye(3), REMEDY) == {}
 
 
+@pytest.mark.parametrize("deg", [90, 180, 270])
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(5.0, 0.0), (0.0, -3.0), (2.0, 2.0), (-8.0, 3.0)])
+def test_a_tilt_sensor_turned_about_z_is_named(deg: int, pitch_deg: float, roll_deg: float) -> None:
+    """A bias of its own, 20 mg, hides the turn from nobody; the wrong offsets would be twice the slope."""
+    real = force(pitch_deg, roll_deg)
+    taken = rotation_matrix(f"ROTATION_YAW_{deg}").T @ real
+    biased = real + np.array([6.0, -8.0, 10.0]) * MG
+    found = implausible("imu", np.zeros(3), biased, taken, np.eye(3), REMEDY)
+    assert found["accel"] == f"accel imu: reads as if the gradienter were turned by {deg} deg about z"
+
+
 def test_a_bias_beyond_any_parts_is_named_by_triad() -> None:
     expected = force(0.0, 0.0)
     found = implausible("imu", np.zeros(3), expected + np.array([0.0, 0.32, 0.0]) * G, expected, np.eye(3), REMEDY)
