@@ -136,7 +136,7 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--columns",
         metavar="NAMES",
-        help="in place of the header: t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g (-: passed over)",
+        help="in place of the header: t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g (_: passed over)",
     )
     parser.add_argument(
         "--rate", type=within(4.0, 10000.0), metavar="HZ", help="of a log without times, or in their place"
@@ -291,7 +291,10 @@ def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
 def _flight_lines(number: int, found: Flight) -> list[str]:
     stages = found.stages
     when = f"flight of {found.began_at}" if found.began_at else "flight at an unknown time"
-    start = f"{when}: armed {stages.armed_s:.0f} s after start {number} of the autopilot"
+    since = f"{stages.armed_s:.0f} s after" if stages.armed_s < 1e8 else "in"  # A simulated PX4 counts from 1970
+    begun = f"{since} start {number} of the autopilot"
+    start = f"{when}: {f'armed {begun}' if stages.is_arming_logged else f'no arming in the log, which begins {begun}'}"
+    after = "arming" if stages.is_arming_logged else "that"
     told = [
         f"{what} {at_s - stages.armed_s:.0f} s"
         for what, at_s in (
@@ -300,7 +303,7 @@ def _flight_lines(number: int, found: Flight) -> list[str]:
         )
         if at_s is not None
     ]  # fmt: skip
-    lines = [start, f"  after arming: {', '.join(told) or 'nothing more is logged'}"]
+    lines = [start, f"  after {after}: {', '.join(told) or 'nothing more is logged'}"]
     if found.reference == "truth":
         lines.append("  measured from the simulator's truth, not from the EKF")
     lines += [f"  note: {note}" for note in found.notes]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from companion.storage.profiles import SavedProfile
 
 SHORT_S: Final = 1200
+LEAST_S: Final = 600  # A profile of less fails its own test too often
 _UNITS: Final[dict[Triad, tuple[float, str, int]]] = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
@@ -35,6 +36,7 @@ def add_commands(add: AddCommand) -> None:
     words = "to compare with, and for what the recordings do not tell (default: as used)"
     sub.add_argument("--profile", metavar="PART", help=words)
     sub.add_argument("--skip", type=seconds, default=0.0, metavar="S", help="leave out so much at each beginning")
+    sub.add_argument("--short", action="store_true", help="accept less than 10 min at rest, from 1 min on")
     sub.add_argument("--save", metavar="NAME", help='keep it: profile = "NAME" in [[imu]] then takes it')
     sub.add_argument("--storage", type=Path, metavar="DIR", help="where to (default: as in the configuration)")
 
@@ -59,7 +61,9 @@ async def profile(options: argparse.Namespace) -> int:
     results, refused = [], []
     for imu in names if options.imu is None else [options.imu]:
         try:
-            results.append(_learn(imu, [log for log in logs if log.imu == imu], compared, options.skip))
+            results.append(
+                _learn(imu, [log for log in logs if log.imu == imu], compared, options.skip, short=options.short)
+            )
         except CalibrationRefusedError as error:
             refused.append(f"imu {imu}: {error}")
     for words in refused:
@@ -84,7 +88,7 @@ async def profile(options: argparse.Namespace) -> int:
 
 
 def _learn(
-    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float
+    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, *, short: bool
 ) -> tuple[SavedProfile, list[str], Object]:
     """Estimate the noise of one IMU; return the profile to save, lines for people, and JSON.
 
@@ -110,6 +114,10 @@ def _learn(
         in_the_way = f" (in the way: {obstacle})" if obstacle else ""
         raise CalibrationRefusedError(f"{error}{in_the_way}") from None
     still_s = [sum(seconds_at_rest(part) for part, _, _ in parts) for parts in found]
+    if sum(still_s) < LEAST_S and not short:
+        raise CalibrationRefusedError(
+            f"only {sum(still_s)} s at rest; a profile needs {LEAST_S} s, better an hour (--short accepts less)"
+        )
     seconds = [sum(number for _, number, _ in parts) for parts in found]
     notes = []
     if kept:

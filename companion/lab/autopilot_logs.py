@@ -31,7 +31,7 @@ DATAFLASH_MAGIC: Final = b"\xa3\x95\x80"
 ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
 _HEAD: Final = DATAFLASH_MAGIC[:2]
 _FMT: Final = np.dtype([("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")])
-_CLOCK: Final = "TimeUS"
+_CLOCKS: Final = {"TimeUS": 1e-6, "TimeMS": 1e-3}  # Unit in s; the latter in logs before 2016
 _PARAMETER: Final = "PARM"
 _MOST_PARAMETERS: Final = 1 << 16
 _INSTANCES: Final = 16  # Most instances; a larger number is a damaged byte
@@ -114,7 +114,8 @@ class _Kind:
         key, wanted = fields[self.name]
         there = messages.dtype.names or ()
         rows = np.full((len(messages), 1 + len(wanted)), np.nan)
-        rows[:, 0] = messages[_CLOCK] * US
+        clock = next(name for name in _CLOCKS if name in there)
+        rows[:, 0] = messages[clock] * _CLOCKS[clock]
         with np.errstate(invalid="ignore"):  # damaged
             for k, name in enumerate(wanted, 1):
                 if name in there:
@@ -188,8 +189,8 @@ def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
         return head, kind
     key, wanted = fields[name]
     types = {label: layout[label].kind for label in layout.names or ()}
-    good = layout.itemsize + len(head) == length and _CLOCK in types
-    good = good and "S" not in {types.get(label) for label in (_CLOCK, *wanted)}
+    good = layout.itemsize + len(head) == length and not types.keys().isdisjoint(_CLOCKS)
+    good = good and "S" not in {types.get(label) for label in (*_CLOCKS, *wanted)}
     if good and types.get(key, "u") in ("S" if name == _PARAMETER else "iu"):
         kind.layout = layout
     return head, kind

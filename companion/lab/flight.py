@@ -124,7 +124,8 @@ def _on_earth(boot: Boot, reference: Navigation) -> Navigation:
 
 def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
     """List the stages of each arming; without a logged arming, the whole log is one flight."""
-    armed = [at_s for at_s, state in boot.armed if state] or [float(reference.t_s[0])]
+    logged = [at_s for at_s, state in boot.armed if state]
+    armed = logged or [float(reference.t_s[0])]
     found = []
     for k, armed_s in enumerate(armed):
         next_s = armed[k + 1] if k + 1 < len(armed) else math.inf
@@ -136,7 +137,7 @@ def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
         down_s = next((at_s for at_s, state in reversed(air) if not state), None) if up_s is not None else None
         if up_s is None:
             up_s, down_s = _lifted(reference, armed_s, end_s)
-        found.append(Stages(armed_s, motors_s, up_s, down_s, disarmed_s))
+        found.append(Stages(armed_s, motors_s, up_s, down_s, disarmed_s, bool(logged)))
     return found
 
 

@@ -24,6 +24,7 @@ STEP_S: Final = 0.02
 GAP_S: Final = 0.25
 """Longest gap in the readings within a stretch of free navigation."""
 _LARGEST: Final = 1e6
+_LAST_S: Final = 1e11  # In microseconds still exact; a simulated PX4 counts from 1970
 _LAG_SPAN_S: Final = 0.3
 _MOST_LAG_S: Final = 0.1
 _OUTLIER: Final = 50.0
@@ -50,7 +51,9 @@ class Navigation(NamedTuple):
 
 
 def whole(rows: Floats) -> Floats:
-    return np.asarray(rows[(np.abs(rows) < _LARGEST).all(axis=1)])
+    """Select rows of a time in s, which may count from 1970, and values, that hold numbers of a believable size."""
+    sizes = np.abs(rows)
+    return np.asarray(rows[(sizes[:, 0] < _LAST_S) & (sizes[:, 1:] < _LARGEST).all(axis=1)])
 
 
 def joined(attitude: Floats, moving: Floats) -> Navigation | None:

@@ -45,6 +45,7 @@ HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
 """Allowed median specific force of a log at rest; outside, a unit or a column has a wrong name."""
 
+PASSED_OVER: Final = ("-", "_")  # Names in --columns of a column that is not read
 _SEPARATORS: Final = (";", "\t", ",", " ")
 _LONGEST: Final = 1 << 14
 _NUMBERS: Final = 1e20
@@ -107,12 +108,12 @@ def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = Non
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             names, where, lines = _header(path, file, columns)
             used = columns_of(names, where, timed=rate_hz is None)
-            table, numbers = _numbers(path, lines, names, used)
+            table, numbers = _numbers(path, lines, names, used, more=columns is not None)
     except OSError as error:
         raise unreadable(path, error) from None
     if rate_hz is not None:
         table[:, 0] = np.arange(len(table)) / rate_hz
-    passed = [each for each in names if each not in COLUMNS and each != "-"]
+    passed = [each for each in names if each not in COLUMNS and each not in PASSED_OVER]
     left_out: dict[str, int] = {}
 
     def keep(good: NDArray[np.bool_], why: str) -> None:
@@ -225,13 +226,16 @@ def _is_number(text: str) -> bool:
 
 
 def _numbers(
-    path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, str]
+    path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, str], *, more: bool
 ) -> tuple[Floats, Floats]:
-    """Read time, readings and temperature (n, 8), NaN if missing, and the number of each line."""
+    """Read time, readings and temperature (n, 8), NaN if missing, and the number of each line.
+
+    `more`: lines may have more fields than `names`.
+    """
     places, width = [names.index(name) for name in used.values()], len(names)
     flat, numbers = array("d"), array("d")
     for number, fields in lines:
-        if len(fields) < width or any(field.strip() for field in fields[width:]):
+        if len(fields) < width or (not more and any(field.strip() for field in fields[width:])):
             raise StorageError(
                 f"{path}, line {number}: found {len(fields)} fields; allowed: {width}, as many as columns"
             )

@@ -96,7 +96,7 @@ class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
     kind: Kind
     gradienter: GradienterSettings
     offset_deg: Pair
-    """Zero of the gradienter on top of `gradienter.offset_deg`."""
+    """Measured zero of the gradienter, x and y; it adds to the configured `gradienter.offset_deg`."""
     sigma_deg: float
     covariance_deg2: tuple[Pair, Pair]
     temperature_degc: float | None
@@ -176,7 +176,7 @@ class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Tilt of the board against the base: its attitude (roll right side down) on a level base.
 
-    The accelerometers of `imu` measured it; their bias and scale are known from all sides.
+    The accelerometers of `imu` measured it; a six-position calibration has measured their bias and scale.
     """
 
     imu: str

@@ -63,6 +63,7 @@ class Stages(msgspec.Struct, frozen=True):
     take_off_s: float | None
     landing_s: float | None
     disarmed_s: float | None
+    is_arming_logged: bool = True  # Else `armed_s` is the beginning of the log
 
 
 class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):

@@ -68,6 +68,26 @@ def record(values: dict[str, float], before: dict[str, float]) -> Record:
     )  # fmt: skip
 
 
+def test_a_log_without_an_arming_says_so(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [each for each in messages(flown, parameters()) if each[0] not in {"ARM", "EV"}]
+    assert companion(["flight", str(dataflash(tmp_path / "1.BIN", rows)), *storage(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "armed" not in said.splitlines()[0]
+    assert "no arming in the log, which begins 0 s after start 1 of the autopilot" in said
+
+
+def test_a_log_of_before_2016_counts_in_milliseconds(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [(name, (us // 1000, *rest)) for name, (us, *rest) in messages(flown, parameters())]
+    path = dataflash(tmp_path / "1.BIN", rows)
+    path.write_bytes(path.read_bytes().replace(b"TimeUS", b"TimeMS"))
+    code, answer = said(capsys, path, *storage(tmp_path))
+    assert code == 0
+    (flight,) = answer["flights"]
+    assert (flight["stages"]["armed_s"], flight["stages"]["disarmed_s"]) == (64.0, 242.0)
+
+
 def test_a_flight_is_told_with_what_its_calibration_was_worth(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,7 +105,7 @@ def test_a_flight_is_told_with_what_its_calibration_was_worth(
     (flight,) = answer["flights"]
     assert flight["stages"] == {
         "armed_s": 64.0, "motors_s": pytest.approx(65.0, abs=0.3), "take_off_s": 67.0, "landing_s": 240.0,
-        "disarmed_s": 242.0,
+        "disarmed_s": 242.0, "is_arming_logged": True,
     }  # fmt: skip
     assert flight["began_at"] == "2026-10-11T00:00:46+00:00"
     assert flight["reference"] == "ekf"
@@ -164,23 +184,26 @@ def column(states: Any) -> Floats:
     return np.asarray(states, dtype=np.float64)[:, None]
 
 
-def of_px4(flown: Flown, path: Path) -> Path:
+def of_px4(flown: Flown, path: Path, began_s: float = 0.0) -> Path:
     at, slow = flown.at_s, flown.at_s[::25]
     place = np.tile([LATITUDE_DEG, HEIGHT_M], (len(at), 1))
     spun = ((slow >= flown.motors_s) & (slow < flown.disarmed_s))[:, None]
     bias = [*(each * DEG_H for each in GYRO_DEG_H), *[1e-10] * 3, *(each * MG for each in ACCEL_MG), *[1e-6] * 3]
-    return write_ulog(
-        path,
-        {
-            ("sensor_combined", 0): (flown.t_s, flown.readings),
-            ("vehicle_attitude", 0): (at, flown.quaternions),
-            ("vehicle_local_position", 0): (at, np.hstack([flown.velocity, flown.position, place])),
-            ("actuator_armed", 0): (slow, column((slow >= 64.0) & (slow < 242.0))),
-            ("vehicle_land_detected", 0): (slow, column((slow < 67.0) | (slow >= 240.0))),
-            ("actuator_motors", 0): (slow, 0.5 * np.hstack([np.tile(spun, (1, 4)), np.full((len(slow), 8), np.nan)])),
-            ("estimator_sensor_bias", 0): (slow, np.tile([0.0, *bias], (len(slow), 1))),
-        },
-    )
+    topics = {
+        ("sensor_combined", 0): (flown.t_s, flown.readings),
+        ("vehicle_attitude", 0): (at, flown.quaternions),
+        ("vehicle_local_position", 0): (at, np.hstack([flown.velocity, flown.position, place])),
+        ("actuator_armed", 0): (slow, column((slow >= 64.0) & (slow < 242.0))),
+        ("vehicle_land_detected", 0): (slow, column((slow < 67.0) | (slow >= 240.0))),
+        ("actuator_motors", 0): (slow, 0.5 * np.hstack([np.tile(spun, (1, 4)), np.full((len(slow), 8), np.nan)])),
+        ("estimator_sensor_bias", 0): (slow, np.tile([0.0, *bias], (len(slow), 1))),
+    }
+    return write_ulog(path, {name: (at_s + began_s, rows) for name, (at_s, rows) in topics.items()})
+
+
+def test_a_simulated_px4_counts_from_1970(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert companion(["flight", str(of_px4(flown, tmp_path / "log.ulg", 1.7e9)), *storage(tmp_path)]) == 0
+    assert ": armed in start 1 of the autopilot\n" in capsys.readouterr().out
 
 
 def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

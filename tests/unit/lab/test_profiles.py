@@ -184,16 +184,17 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
         (None, [], 1, "No such file"),
         (None, ["--save", "bmi088"], 1, "found a name of the catalogue"),
         (None, ["--profile", "bmi08"], 2, "did you mean 'bmi088'?"),
-        ("short", [], 1, "imu imu: only 28 s at rest; a profile needs 60 s"),
-        ("short", ["--imu", "fc"], 1, "imu fc: only 28 s at rest"),
+        ("short", ["--short"], 1, "imu imu: only 28 s at rest; a profile needs 60 s"),
+        ("short", ["--short", "--imu", "fc"], 1, "imu fc: only 28 s at rest"),
+        ("minutes", [], 1, "imu imu: only 118 s at rest; a profile needs 600 s, better an hour (--short accepts less)"),
     ],
 )
 def test_every_mistake_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, more: list[str], code: int, words: str
 ) -> None:
     path = tmp_path / "a.csv"
-    if text == "short":
-        write_csv(path, *adis16405(30, 20, 1))
+    if text in {"short", "minutes"}:
+        write_csv(path, *adis16405(30 if text == "short" else 120, 20, 1))
     elif text is not None:
         path.write_text(text, encoding="utf-8")
     assert companion(["profile", str(path), *more]) == code

@@ -97,7 +97,7 @@ def spreadsheet(data: Floats) -> str:
 SHEET = "t_us,gx_deg_s,gy_deg_s,gz_deg_s,ax_mg,ay_mg,az_mg,temperature_degc,-"
 KINDS: dict[str, tuple[Callable[[Floats], str], str]] = {
     "phyphox": (phyphox, "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2,-"),
-    "xsens": (xsens, "-,t_ms,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,-,-,-"),
+    "xsens": (xsens, "_,t_ms,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s"),
     "serial": (serial, "t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g,temperature_degc"),
     "spreadsheet": (spreadsheet, SHEET),
 }
