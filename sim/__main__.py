@@ -11,6 +11,7 @@ MODULES: Final = {
     "demo": "sim.demo",
     "fleet": "sim.fleet.demo",
     "accuracy": "sim.accuracy.cli",
+    "recordings": "sim.accuracy.recordings",
     "rest": "sim.rest",
     "fly": "sim.flying.cli",
 }

@@ -8,7 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,7 +28,8 @@ from companion.estimation.solution.site import Remedies, Whereabouts, local_eart
 from companion.estimation.solution.solve import Solution, solve
 from companion.formats import Object
 from companion.lab.still_log import StillLog
-from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
+from companion.physics import earth
+from companion.physics.frames import Floats, body_from_ned, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import DEG
 from companion.samples import ImuSample, Vector
 
@@ -221,50 +222,90 @@ def _posed(window: Window, given: Given) -> Window:
 # --- windows
 
 
-def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
-    """Check sigma on a sensor: calibrate every window of `length_s` seconds independently, as after a start.
+class WindowResult(NamedTuple):
+    """One window, samples `start` to `end` of its log, calibrated by itself.
 
-    The result of a window is compared with those of the windows after it: in 95 of 100 cases they should agree within
-    2 sigma. The pose is equal in both and cancels: it counts as known, so that sigma is that of the sensor. Windows are
-    not compared across a move of the sensor.
+    `biases` are bias, sigma_stat and sigma_use, (3, 6); None: refused, for the reason `why`. `by_pose` (6,) is what
+    a sensor without bias reads in this pose: the same in all windows between two moves.
+    """
 
-    Returns:
-        Number of windows; number of failed ones by reason (figures in the reason are ignored), the commonest first;
-        comparisons by axis, empty if no two consecutive windows gave a result.
+    start: int
+    end: int
+    biases: Floats | None
+    why: str
+    by_pose: Floats
+    moved: bool  # The sensor lies otherwise than in the window before
+
+
+def calibrated(log: StillLog, given: Given, length_s: float) -> Iterator[WindowResult]:
+    """Calibrate every window of a length in seconds by itself, as after a start.
+
+    The pose that is not given is the mean's own, and exact: sigma is the sensor's alone.
+
+    Raises:
+        StorageError: more than `MOST_WINDOWS`.
     """
     posed, force = given, np.zeros(3)
-    found: list[Floats | None] = []  # Bias, sigma_stat and sigma_use of each window, (3, 6); None: no result
-    whys: list[str] = []
     begin_s = float(log.t_s[0])
     starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
     count = math.floor((float(log.t_s[-1]) - begin_s) / length_s + 1e-6)
     if count > MOST_WINDOWS:
         raise StorageError(f"{log.files[0]}: {count} windows from its first to its last time; allowed: {MOST_WINDOWS}")
     edges = np.searchsorted(log.t_s, begin_s + length_s * np.arange(count + 1))
+    by_pose = np.zeros(6)
     for start, end in itertools.pairwise(edges.tolist()):
         if end - start < 2:
-            found.append(None)
-            whys.append("no samples")
+            yield WindowResult(start, end, None, "no samples", by_pose, moved=False)
             continue
         part = msgspec.structs.replace(
             log, t_s=log.t_s[start:end], readings=log.readings[start:end],
             temperature_degc=log.temperature_degc[start:end],
         )  # fmt: skip
         here = part.readings[:, 3:].mean(axis=0)
-        if not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0:
+        moved = not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0
+        if moved:
             posed, force = _posed_by(here, given), here
-            found.append(None)
+            by_pose = _without_bias(posed)
         # The time since power-on bounds the warm-up that is still to come.
         at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
         powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered if at == 0 else 0.0)
         record, _ = estimate(part, msgspec.structs.replace(posed, powered=powered_s), max_still_s=length_s)
         imu = record.imus[0] if record.imus else None
-        one = None if imu is None else _figures(imu)
-        found.append(one)
-        if one is None:
-            whys.append(record.reason if imu is None else "; ".join(imu.warnings))
+        biases = None if imu is None else _figures(imu)
+        why = "" if biases is not None else record.reason if imu is None else "; ".join(imu.warnings)
+        yield WindowResult(start, end, biases, why, by_pose, moved)
+
+
+def _without_bias(given: Given) -> Floats:
+    """Return the reading (6,), vehicle axes, of a sensor without bias in a pose and at a place that are given."""
+    roll, pitch, heading = ((angle or 0.0) * DEG for angle in (given.roll_deg, given.pitch_deg, given.heading_deg))
+    turn = body_from_ned(roll, pitch, heading)
+    latitude_deg, height_m = given.latitude_deg or 0.0, given.height_m or 0.0
+    force = turn @ (0.0, 0.0, -earth.gravity_m_s2(latitude_deg, height_m))
+    return np.concatenate([turn @ earth.earth_rate_ned_rad_s(latitude_deg), force])
+
+
+def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
+    """Check sigma on a sensor: compare the result of each window with those of the windows after it.
+
+    In 95 of 100 cases they should agree within 2 sigma. The pose cancels. Windows are not compared across a move.
+
+    Returns:
+        Number of windows; number of failed ones by reason, whatever its figures, the commonest first; comparisons by
+        axis, none where no two windows in a row gave a result.
+    """
+    results = list(calibrated(log, given, length_s))
+    found = [each for one in results for each in ([None] if one.moved else []) + [one.biases]]
+    whys = Counter(uncounted(one.why) for one in results if one.biases is None)
     spans = sorted({1, math.ceil(HORIZON_S / length_s)})
-    return count, _counted(whys), [each for span in spans for each in _kept(found, span, span * length_s)]
+    first = {uncounted(one.why): one.why for one in reversed(results)}
+    refused = {first[kind]: count for kind, count in whys.most_common()}
+    return len(results), refused, [each for span in spans for each in _kept(found, span, span * length_s)]
+
+
+def uncounted(why: str) -> str:
+    """Return a reason without its figures, for counting."""
+    return re.sub(r"\d+(\.\d+)?", "…", why)
 
 
 def _posed_by(force: Floats, given: Given) -> Given:
@@ -287,12 +328,6 @@ def _figures(imu: ImuRecord) -> Floats | None:
     gyro = (imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s)
     accel = (imu.accel_bias_m_s2, imu.accel_sigma_stat_m_s2, imu.accel_sigma_use_m_s2)
     return None if None in gyro or None in accel else np.hstack([np.array(gyro), np.array(accel)])
-
-
-def _counted(whys: Sequence[str]) -> dict[str, int]:
-    kinds = Counter(re.sub(r"\d+(\.\d+)?", "", why) for why in whys)
-    first = {re.sub(r"\d+(\.\d+)?", "", why): why for why in reversed(whys)}
-    return {first[kind]: count for kind, count in kinds.most_common()}
 
 
 def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[Object]:

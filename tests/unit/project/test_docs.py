@@ -108,10 +108,11 @@ def understood(command: str) -> str:
 def sim_parser(words: list[str]) -> argparse.ArgumentParser:
     """Parser of `python -m sim`, chosen as in sim/__main__.py."""
     from sim import rest, serve
+    from sim.accuracy import recordings
     from sim.flying import cli as flying
     from sim.sitl import cli as firmware
 
-    for name, own in (("rest", rest.parser), ("fly", flying.parser)):
+    for name, own in (("rest", rest.parser), ("fly", flying.parser), ("recordings", recordings.parser)):
         if words[:1] == [name]:
             made = argparse.ArgumentParser()
             made.add_subparsers().add_parser(name, parents=[own()], add_help=False)
