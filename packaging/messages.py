@@ -29,7 +29,7 @@ def page() -> str:
 
 def _row(entry: Entry) -> str:
     # `companion explain` knows all patterns.
-    shown = ", ".join(f"`{pattern}`" for pattern in (entry.patterns[:1] if entry.text else entry.also[:3]))
+    shown = ", ".join(f"`{pattern}`" for pattern in (entry.patterns[:1] if entry.text else entry.also[:2]))
     words = " ".join(part for part in (entry.cause, entry.remedy) if part)
     return f"\n{f'[{shown}]({entry.see})' if entry.see else shown}: {words}\n"
 

@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from companion.component.service import Refusal
 from companion.estimation.machine import What
+from companion.storage.records import RecordStore
 from companion.storage.state import write_atomically
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario
@@ -33,7 +34,7 @@ from tests.support.virtual_time import run_virtual
 
 LIMIT_MS: Final = 50.0
 _SOLVE: Final = "Estimator.solve.<locals>.<lambda>"
-_KEEP: Final = "RecordStore.save"
+_KEEP: Final = RecordStore.save.__qualname__
 SETTINGS: Final = """
 [push]
 parameters = false

@@ -91,7 +91,7 @@ class ArmingScript:
     """Sends the verdict to ArduPilot's arming script (companion/lua/companion_arming.lua) twice a second.
 
     The component's loop sends the verdict; the script closes the gate after 3 s without one, so a hanging loop closes
-    it too. The message is TUNNEL: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the
+    it too. The message is TUNNEL: unlike PARAM_SET it does not wear the flash; unlike NAMED_VALUE_FLOAT it goes to the
     autopilot alone, and it has room for the reason as text. Payload: "CMPA", version 1, verdict (0 wait, 1 accept,
     2 refuse, 3 the gate is off), then the reason, ASCII.
     """

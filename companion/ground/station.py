@@ -127,7 +127,7 @@ class Station:
         """Start a calibration and follow it to its end.
 
         Raises:
-            NobodyHeardError: the companion sends heartbeats but does not answer.
+            NobodyHeardError: no answer to the request, although the companion sends heartbeats.
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()

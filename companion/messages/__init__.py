@@ -44,6 +44,7 @@ NO_MATCH: Final = "Type the line from the screen, or find the topic in docs/inde
 _CERTAIN_LETTERS: Final = 8  # Fewest letters of a pattern that identify a message in a longer line
 _SIMILAR: Final = 0.8  # Least ratio of `difflib` at which a word counts as misspelt
 _LEAST_SCORE: Final = 0.4  # Least share of the searched words' weight that an entry must contain
+_NAMED: Final = 0.1  # Bonus of an entry that names one of the words as its own
 _WORD: Final = re.compile(r"[a-z][a-z_]+")
 
 
@@ -103,7 +104,10 @@ def search(words: str, most: int = 3) -> list[tuple[str, Entry]]:
     weights = _weights()
     wanted = {_known(word, weights) for word in _words(words)}
     whole = sum(weights.get(word, 1.0) for word in wanted) or math.inf
-    scores = {name: sum(weights[word] for word in wanted & has) / whole for name, has in index.items()}
+    scores = {
+        name: sum(weights[word] for word in wanted & has) / whole + _NAMED * bool(wanted & {*catalogue()[name].words})
+        for name, has in index.items()
+    }
     best = sorted((name for name, score in scores.items() if score >= _LEAST_SCORE), key=lambda name: -scores[name])
     names = dict.fromkeys([*([exact[0]] if exact else []), *best])
     return [(name, catalogue()[name]) for name in list(names)[:most]]

@@ -63,7 +63,7 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_deg": 1,
     "inclination_expected_deg": 1,
 }
-"""Decimals of figures that reveal the location, gravity and magnetic field included: they leave about a kilometre."""
+"""Decimals of published figures that reveal the location, gravity and field included: it is known to about 1 km."""
 _WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "effective": None}
 """Substitutes for figures whose digits reveal the gravity and the latitude from which they were computed."""
 _EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")

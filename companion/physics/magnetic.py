@@ -15,7 +15,7 @@ from companion.physics.frames import Array
 from companion.physics.units import DEG
 
 BOUND_OF_TWO: Final = 3.043
-"""95 % bound of an unknown third component over the length of the two known ones, if all three have one unknown sigma:
+"""95 % bound of an unknown third component, divided by the length of the two known ones, if all have the same sigma:
 Student's t with two degrees of freedom, 4.303 / sqrt(2). A direction uniform on the sphere gives the same value,
 0.95 / sqrt(1 - 0.95^2)."""
 BOUND_OF_ONE: Final = 12.71

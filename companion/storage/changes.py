@@ -80,7 +80,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         unforeseen: Mapping[str, float] | None = None,
         origin: Origin | None = None,
     ) -> ChangeSet:
-        """Make the set before the first change; `unforeseen`: old values that the firmware will overwrite.
+        """Make the set before the first change is written; `unforeseen`: old values that the firmware overwrites.
 
         A set for an unknown vehicle (system id 0) cannot be saved.
         """

@@ -43,7 +43,7 @@ ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 MAX_VIEWERS: Final = 16
 MAX_STRANGERS: Final = 4
-"""Most viewers without the token from one address; no limit if only the board itself can connect."""
+"""Maximum number of viewers without the token from one address; no limit if only the board itself can connect."""
 MAX_BEHIND: Final = 20
 """Most unread events of a viewer, ten seconds of them; a viewer further behind is disconnected, and reconnects."""
 AGAIN_S: Final = 0.5  # Pause before the next request after a failed one for the status

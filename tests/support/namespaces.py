@@ -6,6 +6,7 @@ import functools
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Final
 
@@ -38,9 +39,11 @@ def run_again_with_mounts(test: pytest.Item) -> None:
     if why is not None or _AGAIN in os.environ:
         pytest.skip(why or "no namespaces for a mount: not allowed in them either")
     command = [*OWN_SHARED_MEMORY, sys.executable, "-m", "pytest", "-q", test.nodeid]
-    done = subprocess.run(
-        command, cwd=Path(__file__).parents[2], env={**os.environ, _AGAIN: "1"}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
+    # In there the user is root, and root's own folder of earlier tests may belong to the real one.
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(
+            command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False,
+            env={**os.environ, _AGAIN: "1", "PYTEST_DEBUG_TEMPROOT": folder},
+        )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "1 passed" in done.stdout

@@ -248,7 +248,7 @@ def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Ve
 def changes_for(
     calibration: ImuCalibration, gyro_residual_rad_s: Vector | None, accel_residual_m_s2: Vector | None
 ) -> list[Change]:
-    """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None: keep that triad's.
+    """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None keeps a triad's own.
 
     Raises:
         CalibrationRefusedError: a value beyond the limits at the top of this file.

@@ -156,7 +156,7 @@ class PX4(Firmware):
         )
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
-        """Return the tilt that EKF2 keeps, as it learns a step of level or accelerometers very slowly."""
+        """Return the tilt error that remains in EKF2, which learns a step of level or accelerometers very slowly."""
         turned_deg = math.hypot(*(change.after - change.before for change in changes if change.parameter in LEVEL))
         step: dict[str, float] = {}
         for change in changes:

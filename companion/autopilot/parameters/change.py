@@ -107,8 +107,8 @@ FailureKind = Literal[
 
 
 POLL_S: Final = 1.1
-"""Time after which every module of PX4 has read a new value: they read at most once a second (autopilots 9.2). After
-twice that without a write, each reads the next value at once."""
+"""Time after which every module of PX4 has read a new value: they read at most once a second (autopilots 9.2). If
+nothing was written for twice this time, each module reads the next value at once."""
 
 _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
 
@@ -117,8 +117,8 @@ _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
 class Change:
     """Old and new value of one parameter, rounded to float32.
 
-    `via` is a far value for firmware that would ignore a small change of the vector: it is written first, and once the
-    firmware uses it, the new values of the vector. A restore uses the far value too.
+    `via` is a far value, for firmware that ignores a small change of a vector of parameters. The far value is written
+    first; once the firmware uses it, the new value follows. A restore goes through the far value too.
     """
 
     parameter: str

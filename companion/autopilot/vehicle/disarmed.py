@@ -42,7 +42,7 @@ _REMEMBERED: Final = 8  # number of questions, and of answer times, that are rem
 
 
 class DisarmedProof:
-    """Judges answers to our questions. Pure logic: numbers and times are arguments."""
+    """Decides from the autopilot's answers whether it is disarmed. Pure logic: numbers and times are arguments."""
 
     def __init__(self) -> None:
         self._asked_s: dict[int, float] = {}

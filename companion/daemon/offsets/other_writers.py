@@ -131,7 +131,7 @@ class Rivalry:
         self._imus, self._say = imus, core.say
         self.stop_rivals = core.config.push.stop_rivals  # True: the next write switches rivals off
         self._told: set[str] = set()
-        """Rivals reported to the ground stations since they were switched on; the status always lists all."""
+        """Rivals that were reported to the ground stations since the rivals were switched on; the status lists all."""
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 

@@ -161,10 +161,10 @@ class Offsets(Subsystem):
                 left = [change.parameter for change in made]
                 note({}, left)
         if left:
-            return message("write_not_rolled_back", reason=reason, parameters=", ".join(left), outlook=outlook)
+            return f"{message('old_values_not_back', reason=reason, parameters=', '.join(left))}: {outlook}"
         with contextlib.suppress(StorageError):
             await self.ledger.undone()
-        return message("write_rolled_back", reason=reason)
+        return message("old_values_back", reason=reason)
 
     async def _wait_disarmed(self) -> None:
         await self._heartbeat(DISARMED_WITHIN_S)

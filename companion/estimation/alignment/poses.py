@@ -50,7 +50,7 @@ class AlignmentRequest(NamedTuple):
 
     @property
     def on_spot(self) -> int:
-        """Number of stands on the one spot; a "turn", or two headings, ends with a check on the first marks."""
+        """Number of stands on the marked spot; a "turn", or two headings, has one more at the end, as a check."""
         if self.headings == 2 and self.action != "tilts":
             return 3
         return HEADINGS + (self.action == "turn")

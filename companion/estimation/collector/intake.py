@@ -198,9 +198,9 @@ class Source:
         return next(reversed(self.batches.batches.values()), None)
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
-        """Return whether this source was still in a second; `moved`: the IMUs saw a movement in it.
+        """Return True if this source did not move during one second; `moved`: the IMUs saw a movement in it.
 
-        `may_move`: only a fault of the source counts, not a movement.
+        `may_move`: a movement is allowed, and only a fault of the source counts.
         """
         batches = self.batches.batches
         batch = next((batches[at] for at in range(slot, slot - self.carry - 1, -1) if at in batches), None)

@@ -42,7 +42,7 @@ _SPREAD: Final = 1.5
 """Standard deviation, in steps, beyond which swaying spreads integers enough to hide no bias."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
-"""Sigma of the comparison with the gradienter; `solve` adds the error of its zero, which is common to all IMUs."""
+"""Smallest sigma of the accelerometers, from comparing them with the gradienter; `solve` adds that of its zero."""
 _MIDDLE: Final = 0.37  # Share of K^2 T
 _FLICKER_TO_COME: Final = 0.75
 """Share of B^2 for the flicker of the next minutes, which its past does not predict. Added to the flicker within the

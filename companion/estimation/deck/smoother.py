@@ -108,7 +108,7 @@ class _Stretch:
 
 
 def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
-    """Estimate biases and attitudes from at least ten consecutive passages without a gap.
+    """Estimate biases and attitudes from at least ten consecutive passages (seconds of data) without a gap.
 
     `headings_rad` (n,): compass heading in the middle of each passage, NaN if missing. `compass_forward` (3,): forward
     axis of the compass in the vehicle's axes.

@@ -74,7 +74,7 @@ class PoseEffect:
         return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """Make the record entry; `up` (3,): attitude of the calibration; `sigma_use_m_s2` (3,): at that attitude."""
+        """Make the record of sigma at other attitudes; `up` and `sigma_use_m_s2` (3,) are those of the calibration."""
         here = np.square(sigma_use_m_s2)
         scale = np.sqrt(np.diag(np.square(self.mean) + np.square(self.sigma)))
         return Effective(

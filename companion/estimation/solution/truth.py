@@ -37,7 +37,7 @@ UNKNOWN_K: Final = 5.0  # Assumed change of an unknown temperature
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
-"""Largest error of the length of gravity, in sigmas; beyond it, the figures from all sides are outdated."""
+"""Largest error of the measured length of gravity, in sigmas; beyond, the six-position calibration is outdated."""
 
 
 class OwnHeading(msgspec.Struct, frozen=True):

@@ -9,7 +9,7 @@ its own components. Sources: PNI TCM3/TCM5 manual r12 p. 33-43, TCM manual r06 p
 
 Floats are big-endian by default (kBigEndian, TRAX p. 42), but the device can save the other order. A little-endian
 heading, read as big-endian, may be a small number that looks valid. So both orders are tried on all floats of a frame:
-a frame that is valid in one order only decides, and two such frames in a row are needed to change the order.
+only a frame that is valid in exactly one order decides, and two such frames in a row change the order.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
 AHEAD_S = 0.5
-"""Largest lead of a stream over its line time; a faster stream has no real baud rate (USB without a UART)."""
+"""Seconds by which bytes may come earlier than the baud rate permits; earlier ones have none (USB without a UART)."""
 _STALL_S = 10.0
 
 NO_FRAME: Final = 0

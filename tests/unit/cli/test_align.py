@@ -47,12 +47,14 @@ def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypat
     assert cli.main(["-c", str(file), "align", "zero", "--json"]) == 3
     told = capsys.readouterr()
     assert json.loads(told.out)["state"] == "unreachable"
-    assert told.err.endswith(f"(no such socket); start it with: companion -c '{file}' run\n")
+    line, remedy = told.err.splitlines()
+    assert line.endswith(f"(no such socket); start it with: companion -c '{file}' run")
+    assert remedy.startswith("-> Start the companion as the line says.")
     monkeypatch.setattr(config, "DEFAULT_PATH", file)
     for serves, start in ((False, "companion run"), (True, "sudo systemctl start companion")):
         monkeypatch.setattr("companion.installation.install.is_service", lambda serves=serves: serves)
         assert cli.main(["status"]) == 3
-        assert capsys.readouterr().err.endswith(f"; start it with: {start}\n")
+        assert capsys.readouterr().err.splitlines()[0].endswith(f"; start it with: {start}")
 
 
 def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:

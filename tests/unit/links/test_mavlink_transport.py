@@ -285,7 +285,7 @@ class TestUdpOut:
         async def main() -> None:
             link = MavlinkLink()
             async with transport(link, f"udpout:127.0.0.1:{peer.getsockname()[1]}") as states:
-                await until(lambda: link.connected)
+                await until(lambda: bool(states.all))
                 before = states.port
                 speakers[0].error_received(OSError(101, "Network is unreachable"))
                 await until(lambda: len(states.all) == 3)
