@@ -225,8 +225,8 @@ def _posed(window: Window, given: Given) -> Window:
 class WindowResult(NamedTuple):
     """One window, samples `start` to `end` of its log, calibrated by itself.
 
-    `biases` are bias, sigma_stat and sigma_use, (3, 6); None: refused, for the reason `why`. `by_pose` (6,) is what
-    a sensor without bias reads in this pose: the same in all windows between two moves.
+    `biases` are bias, sigma_stat and sigma_use, (3, 6); None: refused, for the reason `why`. `by_pose` (6,) is the
+    reading of a bias-free sensor in this pose, constant between two moves.
     """
 
     start: int
@@ -234,13 +234,13 @@ class WindowResult(NamedTuple):
     biases: Floats | None
     why: str
     by_pose: Floats
-    moved: bool  # The sensor lies otherwise than in the window before
+    moved: bool  # The attitude differs from that of the previous window
 
 
 def calibrated(log: StillLog, given: Given, length_s: float) -> Iterator[WindowResult]:
-    """Calibrate every window of a length in seconds by itself, as after a start.
+    """Calibrate every window of `length_s` seconds independently, as after a start.
 
-    The pose that is not given is the mean's own, and exact: sigma is the sensor's alone.
+    A pose that is not given comes from the window's mean and counts as exact, so sigma is that of the sensor.
 
     Raises:
         StorageError: more than `MOST_WINDOWS`.
@@ -277,7 +277,7 @@ def calibrated(log: StillLog, given: Given, length_s: float) -> Iterator[WindowR
 
 
 def _without_bias(given: Given) -> Floats:
-    """Return the reading (6,), vehicle axes, of a sensor without bias in a pose and at a place that are given."""
+    """Return the reading (6,), in vehicle axes, of a bias-free sensor at the given pose and place."""
     roll, pitch, heading = ((angle or 0.0) * DEG for angle in (given.roll_deg, given.pitch_deg, given.heading_deg))
     turn = body_from_ned(roll, pitch, heading)
     latitude_deg, height_m = given.latitude_deg or 0.0, given.height_m or 0.0
@@ -288,11 +288,11 @@ def _without_bias(given: Given) -> Floats:
 def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
     """Check sigma on a sensor: compare the result of each window with those of the windows after it.
 
-    In 95 of 100 cases they should agree within 2 sigma. The pose cancels. Windows are not compared across a move.
+    In 95 of 100 cases they agree within 2 sigma. The pose is equal in both and cancels. A move ends the comparison.
 
     Returns:
-        Number of windows; number of failed ones by reason, whatever its figures, the commonest first; comparisons by
-        axis, none where no two windows in a row gave a result.
+        Number of windows; number of failed ones by reason (figures in the reason are ignored), the commonest first;
+        comparisons by axis, empty if no two consecutive windows gave a result.
     """
     results = list(calibrated(log, given, length_s))
     found = [each for one in results for each in ([None] if one.moved else []) + [one.biases]]

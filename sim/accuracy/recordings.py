@@ -1,16 +1,15 @@
 """`python -m sim recordings DIR`: is sigma honest on real sensors, and is the estimate better than a plain mean?
 
 DIR has one folder for each part, with recordings of it at rest: everything that `companion replay` reads. Files in its
-folder `moving` were recorded in motion from beginning to end. Its file `part.toml`, all keys optional, says what the
-recordings do not tell: `profile` (of the catalogue), `columns`, `rate_hz`, `powered_s` (since switch-on, at the
-beginning of each file).
+folder `moving` were recorded in motion from beginning to end. Its file `part.toml` has what the recordings lack, all
+optional: `profile` (of the catalogue), `columns`, `rate_hz`, `powered_s` (since switch-on, at the beginning of a file).
 
 Every window is calibrated by itself, as after a start. Its truth is the plain mean of the raw samples of the following
 180 s (60 s at least where the recording ends before). The pose is the same in both, and cancels. Profiles:
 
-- `default`: nobody named the part;
+- `default`: an unknown part;
 - `catalogue`: the one that part.toml names;
-- `learned`: fitted to the other recordings of the part, where these have 10 minutes.
+- `learned`: fitted to the other recordings of the part, if these have 10 minutes at rest.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from companion.estimation.noise.allan import allan_variance, noise_profile
 from companion.estimation.stillness.gates import ImuGate
 from companion.lab.estimate import HORIZON_S, Given, calibrated, uncounted
 from companion.lab.log_files import read_logs
-from companion.lab.profile import Rest, fit_profile, rests, seconds_of
+from companion.lab.profile import Rest, fit_profile, rests, seconds_at_rest, seconds_of
 from companion.lab.still_log import StillLog
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
@@ -67,7 +66,7 @@ class Score:
     def add(self, error: Floats, sigma: Floats, naive: Floats, of_mean: Floats) -> None:
         self._rows.append(np.array([error, sigma, naive, of_mean]))
 
-    def take(self, other: Score) -> None:
+    def merge(self, other: Score) -> None:
         self.windows += other.windows
         self.refused += other.refused
         self._rows += other._rows
@@ -101,7 +100,7 @@ def scored(logs: Iterable[StillLog], profile: NoiseProfile, powered_s: float, le
                 here = log.readings[window.start : window.end]
                 mean = here.mean(axis=0)
                 bias, _, sigma = window.biases
-                # The bias is a mean less what the pose makes: so is the one of the truth.
+                # A bias is a mean minus the bias-free reading of the pose; so is the truth's.
                 error = bias - (truth - window.by_pose)
                 naive = here.std(axis=0) / math.sqrt(len(here))
                 score.add(error, np.hypot(sigma, seen), np.hypot(naive, seen), mean - truth)
@@ -109,7 +108,7 @@ def scored(logs: Iterable[StillLog], profile: NoiseProfile, powered_s: float, le
 
 
 def _truth(log: StillLog, start: int) -> tuple[Floats, Floats] | None:
-    """Return the mean of the raw samples after a window, (6,), and the sigma that white noise leaves in it."""
+    """Return the mean of the raw samples after a window, (6,), and its sigma by white noise; None if they are few."""
     if start >= len(log.t_s):
         return None
     end = int(np.searchsorted(log.t_s, log.t_s[start] + HORIZON_S))
@@ -121,22 +120,19 @@ def _truth(log: StillLog, start: int) -> tuple[Floats, Floats] | None:
     return log.readings[start:end].mean(axis=0), np.sqrt(variance / len(seconds))
 
 
-def learned(log: StillLog, others: Sequence[StillLog]) -> NoiseProfile | None:
-    """Fit a profile to the other recordings of a part; None where they are too short."""
-    unknown = noise_profile(None)
-    found: list[Rest] = [
-        rest for each in others if each is not log for rest in rests(each.t_s, each.readings, "", unknown)[0]
-    ]
-    if sum(len(slots) for slots, _ in found) < LEAST_LEARNED_S:
+def learned(at_rest: Sequence[Sequence[Rest]], but: int) -> NoiseProfile | None:
+    """Fit a profile to the recordings of a part, all but one; None if they are too short."""
+    found = [rest for number, one in enumerate(at_rest) if number != but for rest in one]
+    if seconds_at_rest(found) < LEAST_LEARNED_S:
         return None
     try:
-        return fit_profile("learned", found, unknown)[0]
+        return fit_profile("learned", found, noise_profile(None))[0]
     except CalibrationRefusedError:
         return None
 
 
-def taken_for_still(logs: Iterable[StillLog]) -> tuple[int, int]:
-    """Count the seconds of moving recordings, and those that the gate takes for still, without a profile."""
+def judged_still(logs: Iterable[StillLog]) -> tuple[int, int]:
+    """Count the seconds of moving recordings, and those that the gate judges still, without a profile."""
     still = seconds = 0
     for log in logs:
         gate = ImuGate(log.imu, noise_profile(None))
@@ -154,8 +150,8 @@ def part_rows(folder: Path) -> Iterator[Sequence[str]]:
     Raises:
         CompanionError: a recording or part.toml cannot be read.
     """
-    told = folder / "part.toml"
-    part = msgspec.convert(tomllib.loads(told.read_text("utf-8")) if told.exists() else {}, Part)
+    facts = folder / "part.toml"
+    part = msgspec.convert(tomllib.loads(facts.read_text("utf-8")) if facts.exists() else {}, Part)
 
     def logs_in(place: Path) -> list[StillLog]:
         files = sorted(path for path in place.glob("*") if path.is_file() and path.name != "part.toml")
@@ -165,14 +161,15 @@ def part_rows(folder: Path) -> Iterator[Sequence[str]]:
     profiles: dict[str, list[tuple[NoiseProfile, list[StillLog]]]] = {"default": [(noise_profile(None), logs)]}
     if part.profile is not None:
         profiles["catalogue"] = [(noise_profile(part.profile), logs)]
-    elsewhere = [(profile, [log]) for log in logs if (profile := learned(log, logs)) is not None]
+    at_rest = [rests(log.t_s, log.readings, log.imu, noise_profile(None))[0] for log in logs]
+    elsewhere = [(profile, [log]) for k, log in enumerate(logs) if (profile := learned(at_rest, k)) is not None]
     if elsewhere:
         profiles["learned"] = elsewhere
     for name, pairs in profiles.items():
         for length_s in WINDOWS_S:
             score = Score()
             for profile, some in pairs:
-                score.take(scored(some, profile, part.powered_s, length_s))
+                score.merge(scored(some, profile, part.powered_s, length_s))
             refused = f"{score.refused.total() / max(score.windows, 1):.1%}"
             for triad in TRIADS:
                 first = (
@@ -184,8 +181,8 @@ def part_rows(folder: Path) -> Iterator[Sequence[str]]:
             for why, count in score.refused.most_common(2):
                 yield ("", f"{count} refused: {why}")
     if moving := logs_in(folder / "moving"):
-        seconds, still = taken_for_still(moving)
-        yield (folder.name, f"moving: {still} of {seconds} s taken for still")
+        seconds, still = judged_still(moving)
+        yield (folder.name, f"moving: {still} of {seconds} s judged still")
 
 
 def parser() -> argparse.ArgumentParser:

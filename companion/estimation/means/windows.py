@@ -43,14 +43,16 @@ _ALLAN_SPANS: Final = 5
 RAW_BATCHES: Final = 10  # Seconds of floats beside integers that say enough of their own scatter
 RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
 SPOT_WALK: Final = np.repeat([0.0, 0.04 * MG], 3)
-"""Walk of an unknown accelerometer by the ground's tilt and the temperature, unit / sqrt(s): 8 arcsec in a second.
-Recordings of a VN-100 and of ten Movella DOT on desks have 30 to 50 ug; the part's own is learned."""
+"""Walk of an unknown accelerometer by the ground's tilt and the temperature, unit / sqrt(s), beside the part's own.
+With it sigma of a VN-100 on a desk equals its errors; that of ten Movella DOT is three times theirs."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
 """Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
-_LINE_TAKES: Final = 2.56  # Variance of a slope by an unknown part's wander over that of the wander about the line
-_MOST_WANDER: Final = 0.5  # Of the wander about a ramp, over what the ramp itself makes in the same time
+_GUESSED_FLOOR: Final = 2.56
+"""Margin on the variance of a slope if the floor is estimated about the line: chance slopes of ten Movella DOT stay
+below it, the warm-up of a PX4 board (sample.ulg) exceeds it."""
+_MOST_WANDER: Final = 0.5  # Largest wander about a ramp, over the change by the ramp in the same time
 _ALLAN_SIGNIFICANT: Final = 3.0
 """Allan variance at T/5 over that of white noise: upper 5 % point for about four degrees of freedom."""
 
@@ -177,7 +179,7 @@ def estimate(
         if not imu.profile.is_named:
             # About the line, as a ramp would count as wander; the line takes the slowest of that with it.
             floors = _learned(slots, values - line.slope * times[:, None], least)
-            wander = _LINE_TAKES * slope_variance(*floors, 2.0 * half_s)
+            wander = _GUESSED_FLOOR * slope_variance(*floors, 2.0 * half_s)
         ramps = is_ramp(line, len(slots), wander) & _dominates(slots, values, line.slope)
         slope, ramp = line.slope, np.where(ramps, line.slope, 0.0)
         level = values - ramp * (times - times.mean())[:, None]
@@ -220,32 +222,34 @@ def estimate(
 
 
 def _dominates(slots: NDArray[np.int64], values: Floats, slope: Floats) -> NDArray[np.bool_]:
-    """(c,) True where a line is more than the wander about it, over a fifth of the window: a step is no ramp."""
+    """(c,) True if a line changes more than the wander about it, over a fifth of the window; a step does not."""
     left = values - slope * (slots - slots.mean())[:, None]
-    span = max(int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS, 2)
-    variance, _ = allan_variance(slots, left, span)
-    explained = np.square(white_noise(slots, left)) / span
-    wander = np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0)
-    return np.asarray(wander < np.square(slope * span * _MOST_WANDER))
+    excess, span = _excess(slots, left, white_noise(slots, left))
+    return np.asarray(excess < np.square(slope * span * _MOST_WANDER))
 
 
 def _learned(slots: NDArray[np.int64], values: Floats, least: Floats) -> tuple[Floats, Floats]:
-    """Return B and K of every column of a part that nobody named; its N is `least` or more."""
+    """Return B and K of every column of an unknown part, whose N is `least` or more."""
     white = np.maximum(white_noise(slots, values), least)
-    parts = [learned_floor(slots, values[:, part], white[part]) for part in (slice(0, 3), slice(3, 6))]
+    parts = [learned_floor(slots, values[:, rows_of(triad)], white[rows_of(triad)]) for triad in TRIADS]
     flicker, walk = (np.concatenate(each) for each in zip(*parts, strict=True))
     return flicker, np.hypot(walk, SPOT_WALK)
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
     """Return B of every column: from the profile, or from the excess of the Allan deviation at T/5 over white noise."""
+    excess, _ = _excess(slots, values, white)
+    return np.maximum(np.sqrt(excess) / FLOOR_OF_FLICKER, profile)
+
+
+def _excess(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, int]:
+    """Return the Allan variance at T/5 beyond that of white noise, (c,), zero if not significant; and T/5, s."""
     span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
     if span < 2:
-        return profile
+        return np.zeros(values.shape[1]), span
     variance, _ = allan_variance(slots, values, span)
     explained = np.square(white) / span
-    more = np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0)
-    return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
+    return np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0), span
 
 
 def _quantisation(batches: Sequence[Batch], step: float) -> tuple[Floats, NDArray[np.bool_]]:

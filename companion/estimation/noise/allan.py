@@ -176,7 +176,7 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
 
 # --- of an unknown part
 
-_FLOOR_MEDIAN: Final = 0.2  # Allan floor A over white noise N of common parts, 1 / sqrt(s): 0.06 to 0.55
+_FLOOR_MEDIAN: Final = 0.2  # Allan floor A over N, 1 / sqrt(s): 0.06 to 0.42 in the catalogue
 _FLOOR_SPREAD: Final = math.log(2.0)
 _FLOOR_RATIOS: Final = np.geomspace(0.03, 3.0, 21)
 _TINY: Final = 1e-30  # (rad/s)^2 or (m/s^2)^2: less than any noise, for readings that never change
@@ -187,20 +187,16 @@ def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tu
     """Estimate B and K of a triad of an unknown part, (3,) each, from a window of its readings.
 
     One ratio A / N holds for all three axes. Its prior is that of common parts; the likelihood is that of the window's
-    Allan variances. V(T, H) is linear in B^2 and K^2, so their posterior means suffice.
-
-    Args:
-        slots: (m,) ascending seconds.
-        values: (m, 3) means of those seconds.
-        white: (3,) N of the readings.
+    Allan variances. V(T, H) is linear in B^2 and K^2, so their posterior means suffice. `slots` (m,) are ascending
+    seconds, `values` (m, 3) their means, and `white` (3,) is N.
     """
     ratio2, walk_s = (each.ravel() for each in np.meshgrid(np.square(_FLOOR_RATIOS), _WALKS_S))
     log_weight = -0.5 * np.square((np.log(ratio2) / 2.0 - math.log(_FLOOR_MEDIAN)) / _FLOOR_SPREAD)
     length, span = int(slots[-1] - slots[0]) + 1, 2
     while span <= length // _LONGEST_SHARE:
         variance, freedom = allan_variance(slots, values, span)
-        model = 1.0 / span + ratio2 * (1.0 + span / walk_s)
         if freedom > 0.0:
+            model = 1.0 / span + ratio2 * (1.0 + span / walk_s)
             found = float((variance / np.maximum(np.square(white), _TINY)).sum())
             freedom = len(slots) / (2.0 * span)
             log_weight = log_weight - freedom / 2.0 * (3.0 * np.log(model) + found / model)

@@ -19,7 +19,7 @@ import numpy as np
 
 from companion.config.sections import NoiseProfile
 from companion.estimation.seconds.batch import Batch
-from companion.estimation.stillness.own_noise import OwnNoise
+from companion.estimation.stillness.own_noise import OwnNoise, freedom_of, parts_of_second
 from companion.estimation.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
 from companion.physics.frames import Floats
 from companion.physics.statistics import chi_square_ratio
@@ -75,7 +75,7 @@ _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
 _CHANCE_OF_FIVE: Final = 3.5  # The same for the largest of five averaging times
 COMMON: Final = (0.045 * DEG, 0.7 * MG)
-"""Density of the noisiest common gyro and accelerometer (ADIS16405), times sqrt(s): believed from the first second."""
+"""Density of the noisiest common gyro and accelerometer (ADIS16405), times sqrt(s): accepted from the first second."""
 _LEAST_HALVINGS: Final = 4  # Of a second: 1/16 s of three samples or more, from 48 Hz on
 _STATIONARY: Final = 2.0  # Largest ratio of noise at rest to its usual variance
 
@@ -119,15 +119,15 @@ def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, 
     return math.sqrt(max(batch.variance[channels].mean() - white.mean(), 0.0)), math.hypot(gate, math.sqrt(chance))
 
 
-def _beyond_noise(batch: Batch, channels: slice, gate: float, density: float) -> tuple[float, float]:
-    """Rms of the slow part over the channels, and what the gate and chance allow by the second's Allan variances.
+def _slow_by_density(batch: Batch, channels: slice, gate: float, density: float) -> tuple[float, float]:
+    """Return the rms of the slow part over the channels, and its limit, from the Allan variances within the second.
 
-    Noise behind a filter above some 10 Hz has one density, Allan variance times averaging time, at all times; behind a
+    Noise behind a filter above some 10 Hz has one density, Allan variance times averaging time, at all times. Behind a
     lower one it falls towards short times. Motion adds to the long ones.
     """
-    parts = np.exp2(np.arange(1.0, len(batch.allan) + 1.0))
+    parts = parts_of_second(len(batch.allan))
     noise = density * parts
-    freedom = (channels.stop - channels.start) * np.maximum(0.75 * parts - 1.0, 1.0)
+    freedom = (channels.stop - channels.start) * freedom_of(parts)
     allowed = gate**2 + noise * (chi_square_ratio(freedom, _CHANCE_OF_FIVE) - 1.0)
     beyond = float(((batch.allan[:, channels].mean(axis=1) - noise) / allowed).max())
     slow = math.sqrt(max(float((batch.variance - batch.white)[channels].mean()), 0.0))
@@ -135,7 +135,7 @@ def _beyond_noise(batch: Batch, channels: slice, gate: float, density: float) ->
 
 
 def _shortest_density(batch: Batch) -> Floats:
-    """Return the density (6,) at the shortest averaging time: N^2 where no filter acts on it."""
+    """Return the density (6,) at the shortest averaging time: N^2 if no filter acts on it."""
     return batch.allan[-1] / 2.0 ** len(batch.allan) if len(batch.allan) >= _LEAST_HALVINGS else batch.white / batch.n
 
 
@@ -228,7 +228,7 @@ class ImuGate:
                 most = max(COMMON[number] ** 2, self._white[number] ** 2, white)
                 most = min(most, _STATIONARY * known) if known > 0.0 else most
                 density = min(float(shortest[triad].mean()), most) if own is None else float(own.density.mean())
-                found, allowed = _beyond_noise(batch, triad, motion, density)
+                found, allowed = _slow_by_density(batch, triad, motion, density)
             else:
                 bounds = (known * batch.n, _STATIONARY * known * batch.n if known > 0.0 else shaking**2)
                 # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.

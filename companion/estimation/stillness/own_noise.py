@@ -125,8 +125,8 @@ class OwnNoise:
             step = batch.mean - before.mean
             if not 0 < batch.slot - before.slot <= _GAP or (step * step > 2.0 * _OUTLIER_SIGMAS**2 * most2).any():
                 return True
-        parts = _parts(len(batch.allan))
-        allowed = parts * chi_square_ratio(_freedom(parts), _OUTLIER_SIGMAS)
+        parts = parts_of_second(len(batch.allan))
+        allowed = parts * chi_square_ratio(freedom_of(parts), _OUTLIER_SIGMAS)
         return bool((batch.allan > allowed[:, None] * most2).any())
 
     def _learn(self) -> None:
@@ -151,9 +151,9 @@ def _noise(seconds: list[Batch], part: slice) -> Known | None:
     spans = [(span, *allan_variance(slots, means, span)) for span in _SPANS]
     longer = [(span * found, freedom) for span, found, freedom in spans]
     depth = min(len(batch.allan) for batch in seconds)
-    parts = _parts(depth)
+    parts = parts_of_second(depth)
     within = np.mean([batch.allan[:depth, part] for batch in seconds], axis=0) / parts[:, None]
-    shorter = [*zip(within, many * _freedom(parts), strict=True), (white / samples, many * samples * 2.0 / 3.0)]
+    shorter = [*zip(within, many * freedom_of(parts), strict=True), (white / samples, many * samples * 2.0 / 3.0)]
     density, freedom = float(longer[0][0].mean()), 3.0 * longer[0][1]
     if not (white.min() > 0.0 and density > 0.0):
         return None
@@ -180,10 +180,10 @@ def _ratio(first: float, second: float) -> float:
     return math.exp(_SIGMAS * math.sqrt(2.0 / max(first, 1.0) + 2.0 / max(second, 1.0)))
 
 
-def _parts(depth: int) -> Floats:
+def parts_of_second(depth: int) -> Floats:
     return np.asarray(np.exp2(np.arange(1.0, depth + 1.0)))
 
 
-def _freedom(parts: Floats) -> Floats:
+def freedom_of(parts: Floats) -> Floats:
     """Return the degrees of freedom of the Allan variance for a number of parts of a second."""
     return np.maximum(0.75 * parts - 1.0, 1.0)

@@ -22,7 +22,7 @@ MOST_ACCEL_M_S2: Final = 0.3 * G  # Several times the worst power-up bias in dat
 _TILTED_RAD: Final = math.radians(20.0)
 """Angle between gravity by the IMU and by the tilt; the largest bias turns it by 17 degrees."""
 _COMMON_BIAS_M_S2: Final = 0.05 * G  # Most parts' bias at power-up is below: 0.02 to 0.05 g in data sheets
-_EXPLAINED: Final = 0.3  # Share of a difference that is left where a turned tilt sensor explains it
+_EXPLAINED: Final = 0.3  # Largest error left, over the error before, if a turned tilt sensor explains it
 _FITS_M_S2: Final = 0.2 * G
 _AS_WELL_M_S2: Final = 0.02 * G
 """Difference below which mountings fit equally, as ROLL_180 and PITCH_180 do when level; the simplest counts."""
@@ -52,10 +52,10 @@ def implausible(
     if words := misplaced(name, force_m_s2, expected_m_s2, sensor_to_vehicle, remedy):
         return {"gyro": words, "accel": words}
     found: dict[Triad, str] = {}
+    bias, rate = np.abs(force_m_s2 - expected_m_s2), np.abs(rate_rad_s)
     if (deg := _turned(force_m_s2, expected_m_s2)) is not None:
         found["accel"] = message("tilt_sensor_turned", imu=name, deg=deg)
-    bias, rate = np.abs(force_m_s2 - expected_m_s2), np.abs(rate_rad_s)
-    if bias[axis := int(bias.argmax())] > MOST_ACCEL_M_S2:
+    elif bias[axis := int(bias.argmax())] > MOST_ACCEL_M_S2:
         found["accel"] = (
             f"accel {name}: a bias of {bias[axis] / G:.2f} g on {_AXES[axis]}, more than any part has"
             f" ({MOST_ACCEL_M_S2 / G:g}): scale, unit or tilt are wrong"
@@ -93,7 +93,7 @@ def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehi
 
 
 def _turned(force_m_s2: Array, expected_m_s2: Array) -> int | None:
-    """Return the turn about z, degrees, by which a tilt sensor explains a reading that no common bias does."""
+    """Return the turn of the tilt sensor about z, deg, that explains an error larger than a common bias, or None."""
     off = float(np.linalg.norm(force_m_s2 - expected_m_s2))
     if off > _COMMON_BIAS_M_S2:
         for deg in (180, 90, 270):

@@ -187,6 +187,16 @@ def test_bursts_in_all_axes_are_never_learned(rms_deg_s: float) -> None:
         assert own.known[0] is None or math.sqrt(own.known[0].variance.mean()) < 0.1 * rms_deg_s * DEG
 
 
+def test_a_noisy_part_behind_a_filter_is_still_from_its_first_second_and_a_sway_is_not() -> None:
+    """ADIS16405 behind 25 Hz, correlated from sample to sample; nobody names the part."""
+    t_s, readings = filtered(60, 100, (152.0 * DEG_H, 0.669 * MG), 25.0, 1, 31)
+    still = [ImuGate("imu", UNKNOWN).judge(batch).still for batch in seconds_of(t_s, readings)]
+    assert np.mean(still) >= 0.98
+    readings[:, :2] += 0.3 * DEG * math.sqrt(2.0) * np.sin(2.0 * math.pi * np.array([1.0, 2.0]) * t_s[:, None])
+    swaying = [ImuGate("imu", UNKNOWN).judge(batch).still for batch in seconds_of(t_s, readings)]
+    assert np.mean(swaying) <= 0.05
+
+
 def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_at_rest() -> None:
     noisy = (1.6 * 0.07 * DEG, 1.6 * MG)
     t_s, readings = filtered(120, 100, noisy, 10.0, 1, 9)

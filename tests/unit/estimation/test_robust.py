@@ -53,6 +53,15 @@ def test_the_robust_mean_is_within_a_few_per_cent_of_the_bound_where_nothing_kno
     assert found < float(np.sqrt(np.mean(np.square(huber_mean(values))))) * np.sqrt(count)
 
 
+def test_the_robust_mean_is_the_plain_one_unless_a_value_stands_out() -> None:
+    values = np.random.default_rng(4).uniform(-1.0, 1.0, (60, 2))
+    np.testing.assert_allclose(robust_mean(values), values.mean(axis=0), rtol=1e-12)
+    values[7, 0] += 10.0
+    first, second = np.abs(robust_mean(values) - values.mean(axis=0)).tolist()
+    assert first > 0.1
+    assert second < 1e-12
+
+
 def test_the_robust_mean_forgets_a_knock_that_hubers_feels() -> None:
     rng = np.random.default_rng(7)
     values = rng.normal(size=(60, 4000))

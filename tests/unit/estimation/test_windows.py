@@ -205,6 +205,18 @@ def test_a_slope_of_the_parts_own_flicker_is_no_warm_up_and_a_real_one_is() -> N
     assert window_of(source, warm).gyro_rad_s == pytest.approx([60.0 * slope] * 3, abs=0.5)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_an_unknown_part_is_extrapolated_along_a_warm_up_and_not_across_a_step(seed: int) -> None:
+    """A gyro of a Movella DOT steps by 110 deg/h within a minute, and back."""
+    rng, time = np.random.default_rng(seed), np.arange(0.5, 30.0)
+    noise, nobody = rng.normal(0.0, 20.0, (30, 6)), imu("fc", noise_profile(None))
+    step, ramp = 110.0 * (time > 15.0)[:, None], 8.0 * time[:, None]
+    for change, is_ramp in ((step, False), (ramp, True)):
+        batches = batches_of((noise + change) * DEG_H)
+        found = estimate(nobody, batches, end_s=batches[-1].slot + 1.0, horizon_s=180.0)
+        assert (found.warming.ramp[:3] != 0.0).tolist() == [is_ramp] * 3
+
+
 @pytest.mark.parametrize("seconds", [10, 60])
 @pytest.mark.parametrize(("part", "triad"), [(p, t) for p in PROFILES if p != "unknown" for t in ("gyro", "accel")])
 def test_sigma_of_an_unknown_part_is_learned_from_its_noise(part: str, triad: Triad, seconds: int) -> None:

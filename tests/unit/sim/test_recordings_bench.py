@@ -44,7 +44,7 @@ def test_white_noise_is_covered_and_no_worse_than_its_mean(tmp_path: Path, capsy
     assert float(rms) == pytest.approx(40.0 * np.sqrt(1 / 10.0 + 1 / 150.0), rel=0.25)
     assert float(of_mean) == pytest.approx(1.0, abs=0.02)
     assert float(naive.rstrip("%")) >= 85.0
-    assert "moving: 0 of 239 s taken for still" in " ".join(found[-2])
+    assert "moving: 0 of 239 s judged still" in " ".join(found[-2])
 
 
 @pytest.mark.parametrize(("told", "words"), [
