@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import datetime
-from typing import Any
+import functools
+import threading
+from typing import Any, Final
 
 import msgspec
+
+_FIRST_USE: Final = threading.Lock()
+"""msgspec (0.22) describes a type at its first use; two threads that do so at the same time crash the process."""
 
 
 def decode(data: bytes, kind: Any, newest: int | None) -> Any:
@@ -16,7 +21,14 @@ def decode(data: bytes, kind: Any, newest: int | None) -> Any:
             raise msgspec.ValidationError(
                 f"found format {version}; allowed: up to {newest} (a newer companion has saved it)"
             )
-    return msgspec.json.decode(data, type=kind)
+    with _FIRST_USE:
+        decoder = _decoder(kind)
+    return decoder.decode(data)
+
+
+@functools.cache
+def _decoder(kind: Any) -> msgspec.json.Decoder[Any]:
+    return msgspec.json.Decoder(kind)
 
 
 def utc_now() -> str:
