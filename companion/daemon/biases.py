@@ -1,6 +1,6 @@
 """Biases of each IMU from earlier calibrations and still windows, and the prediction of its present biases.
 
-A change of sensor, profile or mounting voids them. The best prediction is the last calibration since the power-up.
+A change of sensor, profile or mounting voids the stored biases. The last calibration since power-up predicts best.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from companion.storage.records import BiasStore, KnownImu, this_boot
 logger = logging.getLogger(__name__)
 
 LOOK_K: Final = 1.0  # Temperatures closer than this count as equal
-WRITE_EVERY_S: Final = 60.0  # least time between writes of still windows to the disk
+WRITE_EVERY_S: Final = 60.0  # Minimum time between writes of still windows to the disk
 _MUCH_BETTER: Final = 0.7
-"""Sigma, as a fraction of the kept window's, below which a new still window of equal temperature replaces it."""
+"""Ratio of sigmas (new to stored still window of equal temperature) below which the new window replaces the stored."""
 _IN_WORDS: Final = {  # Keys of an identity, as text for people
     "system": "vehicle",
     "gyro": "gyro (device id)",
@@ -52,7 +52,7 @@ _IN_WORDS: Final = {  # Keys of an identity, as text for people
 
 
 class BiasMemory:
-    """Predicts biases before a result is used, and remembers the result."""
+    """Predicts the biases of each IMU before a calibration, and stores the measured ones after it."""
 
     def __init__(self, core: Core, devices: Devices, used: ActiveAlignment) -> None:
         self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
@@ -65,7 +65,7 @@ class BiasMemory:
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
-        """Reference of this power-up by IMU and triad: its session and point, and the contradictions since."""
+        """Reference bias by IMU and triad (gyro, accel): id of the power-up, point, number of contradictions since."""
         self._now_degc: dict[str, float | None] = {}
         self._written_s = -math.inf
 
@@ -74,7 +74,7 @@ class BiasMemory:
         self.follow()
 
     def follow(self) -> None:
-        """Fit the curves over temperature to all known biases; blocking."""
+        """Fit curves of bias over temperature to all stored biases; blocking."""
         curves: dict[tuple[str, Triad], Curve | None] = {}
         settles: dict[str, tuple[float, float] | None] = {}
         known = dict(self._known)
@@ -93,7 +93,7 @@ class BiasMemory:
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
     ) -> tuple[Vector, Vector] | None:
-        """Predict the change of the output between two temperatures, and its variance; None: unknown."""
+        """Predict the change of the output from `degc` to `now_degc`, and its variance, by axis; None if unknown."""
         curve = self.curve(name, triad)
         if curve is None or degc is None or now_degc is None:
             return None
@@ -114,14 +114,14 @@ class BiasMemory:
         return msgspec.structs.replace(found, warm=None, **left)
 
     def _taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
-        """Return the bias change that the autopilot's own temperature calibration compensates, (3,)."""
+        """Return the bias change (3,) from `degc` to `now_degc` that the autopilot's thermal calibration removes."""
         calibration = self._imus[name].calibration if name in self._imus else None
         return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
     # --- before a result is used
 
     def with_offsets(self, solution: Solution) -> Solution:
-        """Add the offsets that the autopilot subtracts; raise AutopilotError while they are unknown."""
+        """Return a solution with the offsets that the autopilot subtracts; raise AutopilotError if they are unknown."""
         imus = tuple(
             dataclasses.replace(imu, subtracted=self._imus[imu.name].in_force.subtracted(imu.temperature_degc))
             if imu.name in self._imus
@@ -131,7 +131,7 @@ class BiasMemory:
         return dataclasses.replace(solution, imus=imus)
 
     def forgotten(self) -> dict[str, str]:
-        """Forget the biases of replaced sensors; return the reason by IMU, in one line."""
+        """Delete the stored biases of replaced sensors; return the reason by IMU, as one line of text."""
         found: dict[str, str] = {}
         for name in self._sources:
             if not (what := self._changed(name)):
@@ -146,7 +146,7 @@ class BiasMemory:
         return found
 
     def why_not_now(self, name: str, started_at: str) -> str | None:
-        """Return why the bias may have changed since a calibration; None: no reason known."""
+        """Return a reason to doubt that the bias is still that of the calibration started at `started_at`, or None."""
         if (point := self._point(name, started_at)) is None:
             return message("imu_changed_since_calibration", event="has lost its history")
         if what := self._changed(name):
@@ -168,7 +168,6 @@ class BiasMemory:
         )
 
     def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float) -> prior.ExpectedImu:
-        """Predict the biases of one IMU for this window from its history and its curve."""
         name = imu.name
         record = self._alignment.record if self._alignment.unused is None else None
         aligned = () if record is None else record.imus
@@ -204,7 +203,7 @@ class BiasMemory:
     # --- after a calibration
 
     def measured(self, solution: Solution, doubts: Sequence[Doubt], started_at: str, unix_s: float) -> dict[str, Point]:
-        """Make the points of the history from a solution that uses the readings alone, no earlier biases."""
+        """Return a history point for each IMU, from a solution that uses the readings alone and no earlier biases."""
         return points(
             dataclasses.replace(solution, imus=tuple(map(self._at_mean, solution.imus))),
             doubts,
@@ -215,14 +214,14 @@ class BiasMemory:
         )
 
     def _at_mean(self, imu: ImuSolution) -> ImuSolution:
-        """Refer the autopilot's temperature compensation to the window's mean temperature instead of its end's."""
+        """Apply the autopilot's temperature compensation at the window's mean temperature instead of its last one."""
         degc, end_degc = imu.mean_degc, imu.temperature_degc
         if degc is None or end_degc is None or degc == end_degc:
             return imu
         return imu.shifted(-np.concatenate([self._taken_off(imu.name, t, degc, end_degc) for t in TRIADS]))
 
     async def keep(self, found: Mapping[str, Point]) -> None:
-        """Remember a good calibration; a failure of the disk is only logged."""
+        """Store the biases of a good calibration; a failure of the disk is only logged."""
         for name, point in found.items():
             # A point without a temperature fits no curve.
             if point.temperature_degc is not None or all(one.temperature_degc is None for one in self._points(name)):
@@ -232,7 +231,7 @@ class BiasMemory:
         await self._write()
 
     async def look(self, solution: Solution) -> None:
-        """Remember the best still window at each temperature (1 K steps) of this power-up."""
+        """Store the biases of a still window if it is this power-up's best at its temperature (steps of 1 K)."""
         unix_s = time.time()
         self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
@@ -263,7 +262,7 @@ class BiasMemory:
             await self._write()
 
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
-        """Return whether a window is the first at its temperature in this power-up, or much better than those."""
+        """Return whether a window is this power-up's first at its temperature, or much better than those before."""
         degc, power_up = imu.mean_degc, self.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or degc is None or self._changed(imu.name):
             return False
@@ -272,7 +271,7 @@ class BiasMemory:
         return bool(imu.sigma_stat[:3].max() < _MUCH_BETTER * best)
 
     async def forget(self, started: Collection[str]) -> None:
-        """Forget undone calibrations, given by their start times."""
+        """Delete the biases of undone calibrations, given by their start times."""
         if not any(point.started_at in started for known in self._known.values() for point in known.points):
             return
         for name, known in self._known.items():
@@ -290,7 +289,7 @@ class BiasMemory:
             logger.warning("%s", message("history_not_kept", what="biases of this calibration", reason=error))
 
     def _refer(self, name: str, triad: Triad, point: Point) -> None:
-        """Update the reference of this power-up; only the third contradicting point in a row replaces it."""
+        """Update this power-up's reference bias; a contradicting point replaces it only if it is the third in a row."""
         found = point.of(triad)
         if found is None:
             return
@@ -304,7 +303,7 @@ class BiasMemory:
     # --- stored biases
 
     def temperature(self) -> list[Object]:
-        """Summarise the biases over temperature; blocking."""
+        """Summarise the biases of each IMU over temperature; blocking."""
         # Imported here to keep the start short.
         from companion.estimation.solution.by_temperature import by_temperature
 
@@ -331,14 +330,14 @@ class BiasMemory:
         return next((each for each in self._points(name) if each.started_at == started_at), None)
 
     def _remember(self, name: str, known: Sequence[Point]) -> None:
-        """Keep as many points of an IMU as are stored on disk, so that predictions do not change at a restart."""
+        """Replace an IMU's history, limited as on disk, so that predictions do not change at a restart."""
         imu = self._known.get(name) or KnownImu(identity=self._identity(name, {}))
         self._known[name] = msgspec.structs.replace(imu, points=kept(known))
 
     # --- identity of the sensor behind each IMU
 
     def _changed(self, name: str) -> str:
-        """List the differences between the present and the remembered sensor, as text; empty: none."""
+        """Return the differences between the present and the stored sensor, as text; empty if there are none."""
         if name not in self._known:
             return ""
         before = self._known[name].identity
@@ -368,7 +367,7 @@ class BiasMemory:
         return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
 
     def _identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
-        """Return the properties that identify a sensor and its biases; `before` supplies those unknown now."""
+        """Return the properties whose change voids an IMU's biases; `before` supplies those that are unknown now."""
         source = self._sources[name]
         profile = source.profile.name if isinstance(source.profile, NoiseProfile) else source.profile
         found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}

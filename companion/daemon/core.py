@@ -27,14 +27,14 @@ from companion.links.system.events import Listeners
 logger = logging.getLogger(__name__)
 
 CATCH_UPS: Final = 3
-"""Most evaluations of the window in a row: while one is computed the next may become due."""
+"""Maximum number of consecutive evaluations of the measuring window: while one is computed the next may become due."""
 TICK_S: Final = 0.2
 REREAD_EVERY_S: Final = 0.5
-"""Least time between two reads: anybody on the network can announce a change and so cause one."""
+"""Minimum time between two reads of the autopilot: any station can announce a change and so cause a read."""
 Handler = Callable[[Any, str], AsyncIterator[Object]]
-"""Handler of a command: its arguments are the `Command` and the name of the interface; it yields replies."""
+"""Handler of a command: it gets the parsed `Command` and the name of the requesting interface, and yields replies."""
 Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
-"""Name of a task, and the function that makes its coroutine, which runs until cancelled."""
+"""Name of a long-lived task, and the function that creates its coroutine, which runs until cancelled."""
 Offload = Callable[..., Awaitable[Any]]
 """Function that runs a blocking call outside the event loop: `asyncio.to_thread` in the daemon."""
 
@@ -59,7 +59,7 @@ class RuntimeSettings:
 
 
 class RepeatedRead:
-    """Reads from the autopilot after each of its starts and each `again`; retries `retry_s` after an AutopilotError."""
+    """Calls `read` after each autopilot start and each `again`; retries it `retry_s` after an AutopilotError."""
 
     def __init__(self, vehicle: Vehicle, read: Callable[[], Awaitable[None]], retry_s: float) -> None:
         self._vehicle, self._read, self._retry_s = vehicle, read, retry_s
@@ -69,7 +69,7 @@ class RepeatedRead:
         vehicle.on_event.add(self._on_event)
 
     def again(self, pause_s: float = 0.0) -> None:
-        """Request another read, as something has changed; `pause_s`: least time from it to the next read."""
+        """Request another read because something has changed; after that read, wait `pause_s` before the next one."""
         self._pause_s = max(self._pause_s, pause_s)
         self._due.set()
 
@@ -94,12 +94,12 @@ class RepeatedRead:
 
 
 class Core:
-    """Parts shared by all subsystems: configuration, autopilot link, collector and others; `link` is for tests."""
+    """Parts shared by all subsystems: configuration, autopilot link, sample collector and others; tests pass `link`."""
 
     def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
         self.config, self.offload = config, offload
         self.only_listening = only_listening
-        """Check mode: the reason for refusing every job, as nothing may change; None in normal operation."""
+        """Reason for refusing every job in check mode, in which nothing may change; None in normal operation."""
         system_id = config.vehicle.system_id
         self.link = link or MavlinkLink(system_id=system_id or 1, component_id=config.mavlink.component_id)
         self.vehicle = Vehicle(self.link, system_id=system_id, is_carried=self._is_carried)
@@ -115,7 +115,7 @@ class Core:
         return self.collector.glance(asyncio.get_running_loop().time()).moving
 
     def _retarget(self, settings: Settings) -> None:
-        if not self.machine.state.busy:  # a running calibration keeps its targets
+        if not self.machine.state.busy:  # the targets of a running calibration stay unchanged
             self.collector.retarget(settings)
 
     async def local_earth(self) -> LocalEarth:
@@ -130,7 +130,7 @@ class Core:
             await asyncio.sleep(TICK_S)
 
     async def catch_up(self, *, since_s: float | None = None) -> None:
-        """Evaluate the collector's window if due, in a thread, as arming requests must not wait (autopilots 5.2)."""
+        """Evaluate the measuring window if due; in a thread, as arming requests must not wait (autopilots.md, 5.2)."""
         for _ in range(CATCH_UPS):
             work = self.collector.pending(asyncio.get_running_loop().time(), since_s=since_s)
             if work is None:
@@ -150,10 +150,10 @@ class Core:
 
 
 class Subsystem:
-    """Base class of the daemon's parts: stored state, status, commands and tasks, as the service calls them."""
+    """Base class of the daemon's parts, each with its stored data, status, commands and tasks."""
 
     def load(self) -> None:
-        """Load stored data before anything runs; blocking."""
+        """Load stored data from disk before any task runs; blocking."""
 
     def status(self) -> Object:
         return {}

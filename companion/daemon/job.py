@@ -22,15 +22,15 @@ TEMPERATURE: Final = "temperature curve"
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 
 GoOn = Callable[[str], None]
-"""Callback during a long wait: sets the text of the progress, and raises `JobCancelledError` after a cancel."""
+"""Callback, called during a long wait: it sets the progress text, and raises `JobCancelledError` after a cancel."""
 
 
 class JobCancelledError(Exception):
-    """The job was cancelled; raised inside it at the next safe point."""
+    """Raised inside a cancelled job at its next safe point."""
 
 
 class Job:
-    """One job as its requesters see it; the future `finished` is set exactly once."""
+    """One job: its request, its progress, and its result in the future `finished`, which is set exactly once."""
 
     def __init__(
         self,
@@ -48,16 +48,16 @@ class Job:
         self.automatic = automatic  # Started by the daemon itself
         self.was_armed = False
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
-        """Time of the event loop by which measuring must end; None: no limit."""
+        """Time on the event loop's clock by which measuring must end; None: no limit."""
         self.finished: asyncio.Future[JobResult] = loop.create_future()
         self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Object | None = None
         self.undid_calibration = kind == "undo"
-        """True if an undo has undone a calibration; False for the undo of an alignment or a temperature curve."""
-        self.words = ""  # Present activity, for people
+        """True if this job has undone a calibration; False for the undo of an alignment or a temperature curve."""
+        self.words = ""  # Present activity, as text for people
         self.hold_still_s: int | None = None
-        """Time for which the aircraft must be held still before the job goes on."""
+        """Seconds for which the aircraft must be held still, if the job waits for nothing else; otherwise None."""
         self.progress_percent = 0
-        """0 to 100; never falls."""
+        """Progress in percent, 0 to 100; it never falls."""
         self._until_s = 0.0
         self.cancelled_by: str | None = None
         self._nudge = asyncio.Event()
@@ -97,18 +97,18 @@ class Job:
         self._nudge.set()
 
     def check_cancelled(self) -> None:
-        """Mark a safe point: raise JobCancelledError, which names the canceller, if the job was cancelled."""
+        """Raise JobCancelledError, which names the canceller, if cancelled; call this where stopping is safe."""
         if self.cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self.cancelled_by}")
 
     def check_time(self) -> None:
-        """Raise CalibrationRefusedError after the deadline."""
+        """Raise CalibrationRefusedError if the deadline has passed."""
         if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
             boat = '; on a boat? set vehicle.platform = "deck"' if self.words.startswith("hold still: ") else ""
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
 
     async def pause(self, seconds: float) -> None:
-        """Wait, at most until `look_again` or a cancel, which raises JobCancelledError."""
+        """Wait for `seconds` or until `look_again` is called; raise JobCancelledError once the job is cancelled."""
         self.check_cancelled()
         self._nudge.clear()
         if await comes(self._nudge, seconds):

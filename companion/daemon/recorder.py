@@ -1,6 +1,6 @@
 """Recorder of all inputs: the last hour and a half in a ring of files, and a single file on request.
 
-Sensing and MAVLink never wait for the disk: a thread empties a bounded queue once a second.
+Sensors and MAVLink never wait for the disk: their data enter a bounded queue, which a thread empties once a second.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ T = TypeVar("T")
 FLUSH_S: Final = 1.0
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
-"""Default size of the ring: some 100 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
+"""Default size of the ring of files, MiB: some 100 minutes of a 200 Hz IMU and 100 Hz telemetry."""
 MOST_BYTES: Final = 4 << 30, 1 << 30
-"""Largest size of a recording with and without a requested length: the file limit of many USB sticks, and 27 hours of
-a 200 Hz IMU beside 100 Hz telemetry."""
+"""Size limits of a recording on request: with a requested length 4 GiB, the largest file on many USB sticks; without
+one 1 GiB, which is 27 hours of a 200 Hz IMU and 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 INTERNAL: Final = "internal error; the log has the details"
 
 
 def _coarse(where: Whereabouts) -> tuple[object, ...]:
-    """Round a place, so that the noise of a GNSS receiver does not count as a change."""
+    """Return a place with rounded coordinates, so that the noise of a GNSS receiver does not count as a change."""
     degrees = [None if value is None else round(value, 3) for value in (where.latitude_deg, where.longitude_deg)]
     return *degrees, None if where.height_m is None else round(where.height_m, -1), where.source, where.date
 
@@ -235,7 +235,7 @@ class Recorder(Subsystem):
                 self.fault = None
 
     async def _in_thread(self, function: Callable[..., T], *arguments: object) -> T:
-        """Run a file operation in a thread; a cancel waits for its end, as two operations must not overlap."""
+        """Run a file operation in a thread; even after a cancel wait for its end, as operations must not overlap."""
         task: asyncio.Future[T] = asyncio.ensure_future(self._offload(function, *arguments))
         try:
             return await asyncio.shield(task)

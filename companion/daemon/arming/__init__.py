@@ -1,1 +1,1 @@
-"""The active calibration, the arm gate, and automatic calibrations."""
+"""The active calibration, the gate that allows or refuses arming, and automatic calibrations."""

@@ -1,8 +1,8 @@
 """Automatic calibrations, so that a fresh result is active before anyone arms.
 
-While the aircraft is disarmed and still, and at_arm is "gate" or "warn", it is calibrated at the first opportunity, and
-again when new offsets would be clearly better. Every write wears the autopilot's flash: offsets that a still window
-confirms are not written again, and the number of writes a day is limited, also across restarts.
+If the setting `at_arm` is "gate" or "warn", the disarmed and still aircraft is calibrated at the first opportunity, and
+again when new offsets would be clearly better. Every write wears the autopilot's flash. Therefore offsets that a still
+window confirms are not written again, and the number of writes a day is limited, also across restarts.
 
 Choices of people are never overwritten: after an undo, a cancel, or a change by another station, automatic calibrations
 stop with a message until the next request or restart.
@@ -34,13 +34,13 @@ logger = logging.getLogger(__name__)
 REQUESTER: Final = "the companion itself"
 POLL_S: Final = 1.0
 SPACING_S: Final = 300.0
-"""Least time between automatic writes; sigma_use holds for 180 s."""
+"""Minimum time between automatic writes; the accuracy of a result (sigma_use) is computed for the next 180 s."""
 WORTH_FOR_S: Final = 30.0
-"""Time for which every window must promise better offsets before good offsets are replaced."""
+"""Time during which every window must predict better offsets before good offsets are replaced automatically."""
 PER_DAY: Final = 24
-"""Most automatic writes a day, some 300 parameters; a flash page withstands 10 000 rewrites."""
+"""Maximum number of automatic writes a day (some 300 parameters in all); a flash page withstands 10 000 rewrites."""
 FAILURES: Final = 3
-RETRY_S: Final = 60.0  # Wait after a failure; doubled with each further one
+RETRY_S: Final = 60.0  # Wait after a failure; doubled after each further one
 TIMEOUT_S: Final = 180.0
 
 
@@ -56,7 +56,7 @@ class Automatic:
         self._failures = 0
         self.turns = 0
         self.stopped: str | None = None
-        """Reason why automatic calibrations stopped until a request; None while they go on."""
+        """Reason why automatic calibrations are stopped until the next request; None while they may start."""
 
     @property
     def wanted(self) -> bool:
@@ -64,7 +64,7 @@ class Automatic:
         return wanted.at_arm != "off" and wanted.push and self._core.only_listening is None
 
     def why_not(self) -> str | None:
-        """Return the remedy if no automatic calibration can start now; None: one starts as soon as it is needed."""
+        """Return the remedy, as text, if no automatic calibration can start now; None: one starts when needed."""
         if not self.wanted or self.stopped is not None:
             return "calibrate"
         if self._writes_today() >= PER_DAY:
@@ -106,7 +106,7 @@ class Automatic:
                 logger.info("nothing is written by itself: %s", answer.reason)
 
     async def _still_ours(self) -> bool:
-        """Read the offsets and return whether they are unchanged; another station may have set them unnoticed."""
+        """Read the offsets; return whether they are unchanged, as another station may have set them unnoticed."""
         try:
             same = [await imu.refresh() for imu in self._imus.values()]
         except AutopilotError as error:

@@ -1,6 +1,6 @@
 """The active calibration of each IMU, its age, and the findings against it.
 
-The inputs are finished calibrations, the offsets that the autopilot reports (`OffsetWatch`), and the output in the
+The inputs are finished calibrations, the offsets that the autopilot reports (`OffsetWatch`), and the IMU output in the
 rolling window. The result of an automatic calibration is held back if it contradicts earlier ones: the active
 calibration and the gate stay as they are until somebody requests a calibration or the output changes again.
 """
@@ -46,30 +46,30 @@ from companion.samples import TRIADS, Triad, rows_of
 
 logger = logging.getLogger(__name__)
 
-# Reasons that a good window clears. It does not clear the others: offsets restored by the pilot or set by somebody else
-# stay until a request, and offsets replaced by a boot are written again.
+# Reasons that a good window clears. The other reasons stay: offsets restored by the pilot or set by somebody else count
+# until a request, and offsets replaced by a boot are written again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
-"""Findings that count even while a result is held back: choices of people, and writes without a visible effect."""
+"""Findings reported even if a result is held back: choices of people, and writes without a visible effect."""
 SETTLED_EVERY_S: Final = 5  # Interval between checks of the output while there is no finding; otherwise 1 s
 
 
 @dataclasses.dataclass(slots=True)
 class _TriadState:
-    """State of the gyros or accelerometers of one IMU; `held`: the active calibration, or why there is none."""
+    """State of the gyros or accelerometers of one IMU; `held`: the active calibration, or the reason for none."""
 
     held: Held | Why = Why.NEVER
     shelved: Held | None = None
-    """Calibration before a restart that kept the offsets; active again once a window agrees with it."""
+    """Calibration from before an autopilot restart; active again once a still window agrees with it."""
     present: Present | None = None
     in_doubt: tuple[str, Held] | None = None
-    """Result held back, with its reason; dropped when the output no longer agrees with it."""
+    """Reason and result of an automatic calibration that was held back; None once it no longer fits the output."""
     judged: bool = True
-    """False: integer readings too coarse to show the bias, so this triad is left out."""
+    """False if integer readings are too coarse to show the bias: these sensors are then left out of the check."""
 
 
 class ActiveCalibration:
-    """The active calibration; call `poll` often, and `measure` whenever there may be a new window."""
+    """Active calibration of all IMUs; call `poll` often, and `measure` whenever there may be a new still window."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
@@ -84,7 +84,7 @@ class ActiveCalibration:
         flown = [imu.name for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
         names = flown or [imu.name for imu in config.imu]
         self.what = What.BOTH if config.gradienter is not None else What.GYROS
-        """Biases that an automatic calibration determines."""
+        """Biases that an automatic calibration determines: accelerometers only if there is a gradienter."""
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
         self.temperatures_degc: dict[str, float] = {}  # Temperatures of the IMUs at the last check of their output
@@ -92,7 +92,7 @@ class ActiveCalibration:
         self._worth_since_s: float | None = None
         self.offsets = OffsetWatch(core.vehicle, imus, self._lose)
         self.calibration: Record | None = None
-        """Record of the last finished calibration of this run; None after an undo."""
+        """Record of the last calibration that this run of the daemon has finished; None after an undo."""
         self.undone = False
         calibrating.alignment.on_change.add(self._realigned)
 
@@ -127,12 +127,12 @@ class ActiveCalibration:
 
     @property
     def earlier(self) -> Record | None:
-        """The last good calibration, from this run or an earlier one, unless it was undone."""
+        """Last good calibration, from this run of the daemon or an earlier one; None if it was undone."""
         return None if self.undone else self.manager.last_good
 
     @property
     def worth_writing_s(self) -> float:
-        """Seconds for which every window has promised better offsets; one window in a hundred does so by chance."""
+        """Seconds during which each window predicted better offsets; one window in a hundred does so by chance."""
         return 0.0 if self._worth_since_s is None else self._measured_s - self._worth_since_s
 
     @property
@@ -145,19 +145,19 @@ class ActiveCalibration:
 
     @property
     def calibrated_s(self) -> float | None:
-        """Time of the oldest active calibration; None if some offsets were only confirmed, not calibrated."""
+        """Event-loop time of the oldest active calibration; None if some offsets were confirmed, not calibrated."""
         times = [held.calibrated_s for held in self._judged if isinstance(held, Held)]
         known = [time_s for time_s in times if time_s is not None]
         return min(known) if times and len(known) == len(times) else None
 
     @property
     def confirmed_s(self) -> float | None:
-        """Time since which all offsets are confirmed (the oldest confirmation); None while some never were."""
+        """Event-loop time of the oldest confirmation of all IMUs' offsets; None while some were never confirmed."""
         known = [held.confirmed_s for held in self._judged if isinstance(held, Held)]
         return min(known) if known and len(known) == len(self._judged) else None
 
     def sigma(self, triad: Triad) -> float | None:
-        """Return the largest active sigma_use, rad/s or m/s^2; None: no active calibration."""
+        """Return the largest sigma of the active gyro or accel calibrations, rad/s or m/s^2; None if there is none."""
         held = [state.held for (_, of), state in self._triads.items() if of == triad]
         return max((max(each.sigma_use) for each in held if isinstance(each, Held)), default=None)
 
@@ -219,7 +219,7 @@ class ActiveCalibration:
 
     def _lose(self, name: str, why: Why) -> None:
         for state in (state for key, state in self._triads.items() if key[0] == name and state.judged):
-            if why is not Why.REBOOTED:  # a reboot keeps the offsets, so a result held back stays held back
+            if why is not Why.REBOOTED:  # a reboot changes no offsets: a result held back stays so
                 state.in_doubt = None
             # A restart changes nothing where there was no active calibration, or the offsets were restored on purpose.
             if isinstance(state.held, Held) or why in (Why.CHANGED, Why.FAILED):
@@ -233,7 +233,7 @@ class ActiveCalibration:
             state.present = None
 
     async def measure(self, now_s: float) -> bool:
-        """Check the present output if due; return whether a check was made."""
+        """Check the active calibration against the present window, if due; return whether a check was made."""
         second = math.floor(now_s)  # the collector's seconds end on whole seconds of the clock
         settled = self.measured and self._worth_since_s is None and not self.findings(now_s)
         if second == self._looked_s or (settled and second - self._looked_s < SETTLED_EVERY_S):
@@ -291,7 +291,7 @@ class ActiveCalibration:
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:
-        """Return whether a result stays held back: while it is recent, and only it agrees with the output."""
+        """Return whether a result stays held back: it must be recent, and it alone must agree with the output."""
         if state.in_doubt is None:
             return False
         measured = state.in_doubt[1]
@@ -328,7 +328,7 @@ class ActiveCalibration:
             state.held = msgspec.structs.replace(held, confirmed_s=confirmed_s, temperature_degc=degc, seen=True)
 
     def _from_record(self, key: Key, now_s: float) -> Held | None:
-        """Return the calibration from before this start if the IMU has run with its offsets ever since."""
+        """Return the calibration from before the daemon's start, if the IMU has run with its offsets ever since."""
         (name, triad), record = key, self.earlier
         calibration = self._imus[name].calibration if name in self._imus else None
         imu = None if record is None else next((each for each in record.imus if each.name == name), None)

@@ -1,7 +1,8 @@
-"""The answer to an arming request with its reason, prepared four times a second.
+"""Answer to arming requests, with its reason, prepared four times a second.
 
-PX4's commander thread stops until the answer arrives (autopilots 5.2), so nothing is computed, read or awaited then.
-`Readiness._reasons` lists the reasons against arming in the order in which they are reported, with or without a gate.
+PX4's commander thread stops until the answer arrives (docs/reference/autopilots.md section 5.2). Therefore a request
+causes no computation, read or wait. `Readiness._reasons` lists the reasons against arming in the order in which they
+are reported, with or without a gate.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
-"""Stillness required after somebody has let go of the aircraft."""
-COUNTDOWN_KEPT_S: Final = 2.0  # Age of the last countdown beyond which it may rise again
+"""Time for which the aircraft must stand still after somebody has let go of it, before it may arm."""
+COUNTDOWN_KEPT_S: Final = 2.0  # Age of a countdown beyond which the next one may be higher
 OLDEST_ANSWER_S: Final = 1.5  # Age at which an answer that was not updated is void
 _STEPS: Final[dict[State, str]] = {
     State.WRITING: "writing offsets",
@@ -45,21 +46,21 @@ _CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.REBOOTED: "checking after restart",
     Why.UNSEEN: _STEPS[State.VERIFYING],
 }
-"""Findings that the next still window clears without a calibration."""
+"""Findings against a calibration that the next still window can clear without a new one, with their messages."""
 _NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
-"""Conditions without which the gate stays closed, whatever calibration is active."""
+"""Preconditions without which the arm gate refuses, whatever calibration is active."""
 _WAITS: Final = {
     Precondition.ARM_STATE_KNOWN: "no heartbeat from the autopilot",
     Precondition.RESTORED: f"{_STEPS[State.UNDOING]}: wait",
 }
 LATE_S: Final = 2.0
-"""Delay until the last second of telemetry is complete and checked."""
+"""Delay until the latest second of telemetry is complete and checked."""
 
 ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
 
 class Readiness:
-    """The arm gate's answer with its reason; `run` keeps it fresh."""
+    """Arm gate: its answer to arming requests, with the reason; `run` updates it."""
 
     def __init__(self, core: Core, owed: RebootOwed, in_force: ActiveCalibration, automatic: Automatic) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
@@ -69,7 +70,7 @@ class Readiness:
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._countdown = -math.inf, math.inf
-        """Time at which the countdown to a calibration was last computed, and its seconds."""
+        """Countdown to a calibration: event-loop time of its computation, and the seconds that were left then."""
         self._has_gated = False
         self.turns = 0
 
@@ -79,7 +80,7 @@ class Readiness:
 
     @property
     def asks_script(self) -> bool:
-        """Return whether ArduPilot's script gets the answer: while the gate is on, and afterwards, to release it."""
+        """Return whether ArduPilot's gate script gets the answer: while the gate is on, and later to permit arming."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
 
@@ -98,7 +99,7 @@ class Readiness:
             try:
                 self.update()
                 await asyncio.sleep(0)  # answer a request that has arrived meanwhile
-                # The output during a write does not show the effect of the offsets after it.
+                # Readings made during a write do not show the effect of the new offsets.
                 if not self._writing and await self._measured(loop.time()):
                     self.update()
                 self.turns += 1
@@ -108,7 +109,7 @@ class Readiness:
             await asyncio.sleep(POLL_S)
 
     async def _measured(self, now_s: float) -> bool:
-        """Call `ActiveCalibration.measure`, which may take seconds on a deck, and keep the answer fresh meanwhile."""
+        """Call `ActiveCalibration.measure` and update the answer meanwhile: on a ship's deck that takes seconds."""
         measuring = asyncio.ensure_future(self.in_force.measure(now_s))
         try:
             while not (await asyncio.wait((measuring,), timeout=POLL_S))[0]:
@@ -133,7 +134,7 @@ class Readiness:
         return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
     def judge(self, now_s: float) -> ArmAnswer:
-        """Return the answer that a gate gives at this moment, also if the gate is off."""
+        """Return the answer that an arm gate gives at this moment, even if the gate is off."""
         answer = next(self._reasons(now_s), None) or ArmAnswer("accept", self.state(now_s)[1])
         if not self._on_deck or answer.hold_still_s is None:
             return answer
@@ -175,7 +176,7 @@ class Readiness:
         status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
         if status.enough:
             return write_s
-        # Until the noise is known, the remaining time is the maximum.
+        # Until the noise is known, expect the longest duration.
         whole_s = status.still_s / status.progress if status.progress > 0.0 else self._wanted.settings.max_s
         left_s: float = max(1, math.ceil(whole_s - status.still_s)) + write_s
         named_at_s, named_s = self._countdown
@@ -187,7 +188,7 @@ class Readiness:
 
     @property
     def _check_s(self) -> float:
-        """Expected time from a write until its effect is seen and the EKF has settled."""
+        """Expected time from a write of offsets until its effect is seen and the EKF has settled."""
         kind = self._vehicle.kind
         return kind.settle_s + min(self._min_still_s, LOOK_S) + LATE_S + kind.ekf_reset_s
 
@@ -208,7 +209,7 @@ class Readiness:
         return state, "; ".join(filter(None, (words, held_back, "calibrate to write it")))
 
     def _state(self, now_s: float) -> tuple[ArmedState, str]:
-        """Judge the offsets alone, without the gate's other reasons (still, connected, ...)."""
+        """Return the state of the offsets with its text, ignoring the gate's other reasons (motion, link ...)."""
         in_force = self.in_force
         if against := next((one.against for one in self._reasons(now_s) if one.against), None):
             return "uncalibrated", against

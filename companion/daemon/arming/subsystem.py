@@ -34,11 +34,11 @@ QUEUE: Final = 16
 POLL_S: Final = 1.0
 RETRY_S: Final = 30.0
 SCRIPT_STARTS_S: Final = 10.0
-"""Longest wait for the script to show itself: scripting starts some seconds after the first heartbeat."""
+"""Longest wait for a sign of ArduPilot's gate script: scripting starts some seconds after the first heartbeat."""
 
 
 class Armings:
-    """Reports and records the active calibration at each arming; `run` writes to disk."""
+    """Reports and records the active calibration at each arming; `run` writes the records to disk."""
 
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._readiness, self._say, self._offload = readiness, core.say, core.offload
@@ -46,7 +46,7 @@ class Armings:
         self._queue: asyncio.Queue[ArmingRecord] = asyncio.Queue(QUEUE)
         self.last: ArmingRecord | None = None
         self.seen_disarmed = False
-        """False: never seen disarmed by this daemon, which may have started in flight."""
+        """True once this daemon has seen the aircraft disarmed; until then it may have started in flight."""
 
     async def run(self) -> None:
         try:
@@ -92,7 +92,7 @@ class GateSetup:
         self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self._said: str | None = None
         self.problem: str | None = None
-        """Missing settings, as text for people; None: complete, or not known yet."""
+        """Autopilot settings that the gate lacks, as text for people; None: nothing is missing, or not known yet."""
         self.known = False
         core.parameters.on_value.add(self._on_parameter)
 
@@ -116,7 +116,7 @@ class GateSetup:
 
 
 class Arming(Subsystem):
-    """Wires the active calibration, the gate, automatic calibrations and the history of armings."""
+    """Connects the active calibration, the gate, automatic calibrations and the history of armings."""
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
@@ -161,7 +161,7 @@ class Arming(Subsystem):
         return tasks
 
     def _calibration(self) -> Object | None:
-        """Return the active calibration, otherwise the last good one, without its age: the clock may be wrong."""
+        """Return the active calibration with its age, otherwise the last good one without age: the clock may be off."""
         in_force, now_s = self.in_force, asyncio.get_running_loop().time()
         known, record = in_force.calibration is not None, in_force.calibration or in_force.earlier
         if record is None:

@@ -1,6 +1,7 @@
-"""Manager of calibrations: starts, adopts, cancels and undoes them, one at a time, and keeps their records.
+"""Manager that starts, cancels and undoes calibrations and other jobs, one at a time, and stores their records.
 
-The module `run` has the calibration itself. A cancel waits for the next safe point and never interrupts a write.
+A request takes over a running automatic calibration. The module `run` contains the calibration itself. A cancel waits
+for the next safe point and never interrupts a write.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from companion.storage.records import RecordStore
 logger = logging.getLogger(__name__)
 
 STARTS_PER_S: Final = 1.0
-"""Sustained limit of starts per second: no person presses faster, but a script that starts and cancels might."""
+"""Maximum sustained rate of job starts: no person is faster, but a script that starts and cancels might be."""
 BURST: Final = 10.0
 
 
 class Precondition(enum.Enum):
-    """Conditions for a start, in the order in which they are reported."""
+    """Conditions for the start of a job, in the order in which unmet ones are reported."""
 
     STORAGE = enum.auto()
     ONE_AUTOPILOT = enum.auto()
@@ -57,7 +58,7 @@ REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = 
     Precondition.ARM_STATE_KNOWN: "unknown",
     Precondition.RESTORED: "busy",
 }
-"""Kind of refusal for each unmet condition; conditions not listed: "other"."""
+"""Kind of refusal for each unmet condition; conditions without an entry have the kind "other"."""
 
 
 def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple[Precondition, str]]:
@@ -80,7 +81,7 @@ def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple
 
 
 class CalibrationManager:
-    """The calibration service behind MAVLink, the control socket, MQTT and the page."""
+    """Calibration service used by MAVLink, the control socket, MQTT and the web page."""
 
     def __init__(self, parts: CalibrationParts, store: RecordStore, by_hand: ByHand) -> None:
         core = parts.core
@@ -89,7 +90,7 @@ class CalibrationManager:
         self._starts = Budget(STARTS_PER_S, BURST)
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
-        """The running or the latest job."""
+        """Running job, or the latest one if none is running."""
         self.reason = ""
         self.last: Record | None = None  # Record of the latest calibration, loaded from disk at start
         self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified when a job ends, before its requester
@@ -97,7 +98,6 @@ class CalibrationManager:
         self._recovery.on_recovered = self._recovered
 
     def load(self) -> None:
-        """Load the latest record; blocking."""
         try:
             self.last = next(iter(self._store.history(limit=1)), None)
         except StorageError as error:
@@ -107,7 +107,7 @@ class CalibrationManager:
 
     @property
     def progress_percent(self) -> int:
-        """Progress of the latest job; 100 once done, although its record may not be on disk yet."""
+        """Progress of the latest job in percent; 100 once it is done, even before its record is on disk."""
         if self.job is None or self._machine.state is State.DONE:
             return 100
         return self.job.progress_percent
@@ -159,13 +159,13 @@ class CalibrationManager:
         return self._start(run, Event.REQUEST, self._finish(run, run.calibrate()))
 
     def start_job(self, job: Job, run: Callable[[Job], Awaitable[str]], missing: str | None) -> Job | Refusal:
-        """Start a job of a kind in `NO_CALIBRATION`, or refuse; `missing`: reason why this aircraft cannot do it."""
+        """Start a job other than a calibration, or return a refusal; `missing`: reason why it is impossible here."""
         if (refusal := self._refusal(missing)) is not None:
             return refusal
         return self._start(job, Event.REQUEST, self._finish(job, run(job)))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
-        """Start to restore the values from before the last write (see `Recovery.undo`), or refuse."""
+        """Start a job that restores the values before the last write (see `Recovery.undo`), or return a refusal."""
         running = self._automatic_run()
         missing = None if running is not None else self._recovery.why_no_undo()
         if (refusal := self._refusal(missing, "nothing_to_undo", but=running)) is not None:
@@ -184,7 +184,7 @@ class CalibrationManager:
         return True
 
     async def close(self) -> None:
-        """Cancel the running job and wait until it has left the autopilot in order."""
+        """Cancel the running job and wait for its end, so that it has finished or rolled back its writes."""
         self.cancel("the daemon's end")
         if self._task is not None:
             await asyncio.wait([self._task])
@@ -192,7 +192,7 @@ class CalibrationManager:
     def _refusal(
         self, missing: str | None, kind: Literal["nothing_to_undo", "other"] = "other", *, but: Job | None = None
     ) -> Refusal | None:
-        """Return a refusal if a job cannot start, otherwise None; `but`: a running job that does not block it."""
+        """Return a refusal if no job can start now, otherwise None; `but`: a running job that blocks no start."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
         if but is None and (found := self.blocking_reason()) is not None:
@@ -302,7 +302,7 @@ class CalibrationManager:
             self._core.say(Severity.WARNING, f"Record not kept: {error}")
 
     async def _note_undone(self, step: ChangeSet) -> bool:
-        """Note in the history that a step was undone; return whether a calibration had made that step."""
+        """Note in the history that a write was undone; return whether a calibration had made that write."""
         if step.origin.what in BY_HAND:
             await self._by_hand.undone(step)
             return False

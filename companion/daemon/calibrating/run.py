@@ -1,7 +1,7 @@
 """One calibration from request to record: its state, and its phases in their order.
 
-`CalibrationRun.calibrate` runs the phases. `estimation.machine` has the table of states; a phase reports events to it,
-and raises an error if the calibration cannot go on.
+`CalibrationRun.calibrate` runs the phases. A phase reports events to the state machine (`estimation.machine`), and
+raises an error if the calibration cannot go on.
 """
 
 from __future__ import annotations
@@ -54,13 +54,11 @@ logger = logging.getLogger(__name__)
 Key = tuple[str, Triad]  # Name of an IMU, and its gyros or its accelerometers
 
 WRONG_IMU_ATTEMPTS: Final = 3
-"""Most attempts to write: with three IMUs, two may be taken for the right one before it is found."""
+"""Maximum number of write attempts: with three IMUs, two may be mistaken for the right one before it is found."""
 _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
 
 
 class CalibrationParts(NamedTuple):
-    """Parts of the daemon that every calibration uses."""
-
     core: Core
     imus: Mapping[str, AutopilotImu]
     measuring: Measuring
@@ -70,7 +68,7 @@ class CalibrationParts(NamedTuple):
 
 
 class CalibrationRun(Job):
-    """One calibration; the base class `Job` has request, progress, cancel and outcome."""
+    """One calibration; the base class `Job` has its request, progress, cancel and outcome."""
 
     def __init__(
         self,
@@ -83,7 +81,7 @@ class CalibrationRun(Job):
         reboot: bool = False,
         automatic: bool = False,
     ) -> None:
-        """Prepare a run; `before`: the last calibration, if it was good and has not been undone."""
+        """Prepare a calibration; `before`: the last one, if it was good and has not been undone."""
         kind = AUTOMATIC if automatic else "calibration"
         super().__init__(kind, what, requester, timeout_s, reboot=reboot, automatic=automatic)
         self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
@@ -93,19 +91,19 @@ class CalibrationRun(Job):
         self.begun_s = asyncio.get_running_loop().time()
         self.log = WriteLog()
         self.alignment: AlignmentUsed | None = None
-        """Active alignment of the gradienter; None: the configured zero and sigma apply."""
+        """Active alignment of the gradienter; None: zero and sigma come from the configuration."""
         self.calibrations: dict[str, ImuCalibration] = {}
-        """Calibrations that the autopilot used, by IMU, while its IMUs were measured."""
+        """Offsets and scales that the autopilot applied to each of its IMUs during the measurement."""
         self.held_back: dict[Key, Doubt] = {}
-        """Triads that an automatic run does not write because they contradict earlier calibrations."""
+        """Triads (gyros or accelerometers of an IMU) not written automatically: they contradict earlier results."""
         self._forget()
 
     def _forget(self) -> None:
         self.measured: Window | None = None  # Window of telemetry under the active offsets
         self.solution: Solution | None = None
-        """Estimate: the residual of the output for IMUs of the autopilot, the whole bias for others."""
-        self.points: dict[str, Point] = {}  # Biases by IMU for later predictions, kept if this calibration succeeds
-        self.unchanged: set[Key] = set()  # Triads that keep their offsets, which are as good as new ones
+        """Estimated biases: residuals after the offsets for the autopilot's IMUs, whole biases for other IMUs."""
+        self.points: dict[str, Point] = {}  # Biases by IMU for later predictions, stored on success
+        self.unchanged: set[Key] = set()  # Triads whose old offsets stay, as good as new ones
         self.plan: Plan | None = None
         self.held_back.clear()
         self.log.written.clear()
@@ -172,10 +170,10 @@ class CalibrationRun(Job):
             self._machine.on(Event.MOVED)
 
     async def _estimate(self) -> None:
-        """Estimate biases, weigh them with earlier ones, and hold back contradictions of an automatic run.
+        """Estimate biases, combine them with earlier ones by weight, and in an automatic run hold back contradictions.
 
-        A result that contradicts earlier ones is written on request only: a gradienter that has moved would spoil good
-        offsets unnoticed.
+        A result that contradicts earlier ones is written on request only. If the gradienter has moved, an automatic
+        write would spoil good offsets unnoticed.
         """
         assert self.measured is not None
         core, memory, unix_s = self._core, self._parts.memory, self.log.started_at.timestamp()
@@ -207,7 +205,7 @@ class CalibrationRun(Job):
             core.say(Severity.WARNING, f"Held back: {kept}; calibrate on request to write it all the same")
 
     async def _make_plan(self) -> None:
-        """Compute new offsets of every IMU that the autopilot uses, and the rivals to switch off."""
+        """Plan the new offsets of all IMUs in use, and the switching off of settings that would overwrite offsets."""
         assert self.solution is not None
         core, rivalry, slots = self._core, self._offsets.rivalry, self._offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}
@@ -234,7 +232,7 @@ class CalibrationRun(Job):
         refuse_shared(targets, slots)
         if targets:
             stops = rivalry.changes([target.calibration for target in targets])
-            # Rivals are switched off first, so that none acts during the write; an undo restores them last.
+            # Switch these settings off first, so that none acts during the write; an undo restores them last.
             targets[0] = dataclasses.replace(targets[0], changes=(*stops, *targets[0].changes))
             for change in stops:
                 words = f"{change.parameter} is switched off; companion undo switches it on again"
@@ -269,7 +267,7 @@ class CalibrationRun(Job):
     async def _remember(self) -> None:
         points = self.points
         if self._core.wanted.push and not self.automatic:
-            # The requester was told of each contradiction, and the measured biases are in use: mark them as chosen.
+            # The requester has got a message on each contradiction, and the biases are in use: mark them as chosen.
             # Leave out gyros if only earlier calibrations bounded the platform's turn: they bring nothing new.
             told = self.solution is not None and self.solution.turn.by != "earlier calibrations"
             points = {name: point.as_chosen(gyro=told) for name, point in points.items()}
@@ -318,7 +316,7 @@ def in_short(triads: Collection[Key]) -> str:
 
 
 def _less(points: Mapping[str, Point], held_back: Collection[Key]) -> dict[str, Point]:
-    """Remove triads that were held back: repeated measurements must not confirm each other."""
+    """Return the points without results held back, as repeated measurements must not confirm each other."""
     left: dict[str, Point] = {}
     for name, point in points.items():
         kept = msgspec.structs.replace(point, **{triad: None for imu, triad in held_back if imu == name})

@@ -40,9 +40,9 @@ from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2
 HEARD_WITHIN_S: Final = 5.0
-"""Longest wait of an undo for the first heartbeat of the autopilot."""
+"""Longest time that an undo waits for the first heartbeat of the autopilot."""
 ALIGN_TIMEOUT_S: Final = 900.0
-"""Default time limit: an alignment that nobody finishes must not block calibrations for ever."""
+"""Default time limit of an alignment: one that nobody finishes must not block calibrations for ever."""
 _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
     "zero": ALIGNMENT,
     "tilts": ALIGNMENT,
@@ -52,7 +52,7 @@ _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
 
 
 class Calibrating(Subsystem):
-    """Wires calibrations and alignments, and answers their commands."""
+    """Connects the parts that calibrate and align, and answers their commands."""
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
@@ -74,7 +74,7 @@ class Calibrating(Subsystem):
             part.load()
 
     def commands(self) -> Mapping[str, Handler]:
-        """Return the handlers; they raise RequestRefusedError, or another CompanionError once the job has started."""
+        """Return the handlers; they raise RequestRefusedError, or another CompanionError after the start of a job."""
         return {
             "calibrate": self._calibrate,
             "align": self._align,
@@ -197,7 +197,7 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, **found}
 
     def start_alignment(self, asked: Align, by: str) -> Job | Refusal:
-        """Start an alignment, or refuse; raise CalibrationRefusedError if the request names no kind of alignment."""
+        """Start an alignment, or return a refusal; raise CalibrationRefusedError if the request names no kind of it."""
         action = next((each for each in _KINDS if each == asked.action), None)
         if action is None:
             allowed = Align.fields()["action"].allowed
@@ -272,10 +272,10 @@ class Calibrating(Subsystem):
         return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
 
     async def _write_curves(self, job: Job, *, overwrite: bool) -> str:
-        """Measure, write the curves, and verify that the output does not change; return a summary as text.
+        """Write the bias curves over temperature to the autopilot, and verify that its output stays; return a summary.
 
-        The curves of all IMUs are written, or none. `overwrite`: also replace a temperature calibration that is not
-        ours. After an error or a cancel the old values are restored, or the error names those that are not.
+        The curves of all IMUs are written, or none. `overwrite`: replace even a temperature calibration that others
+        have written. After an error or a cancel the old values are restored, or the error names those that are not.
         """
         log = WriteLog()
         await self._core.offload(self.memory.follow)
@@ -326,7 +326,7 @@ class Calibrating(Subsystem):
         return targets, words, left
 
     def _accelerometer_curve(self, name: str, gyro: Curve) -> Polynomial | None:
-        """Return the accelerometers' curve if its temperatures span the gyros': an autopilot has one span for both."""
+        """Return the accelerometers' curve if it spans the gyros' temperatures (an autopilot has one span for both)."""
         curve, calibration = self.memory.curve(name, "accel"), self._imus[name].in_force
         if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
             return None

@@ -1,7 +1,7 @@
-"""One IMU of the autopilot: its telemetry, the offsets subtracted in it, and changes of these by others.
+"""One IMU of the autopilot: its telemetry, the offsets that the autopilot subtracts in it, and changes of the offsets.
 
-Samples count only while these offsets are known; a change by anybody voids the samples collected before. Other writers
-are people, or a boot that calibrates the gyros (INS_GYR_CAL = 1).
+Samples count only while these offsets are known; a change by anybody voids the samples collected before. Offsets are
+also written by people, and by a boot of ArduPilot with INS_GYR_CAL = 1, which calibrates the gyros.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 RETRY_S: Final = 3.0
 CONFIRMED_WITHIN_S: Final = 3.0
-"""Longest time from an announced change to a reading that refutes it: a later one does not cover the time between."""
+"""Longest delay after which a read disproves an announced change: later, the offset may have changed and returned."""
 
 
 class AutopilotImu:
@@ -43,17 +43,17 @@ class AutopilotImu:
     def __init__(self, core: Core, imu: Imu, slots: SlotMemory, ekf_bias: EkfBias, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
-        """Calibration that the autopilot subtracts, as read; None while unknown."""
+        """Offsets and scales that the autopilot applies, as last read; None while they are unknown."""
         self.problem = message("offsets_not_read", why="start")
         self.failures = 0
         self.upsets = 0
         self.upset = ""
         self.on_sample: Listeners[ImuSample] = Listeners()
-        self.on_counting: Listeners[ImuSample] = Listeners()  # Listeners to samples that count, before the collector
+        self.on_counting: Listeners[ImuSample] = Listeners()  # Listeners to samples under known offsets
         self.on_raw: Listeners[float, Six, float | None] = Listeners()
-        """Listeners to means of raw readings: time, output less the present offsets, temperature in deg C."""
+        """Listeners to means of raw readings: time, output with the present offsets applied, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
-        """Listeners to readings of the offsets: the previous one (None after a write of ours), and the present one."""
+        """Listeners to reads of the offsets: previous ones (None after a write by the companion), present ones."""
         self.on_change: Listeners[[]] = Listeners()
         self.input = models.imu_input(core.profiles.imu(self.name), None)
         self._slots, self._ekf_bias, self._profiles = slots, ekf_bias, core.profiles
@@ -61,7 +61,7 @@ class AutopilotImu:
         self._known: ImuCalibration | None = None
         self._ours = 0
         self._announced: tuple[str, float, float] | None = None
-        """Name, value and time of a parameter change that somebody announced and `refresh` has not checked yet."""
+        """Parameter change that somebody announced and `refresh` has not checked yet: name, value, time."""
         self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self.stream = ImuStream(
             core.link,
@@ -78,7 +78,7 @@ class AutopilotImu:
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:
-        """Suspend counting samples and reading offsets while we write offsets ourselves."""
+        """Suspend the use of samples and the reading of offsets while the companion itself writes offsets."""
         self._ours += 1
         self.calibration = self._known = None
         self.on_change.tell()
@@ -95,20 +95,20 @@ class AutopilotImu:
 
     @property
     def decided(self) -> bool:
-        """Return True once it is known if this IMU exists: offsets and samples have arrived, or failed to."""
+        """True once it is known whether this IMU exists: its offsets and samples have arrived, or failed to."""
         if self.calibration is None:
             return self.failures > 0 or (self.stream.decided and bool(self.stream.problem))
         return self.stream.decided
 
     @property
     def in_force(self) -> ImuCalibration:
-        """The calibration that the autopilot subtracts; raises AutopilotError while it is unknown."""
+        """Offsets and scales that the autopilot applies; raises AutopilotError while they are unknown."""
         if self.calibration is None:
             raise AutopilotError(f"imu {self.name}: {self.problem}")
         return self.calibration
 
     async def refresh(self) -> bool:
-        """Read the offsets; if they have changed, void the samples and return False. Raises AutopilotError."""
+        """Read the offsets; if they may have changed, void the samples and return False. Raises AutopilotError."""
         assumed, announced, self._announced = self.calibration, self._announced, None
         why = "offsets read again" if announced is None else f"{announced[0]} was changed"
         try:
@@ -198,7 +198,7 @@ class AutopilotImu:
             active = {rival.parameter: rival.value for rival in known.rivals}
             watched = {rival.parameter for rival in self._vehicle.kind.rivals}
             if name not in watched or active.get(name, 0) == value:
-                return  # otherwise a rival was switched: offsets are the same, but may be overwritten later
+                return  # otherwise a setting that overwrites offsets has changed
         self.reading.again(REREAD_EVERY_S)
 
     def _on_event(self, event: VehicleEvent) -> None:
@@ -236,18 +236,18 @@ def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
 
 
 _Known = tuple[tuple[float, ...], int]
-"""Offsets without their parameter names, as PX4 may move an IMU to other parameters; and the number of boots."""
+"""Offset values without names, as PX4 may move an IMU to other parameters, and the autopilot's boot count."""
 
 
 class OffsetWatch:
-    """Detects changes of the offsets; call `poll` often. `lost` gets the IMU that lost our offsets, and the reason."""
+    """Detects changes of the offsets; call `poll` often. Calls `lost` with the IMU whose calibration ended and why."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost
         self._known: dict[str, _Known] = {}
-        self._before: dict[str, _Known] = {}  # Offsets before a job, kept until those after it are read
+        self._before: dict[str, _Known] = {}  # Offsets before a job, until those after it are read
         self._failed = self._asked_restart = False
-        self._written: dict[str, dict[str, float]] = {}  # Values just written, by IMU, kept until they are read
+        self._written: dict[str, dict[str, float]] = {}  # Values just written, by IMU, until they are read
         self.foreign: str | None = None  # Change by somebody else since the last request, as a short text
 
     def known(self) -> dict[str, _Known]:

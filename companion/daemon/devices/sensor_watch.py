@@ -1,4 +1,4 @@
-"""Detection of a gradienter or compass whose reading stays the same while the IMUs see the aircraft move."""
+"""Detection of a gradienter or compass whose reading does not change while the IMUs measure motion of the aircraft."""
 
 from __future__ import annotations
 
@@ -23,28 +23,29 @@ logger = logging.getLogger(__name__)
 PERIOD_S: Final = 0.5
 REMEMBERED_S: Final = 300
 TILTED_DEG: Final = 3.0
-"""Least tilt that proves a sensor stuck: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
+"""Minimum tilt that proves an unchanged gradienter reading stuck: 300 times the coarsest gradienter's resolution,
+far beyond the error of a mean."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
 QUIET_S: Final = 3.0
-"""Largest lag of an IMU behind the others to count as a witness; a write of offsets causes one."""
+"""Longest data gap of an IMU that still counts as evidence of motion; a write of offsets causes such a gap."""
 LATE_S: Final = 1.0
-"""Largest delay of an IMU's first second behind the others' to count as a witness: a later IMU missed the start."""
+"""Maximum delay of an IMU's first data after the other IMUs': a later IMU missed the start of the motion."""
 TURNED_DEG: Final = 15.0
 TURNING_RAD_S: Final = math.radians(12.0)
-"""Least rate that counts as turning; a bias may be up to 10 deg/s."""
+"""Minimum angular rate that counts as turning; a gyro bias may be up to 10 deg/s."""
 
 
 NO_OFFSETS: Final = object()
-"""Offsets of an IMU whose readings no autopilot corrects."""
+"""Value for the offsets of an IMU whose readings no autopilot corrects."""
 
 
 class SensorWatch:
-    """Checks every sensor twice a second.
+    """Checks every sensor twice a second, also against the tilts and turns that the IMUs measure.
 
-    The IMUs are the witnesses of a tilt or a turn. Each measures it in its own axes, so no mounting is needed.
-    `offsets_of`: the offsets subtracted from an IMU's readings, or None while unknown. After a change of the offsets or
-    of the board's orientation an IMU's record starts anew: the change must not look like a tilt.
+    Each IMU measures them in its own axes, so no mounting is needed. `offsets_of`: the offsets subtracted from an IMU's
+    readings, or None while they are unknown. After a change of the offsets or of the board's orientation an IMU's data
+    are collected anew: the change must not look like a tilt.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class SensorWatch:
         self._sensors, self._collector = sensors, collector
         self._offsets_of, self._say = offsets_of, say
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
-        """Whole seconds of each IMU: number of the second, direction of the mean force, turn about it in degrees."""
+        """One-second summaries by IMU: number of the second, unit vector of the mean force (3,), turn about it, deg."""
         self._offsets: dict[str, object] = {}
         self._has_failed = False
 
@@ -100,7 +101,7 @@ class SensorWatch:
                 seconds.append((batch.slot, down, math.degrees(about) if abs(about) > TURNING_RAD_S else 0.0))
 
     def _seen(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
-        """Return the whole seconds between two times, of each IMU that covers as much of them as the others."""
+        """Return each IMU's one-second summaries between two times, without IMUs that cover less than others."""
         # Measured against the newest second, not the clock: collection stops while a sensor is implausible.
         newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
         found = [
@@ -117,7 +118,7 @@ class SensorWatch:
         if since_s is None or last_s is None:
             return None
         near_s = sensor.health.stream.near_since_s or since_s
-        # The smallest tilt that any IMU saw counts.
+        # Use the smallest tilt that any IMU measured.
         tilted_deg = min((_tilted_deg(each, since_s) for each in self._seen(near_s, last_s)), default=0.0)
         # Turns add up, and so do turns too slow to count: begin the sum shortly before the reading froze.
         seen = self._seen(max(near_s, since_s - BEFORE_S), last_s) if "compass" in sensor.kinds else []
@@ -144,7 +145,7 @@ class SensorWatch:
 
 
 def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:
-    """Return the tilt from the first second's pose if the latest seconds since `since_s` all show it; otherwise 0."""
+    """Return the smallest tilt, in deg, of the latest summaries since `since_s` against the first; 0 if too few."""
     stayed = [down for slot, down, _ in seconds[1:] if slot >= since_s][-TILTED_SECONDS:]
     if len(stayed) < TILTED_SECONDS:
         return 0.0

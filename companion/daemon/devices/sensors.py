@@ -1,4 +1,4 @@
-"""The companion's own serial devices: port, decoder, dialogue, and listeners to the samples."""
+"""Sensors on the companion's own serial ports: connection, decoding, dialogue, and listeners to the samples."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 RATE_SPAN_S: Final = 2.0
 TICK_S: Final = 0.02
-"""Shortest time between two messages to a device, and period of checks while the dialogue goes on."""
+"""Minimum time between two messages to a device, and interval of checks for due messages during a dialogue."""
 COARSE_S: Final = 0.25
 LIVELY_S: Final = 1.0
 LOOK_AGAIN_S: Final = 60.0
@@ -41,7 +41,7 @@ RESTARTED: Final = "restarted"
 FLOOD_S: Final = 1.0
 GOOD_AFTER_S: Final = 1.0
 AGAIN_S: Final = 60.0
-"""Shortest time between two warnings of one kind of trouble; repeats go to the debug log, as a loose wire has many."""
+"""Minimum time between two warnings of one kind of trouble; repeats, common with a loose wire, go to the debug log."""
 
 
 class SensorHealth:
@@ -72,7 +72,7 @@ class SensorHealth:
         return Trouble(found.key, f"{self.link.settings}: {found.words}", found.implausible)
 
     def update(self, now_s: float, stuck: Trouble | None = None) -> tuple[Trouble | None, bool]:
-        """Count and log changes (call twice a second); return the trouble, and whether a warning was logged now."""
+        """Count and log new trouble (call twice a second); return present trouble, and whether a warning was logged."""
         self._stuck = stuck
         if (breaks := self._decoder.times.clock.breaks) != self._breaks:
             self.counts[RESTARTED] += breaks - self._breaks
@@ -98,7 +98,7 @@ class SensorHealth:
         if found.key == self._reported:
             return False
         if found.key == ABSENT or (now_s - self._opened_s < SILENT_AFTER_S and not found.implausible):
-            return False  # `ByteLink` reports a lost port; a port just opened gets a moment to start
+            return False  # `ByteLink` reports a lost port; a device may need a moment to start
         if self._reported is None:
             self._began_s = now_s
         self._reported = found.key
@@ -120,7 +120,7 @@ def _flood(budget: Budget | None, now_s: float) -> Trouble | None:
 
 
 class SensorRole:
-    """One role of a device, with its sample count and rate, for `companion status`."""
+    """One role of a device (IMU, gradienter or compass): its sample count and rate, for `companion status`."""
 
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
         self.name, self.kind = role.name, role.kind
@@ -179,7 +179,7 @@ class SensorRole:
 
 
 class SerialSensor:
-    """One serial device, read and decoded once for all its roles; `take` is called with a role and its sample."""
+    """One serial device, read and decoded once for all its roles; `take` is called with each role and its sample."""
 
     def __init__(
         self, device: SerialDevice, take: Callable[[Role, Sample], None], offload: Offload = asyncio.to_thread
@@ -198,13 +198,13 @@ class SerialSensor:
         )
         self.health = SensorHealth(self.link, self.protocol, self.decoder)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
-        """Listeners to device name, bytes and time, before decoding; bytes of None mark a gap."""
+        """Listeners to received bytes before decoding: device name, bytes (None marks a gap), time."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
-        """Listeners to all samples of a read and the time of the read, before the collector."""
+        """Listeners to the samples of one read, and its time; they are called before the collector."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
-        """North of the headings that were refused because another one is configured."""
+        """North reference of headings that were refused, as the configuration names another one."""
         self._spoke_s = -math.inf
         self._alone = False
         self._look_at_s = -math.inf
@@ -255,7 +255,7 @@ class SerialSensor:
             self._speak(t_s)
 
     async def _converse(self) -> None:
-        """Send due messages: check often during a dialogue, seldom otherwise, as ticks cost processor time."""
+        """Send due messages to the device: check often during a dialogue, otherwise seldom to save processor time."""
         loop = asyncio.get_running_loop()
         while True:
             is_lively = loop.time() - self._spoke_s < LIVELY_S
@@ -265,7 +265,7 @@ class SerialSensor:
             self._speak(loop.time())
 
     async def _look_for_others(self) -> None:
-        """Check that no other program holds the port, such as a login or modem service: two writers do harm."""
+        """Check that no other program (such as a login or modem service) has the port open: two writers do harm."""
         opening, port = self._openings, self.link.settings
         holders = () if port.is_tcp else await self._offload(find_holders, port.url)
         if opening != self._openings:

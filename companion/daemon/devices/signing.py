@@ -1,4 +1,4 @@
-"""MAVLink signing in the daemon: the key, the signing time across restarts, and refused senders."""
+"""MAVLink signing in the daemon: the key, the signature timestamp across restarts, and refused senders."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ logger = logging.getLogger(__name__)
 
 PERIOD_S: Final = 1.0
 AHEAD_S: Final = 30.0
-"""Signature time reserved by one write to disk, so the largest jump ahead after a power cut. The specification refuses
-new senders that are more than a minute behind, so the jump stays well below that."""
+"""Range of signature timestamps reserved by one write to disk, hence the largest jump ahead after a power cut. The
+specification refuses new senders that are more than a minute behind, so the jump stays well below that."""
 RESERVE_BEFORE_TICKS: Final = 5 * TICKS_PER_S
 UNANSWERED: Final = 3
-"""Number of unanswered requests in a row, one a second, after which the autopilot seems to require signatures."""
+"""Number of TIMESYNC requests in a row, one a second, that may go unanswered; more show that signing is required."""
 ASK_AGAIN_S: Final = 30.0  # Pause after an answer of the autopilot before the next request
 AFTER_S: Final = 3.0
-"""Time without a verified message before a fault is reported; a change of the key takes less."""
+"""Time without a verified message of the autopilot before a fault is reported; a change of the key takes less."""
 AHEAD_OF_CLOCK_S: Final = 86400.0
-"""Lead of the signature time over the system's clock that shows a wrong clock, not just a board without power."""
+"""Lead of the signature timestamp over the system clock that proves a wrong clock, not merely a power cut."""
 
 _COUNTED: Final[tuple[Reason, ...]] = ("other key", "unsigned", "old")
 _FAULTS: Final = {
@@ -53,8 +53,8 @@ _SENDERS: Final[dict[Reason, str]] = {
 class LinkSigning:
     """Signs and verifies one link; reports whether the autopilot and the companion accept each other's messages.
 
-    An autopilot that signs while the companion has no key may still accept unsigned messages. A TIMESYNC request shows
-    it: both firmwares answer at once, armed or not (autopilots 2, 4.5).
+    An autopilot that signs while the companion has no key may still accept unsigned messages. The answer to a TIMESYNC
+    request shows that it does: both firmwares answer at once, armed or not (autopilots.md sections 2 and 4.5).
     """
 
     def __init__(self, config: Config, link: MavlinkLink, vehicle: Vehicle, say: Say, offload: Offload) -> None:
@@ -68,7 +68,7 @@ class LinkSigning:
         self._named: set[Reason] = set()  # Reasons already reported of a sender other than the autopilot
         self.warning: str | None = None  # Present fault of the autopilot's signatures, with its remedy
         self._refused: Counter[Reason] = Counter()
-        """Refused messages with the autopilot's ids, by reason, since the last verified one."""
+        """Number of refused messages with the autopilot's ids since its last verified one, by reason."""
         self._verified = False
         self._bad_since_s: float | None = None
         self._asked = self._unanswered = 0
@@ -199,7 +199,7 @@ class LinkSigning:
 
     @property
     def rejecting(self) -> str | None:
-        """Fault of signing that keeps the autopilot from being found although messages arrive, or None."""
+        """Signing fault that keeps the companion from finding the autopilot although messages arrive, or None."""
         if self.signing is None or not self.signing.required:
             return None
         if self.trouble:

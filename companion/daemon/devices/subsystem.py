@@ -1,7 +1,8 @@
-"""The devices: the autopilot's IMUs, our own sensors, and the check whether ground stations reach the companion.
+"""Devices: the autopilot's IMUs, the companion's sensors, and the check whether ground stations reach the companion.
 
-Both firmwares forward a command for component 191 only to a link on which they hear its heartbeat. PX4 forwards only
-between links with MAV_n_FORWARD = 1 at its start; no message shows which MAV_n our link is (autopilots 5.4).
+Both firmwares forward a command for component 191 (the companion) only to a link on which they receive heartbeats of
+component 191. PX4 forwards only between links with MAV_n_FORWARD = 1 at its start; no message shows which MAV_n the
+companion's link is (docs/reference/autopilots.md section 5.4).
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ RETRY_S: Final = 10.0
 
 
 class Reach:
-    """Checks whether a ground station reaches the companion: by its heartbeats, and by the forwarding parameters."""
+    """Checks whether a ground station reaches the companion: by received heartbeats, and by forwarding parameters."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
         self._vehicle, self._parameters, self._url = vehicle, parameters, url
@@ -71,7 +72,7 @@ class Reach:
 
 
 class Devices(Subsystem):
-    """Sources of samples; without `imu_rate_hz` each autopilot IMU sends at the rate that the connection can carry."""
+    """Sources of samples; without `imu_rate_hz` each autopilot IMU sends at the rate that the link can carry."""
 
     def __init__(self, core: Core, imu_rate_hz: float | None) -> None:
         self._core = core
@@ -125,7 +126,7 @@ class Devices(Subsystem):
         }
 
     def _misplaced(self, name: str) -> str | None:
-        """Return a warning if, in the last second, an IMU's gravity lay along another axis than the gradienter's."""
+        """Return a warning if an IMU and the gradienter measured "down" along different axes in the last second."""
         config, collector = self._core.config, self._core.collector
         tilt, model = collector.tilt_second(), models.gradienter_model(config.gradienter)
         imu, batch = next((imu for imu in config.imu if imu.name == name), None), collector.imu_seconds().get(name)

@@ -1,1 +1,1 @@
-"""The attitude sent to the autopilot, its supervision, and the settings that the autopilot needs for it."""
+"""The attitude sent to the autopilot, the supervision of it, and the autopilot settings that it needs."""

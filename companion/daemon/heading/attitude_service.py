@@ -1,4 +1,4 @@
-"""The attitude pushed to the autopilot: samples in, messages out, the fallback of ArduPilot, and texts for people."""
+"""Service that sends the attitude to the autopilot, selects ArduPilot's fallback, and reports to people."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
 LATE_S: Final = 3.0
 SHORTEST_S: Final = 0.02
-"""Least time between two messages: ArduPilot drops a message that comes sooner (autopilots 6)."""
+"""Minimum time between two messages: ArduPilot drops a message that comes sooner (autopilots.md section 6)."""
 SHOWN_EVERY_S: Final = 0.2
 """Interval of attitude messages for ground stations: autopilots forward them to slow radios."""
 _ROUNDING_S: Final = 1e-6
 SCRIPT_STARTS_S: Final = 15.0
-"""Wait after the first heartbeat before reading whether there is a script on the flight controller."""
+"""Wait after the autopilot's first heartbeat before checking if a fallback script runs on the flight controller."""
 WELL_S: Final = 10.0  # Time of uninterrupted push before the source set with our heading is requested again
 AGAIN_S: Final = 1.0
 _OURS, _COMPASS, _GYROS = 1, 2, 3
@@ -60,10 +60,11 @@ _WORDS: Final = {
 
 
 class Fallback:
-    """Selects the source set of ArduPilot's EKF when our heading ends: set 3 in flight, set 2 on the ground.
+    """Selects the source set of ArduPilot's EKF when no companion heading is sent: 3 in flight, 2 on the ground.
 
-    Set 3 is gyros and GNSS (autopilots 10.4). Set 2 is the compass: in flight nothing could check it. The script on the
-    flight controller (companion/lua) selects the set; without it `step` sends a request. PX4 falls back by itself.
+    Set 3 uses gyros and GNSS (docs/reference/autopilots.md section 10.4). Set 2 uses the compass, which nothing could
+    check in flight. A script on the flight controller (companion/lua) selects the set; if there is none, `step` sends
+    a command to the autopilot. PX4 falls back without help.
     """
 
     def __init__(self, core: Core) -> None:
@@ -118,7 +119,7 @@ class Fallback:
 
 
 class Sender:
-    """Sends the attitude to the autopilot at its rate; with `full` also to ground stations."""
+    """Sends the attitude to the autopilot at the rate `rate_hz`; with `full` also to ground stations."""
 
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
@@ -127,7 +128,7 @@ class Sender:
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf
 
     def is_due(self, t_s: float, now_s: float) -> bool:
-        """Return whether the attitude of time `t_s` is due; time stamps and sending times are `SHORTEST_S` apart."""
+        """Return whether to send the attitude of time `t_s`: time stamps and sendings must be `SHORTEST_S` apart."""
         return (
             t_s >= self._next_s - _ROUNDING_S
             and t_s - self._last_s >= SHORTEST_S - _ROUNDING_S
@@ -150,7 +151,7 @@ class Sender:
 
 
 class AttitudeService:
-    """Estimates, pushes and supervises the attitude; `run` is its task."""
+    """Estimates and supervises the attitude, and sends it to the autopilot (the push); `run` is its task."""
 
     def __init__(self, core: Core, devices: Devices, in_force: ActiveCalibration, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
@@ -188,7 +189,7 @@ class AttitudeService:
     # --- inputs
 
     def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
-        """Wrap a sample callback: an exception stops the push and drops the estimate, but calibration goes on."""
+        """Wrap a sample callback: an exception stops the push and drops the estimate, but calibration continues."""
 
         def guarded(samples: Sequence[Sample], read_s: float) -> None:
             try:
@@ -207,7 +208,7 @@ class AttitudeService:
             self._push(read_s)
 
     def _push(self, read_s: float) -> None:
-        """Send the attitude if due. Runs in the event-loop turn that read the samples: a timer would skip messages."""
+        """Send the attitude if due; run in the event-loop turn that read the samples: a timer would skip messages."""
         if not self.health.pushing or not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()

@@ -1,4 +1,4 @@
-"""The attitude estimator in the daemon: its samples, calibration and alignments."""
+"""Attitude estimator of the daemon, with its samples, its calibration and its alignments."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from companion.samples import CompassSample, ImuSample, Sample, Triad, Vector
 logger = logging.getLogger(__name__)
 
 KEPT_S: Final = 5.0
-"""Time for which samples are kept, to carry an alignment from the end of its still window (up to 2 s ago) to now."""
+"""Time for which samples are stored, to propagate an alignment from its still window's end (up to 2 s ago) to now."""
 _NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
 CHECK_EVERY_S: Final = 10.0
@@ -43,7 +43,7 @@ TILT_FLOOR_RAD: Final = 0.5 * DEG
 HEADING_FLOOR_RAD: Final = 3.0 * DEG
 DISAGREES_SIGMAS: Final = 3.0
 JUMP_RAD: Final = 1.0 * DEG
-"""Least change of heading by an alignment that is reported to the autopilot as a reset."""
+"""Minimum change of heading at an alignment that is reported to the autopilot as a reset."""
 SLOWEST_AIRSPEED_M_S: Final = 5.0
 UNCALIBRATED_ACCEL_MG: Final = 50.0
 """One sigma of a consumer accelerometer's bias, used if only the gyros were calibrated."""
@@ -51,7 +51,7 @@ _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 def carrying_imu(config: Config) -> Imu:
-    """Return the IMU for the attitude: the companion's own, if any, as it is faster, unfiltered and ours alone."""
+    """Return the IMU for the attitude: the companion's own, if any, as it is faster, unfiltered and not shared."""
     return next((imu for imu in config.imu if imu.source == "serial"), config.imu[0])
 
 
@@ -100,7 +100,7 @@ class StandingAttitude:
     t_s: float
     body_from_ned: Matrix
     covariance: Matrix
-    """Covariance of the attitude error, (3, 3), NED, rad^2."""
+    """Covariance (3, 3) of the attitude error, as rotations about north, east and down, rad^2."""
     heading_known: bool
     local: LocalEarth
 
@@ -108,7 +108,7 @@ class StandingAttitude:
 def standing_attitude(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
 ) -> StandingAttitude:
-    """Estimate the attitude in a still window; refuse readings that contradict each other. Blocking."""
+    """Estimate the attitude in a still window; raise CalibrationRefusedError if readings disagree. Blocking."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
     turn = truth.body_from_ned
@@ -141,7 +141,7 @@ class Carrier:
         self._local: LocalEarth | None = None
         self._record: ImuRecord | None = None
         self._recent: deque[Sequence[ImuSample]] = deque()
-        """Samples of the last `KEPT_S`, by read; collected on the ground, and while there is no estimator."""
+        """Samples of the last `KEPT_S`, one list per read; stored on the ground, and while there is no estimator."""
         self.align_wanted = False
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
@@ -273,7 +273,7 @@ class Carrier:
         assert self.estimator is not None
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
-        # Just after landing no samples are kept: then the attitude applies to the last sample.
+        # Just after landing no samples are stored: then the attitude applies to the last sample.
         begun_s = stand.t_s if since else self.heard_s if math.isfinite(self.heard_s) else None
         self.estimator.align(begun_s, stand.body_from_ned, stand.covariance)
         self.estimator.update(since, phase=self.phase)

@@ -1,4 +1,4 @@
-"""Health of the pushed attitude, and its difference from the autopilot's attitude."""
+"""Checks of the attitude that is sent to the autopilot, and its difference from the autopilot's own attitude."""
 
 from __future__ import annotations
 
@@ -35,36 +35,36 @@ DIFFERS_SIGMAS: Final = 3.0
 DIFFERS_S: Final = 5.0
 ATTITUDE_RATE_HZ: Final = 10.0
 THEIR_TILT_DEG: Final = 2.0
-"""One sigma of the autopilot's tilt, including trim (AHRS_TRIM) and mounting errors."""
+"""Standard deviation of the autopilot's tilt, including trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
-"""One sigma of the autopilot's heading, from a compass or from the companion."""
+"""Standard deviation of the autopilot's heading, from a compass or from the companion."""
 GOOD_S: Final = 3.0  # Time without a fault before a stopped push resumes
 TOLD_TILT_DEG: Final = 4.0
 TOLD_HEADING_DEG: Final = 8.0
-"""Smoothed differences (tilt and heading) that start a warning; it ends at half of them."""
+"""Smoothed difference of heading that starts a warning (of tilt: `TOLD_TILT_DEG`); the warning ends at half of it."""
 SMOOTHED_S: Final = 3.0
-"""Smoothing time: the two attitudes differ briefly because their filters have different delays."""
+"""Time constant that smooths attitude differences: two filters with different delays disagree briefly."""
 OLD_S: Final = 2.0
 STEEP_RAD: Final = math.radians(60.0)
 """Pitch beyond which roll and heading cannot be separated."""
 FORGETS_PER_S: Final = 0.02
-"""Growth of the smallest clock offset seen, s per s: two clocks may drift apart, a simulated one by 1 %."""
+"""Rate at which the smallest clock offset to the autopilot is raised, s/s: clocks drift, a simulated one by 1 %."""
 HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
 STRAYS_RAD: Final = math.radians(5.0)
 FADES_S: Final = 4.0
-"""Time constant of the fading sum: a drift up to 1.25 deg/s goes undetected, and the compass corrects it."""
+"""Time constant of the fading sum of heading drift: up to 1.25 deg/s goes undetected, and the compass corrects it."""
 STRAYS_SIGMAS: Final = 3.0  # Allowed drift in sigmas of the heading: the compass may correct a poorly known heading
 SCALES: Final = 0.01
 """Tolerated difference between the scale factors of two gyros, as a fraction of the angle turned."""
 LATE_S: Final = 0.03  # Usual time difference between the two attitudes
 LONGEST_STEP_S: Final = 0.25
-"""Longest time step that is compared: a longer one could hide a turn to and fro."""
+"""Longest time step over which heading and gyros are compared: a longer one could hide a turn to and fro."""
 
 
 class HeadingDriftMonitor:
-    """Sums our heading's turn minus that of other gyros, by the rule of the script on the flight controller."""
+    """Sums the companion heading's turn minus that of other gyros, by the same rule as the autopilot's script."""
 
     def __init__(self) -> None:
         self.strayed_rad = 0.0
@@ -76,7 +76,7 @@ class HeadingDriftMonitor:
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
-        """Add a heading, its sigma, and the other gyros' rate about the vertical; `late_s`: further time error."""
+        """Add a heading, its sigma, and other gyros' rate about the vertical; `late_s`: time error beyond `LATE_S`."""
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         if before is None:
             self._sigma_rad = max(self._sigma_rad, sigma_rad)
@@ -99,17 +99,17 @@ class HeadingDriftMonitor:
 
 
 class Difference:
-    """Difference between our attitude and the one in the autopilot's ATTITUDE messages."""
+    """Difference between the companion's attitude and the one in the autopilot's ATTITUDE messages."""
 
     def __init__(self, vehicle: Vehicle, carrier: Carrier) -> None:
         self._carrier = carrier
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
-        """Growth of the clock offset since the last message with the shortest delay, s; bounds the timing error."""
+        """Amount by which the clock offset was raised since the message with the least delay, s: largest time error."""
         self.theirs: tuple[float, Quaternion] | None = None
-        """The autopilot's last attitude: time on our clock, and body to NED."""
+        """Autopilot's latest attitude: time on the companion's clock, and quaternion from body to NED."""
         self.latest: tuple[float, float] | None = None
-        """Unsmoothed `tilt_rad` and `heading_rad`; None while the pitch is beyond `STEEP_RAD`."""
+        """Unsmoothed difference of tilt and of heading, rad; None while a pitch is beyond `STEEP_RAD`."""
         self.heard_s = -math.inf
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
@@ -132,15 +132,15 @@ class Difference:
 
     @property
     def heading_rad(self) -> float:
-        """Smoothed difference of heading, the autopilot's minus ours, in [-pi, pi]."""
+        """Smoothed difference of heading, the autopilot's minus the companion's, in [-pi, pi]."""
         return cmath.phase(self._heading)
 
     def levelled(self, attitude: Attitude, now_s: float) -> Attitude:
-        """Return our attitude rotated by the shortest arc to the autopilot's vertical, if that is known.
+        """Return the attitude rotated by the shortest arc so that its vertical is the autopilot's, if that is known.
 
-        PX4 computes the yaw of its own quaternion with an order of angles that depends on the tilt. At 30 deg of tilt
-        the yaw of two orders differs by up to 10 deg. PX4 jumps to a heading that it has refused for 1 s
-        (ev_yaw_control.cpp, getEulerYaw).
+        PX4 computes yaw with an order of Euler angles that depends on its own tilt. At 30 deg of tilt the yaw of two
+        orders differs by up to 10 deg. PX4 jumps to a heading that it has refused for 1 s (ev_yaw_control.cpp,
+        getEulerYaw).
         """
         if not self.is_heard(now_s):
             return attitude
@@ -216,10 +216,11 @@ def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tu
 
 
 class Health:
-    """Decides whether the attitude may be pushed; call `judge` several times a second.
+    """Decides whether the attitude may be sent to the autopilot (pushed); call `judge` several times a second.
 
     A heading that differs from the autopilot's stops the push if both agreed since the last alignment, or if the
-    autopilot's comes from its own compass (`own_agrees`): one of them is wrong. Only an alignment ends a heading drift.
+    autopilot's heading comes from its own compass (`own_agrees`). In both cases one heading is wrong. A detected
+    heading drift stops the push until the next alignment.
     """
 
     def __init__(

@@ -1,6 +1,7 @@
 """Start of the daemon in flight: the attitude resumes with the last calibration, or not at all.
 
-Roll and pitch come from the autopilot, the heading from our compass. Nothing is pushed before it agrees with ours.
+Roll and pitch come from the autopilot, the heading from the companion's compass. No attitude is sent to the autopilot
+before the companion's and the autopilot's agree.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ DECLINATION_SIGMA_DEG: Final = 1.0
 
 
 class Resume:
-    """Resumes the attitude in flight; call `step` several times a second until `pending` is false."""
+    """Resumes the attitude estimate in flight; call `step` several times a second until `pending` is false."""
 
     def __init__(
         self, core: Core, carrier: Carrier, difference: Difference, calibrating: Calibrating, imu: AutopilotImu | None

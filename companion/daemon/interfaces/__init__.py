@@ -1,1 +1,1 @@
-"""Interfaces: control socket, headline, MAVLink component, and the child processes for page and MQTT."""
+"""Interfaces: control socket, headline, MAVLink component, and the child processes for web page and MQTT."""

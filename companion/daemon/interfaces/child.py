@@ -28,7 +28,7 @@ FIRST_REPORT_S: Final = 60.0
 """Longest wait for the first report: a small board with a cold SD card imports the child's libraries slowly."""
 SILENT_S: Final = 5.0 * REPORT_EVERY_S
 END_WITHIN_S: Final = 3.0
-"""Longest wait for a child to end: the MQTT process publishes the last state and "offline" first."""
+"""Longest wait for the end of a child: the MQTT process publishes the last state and "offline" before it ends."""
 WORTH_S: Final = 30.0
 REPORT_LIMIT: Final = 256 * 1024
 

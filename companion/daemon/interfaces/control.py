@@ -34,7 +34,7 @@ REQUEST_LIMIT: Final = 64 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
 KERNEL_BYTES: Final = 16 * 1024
 MAX_CLIENTS: Final = 16
-"""Most connections in each of three classes: no request yet, urgent commands, other commands."""
+"""Maximum number of connections in each of three classes: no request yet, urgent commands, other commands."""
 URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
 
 
@@ -186,7 +186,7 @@ def _remove_stale(path: Path) -> None:
 
 
 def process_behind(path: Path) -> set[int]:
-    """Return the process that listens on a control socket; empty: no process, or no access to it."""
+    """Return the id of the process that listens on a control socket; empty: no process, or no access to it."""
     try:
         with socket.socket(socket.AF_UNIX) as asking:
             asking.settimeout(1.0)

@@ -1,4 +1,4 @@
-"""Headline: the state in a word or two with its reason, which the page and the monitor show first."""
+"""Headline: the daemon's state in a word or two with its reason, shown first by the web page and the monitor."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from companion.messages import message
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
-"""good: ready to fly. wait: be patient, or hold still. busy: the companion is working. bad: somebody has to act."""
+"""Tone: good (ready to fly), wait (be patient or hold still), busy (the companion works), bad (somebody must act)."""
 
 
 Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, and the tone
 
 
 class Headlines:
-    """Makes the headline for all interfaces."""
+    """Composes the headline that all interfaces show."""
 
     def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager

@@ -1,6 +1,6 @@
-"""Interfaces: the MAVLink component, the control socket's answers, and the child processes for MQTT and the page.
+"""Interfaces: the MAVLink component, the control socket's answers, and the child processes for MQTT and the web page.
 
-Each command is answered by its subsystem; the status is made of the parts of all subsystems.
+Each command is answered by its subsystem; the status is merged from the parts of all subsystems.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
-"""Names of the child processes in a request, and their wording as the requester ("cancelled by mqtt cancel")."""
+"""Name of each child process in requests, and its name in texts on the requester, as in "cancelled by mqtt cancel"."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
-"""Status of the page while its process reports nothing."""
+"""Status of the web page while its process reports nothing."""
 
 
 class Interfaces(Subsystem):
@@ -91,7 +91,7 @@ class Interfaces(Subsystem):
         return (self._start_child or Child)(name, module, settings)
 
     async def answer(self, request: Object, face: str | None = None) -> AsyncIterator[Object]:
-        """Answer a request; `face`: name of the child process that sent it. Raises CompanionError if it is refused."""
+        """Answer a request; `face`: name of the interface that sent it. Raises CompanionError if it is refused."""
         command = request.get("command")
         face = face or FACES.get(str(request.get("face")), "companion")
         handler = self._handlers.get(command) if isinstance(command, str) else None
@@ -109,7 +109,7 @@ class Interfaces(Subsystem):
         yield {"kind": "result", "status": await self.refresh()}
 
     async def _monitor(self, request: Monitor, _face: str) -> AsyncIterator[Object]:
-        """Stream the status every 0.5 s, a new state or record at once; with `pose` also the attitude every 0.2 s."""
+        """Stream the status every 0.5 s; with `pose` also the attitude every 0.2 s, a new state or record at once."""
         if not request.pose:
             while True:
                 yield {"kind": "progress", "status": await self.refresh()}

@@ -1,6 +1,6 @@
-"""`companion check`: checks that everything configured answers, and lists faults with the remedy to type.
+"""`companion check`: tests whether everything configured answers, and lists faults with the remedy to type.
 
-The check asks a running daemon, which holds the ports; without one it opens every port and reads for a while.
+The check asks a running daemon, which has the ports open; without a daemon it opens every port and reads for a while.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ONLY_CHECKING: Final = "only a check is running: start companion run"
 LOST_S: Final = 5.0
 HEARTBEAT_WITHIN_S: Final = 4.0
 IMUS_MOST_S: Final = 30.0
-"""Longest wait until it is known which IMUs an autopilot has: a slow line with lost packets, and all retries."""
+"""Longest wait until an autopilot's IMUs are known: enough for all retries on a slow line that loses packets."""
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
@@ -79,7 +79,7 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
 
 
 async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[CheckLine]:
-    """Explain, from the bytes received, why sensors give no good samples; `may_listen`: no daemon holds the ports."""
+    """Explain, from received bytes, why sensors give no good samples; `may_listen`: no daemon has the ports open."""
     devices = {device["name"]: device for device in status["devices"]}
     sick = [sensor for sensor in serial_devices(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED]
     tried: dict[str, Heard | str] = {}
@@ -151,7 +151,7 @@ async def run_check(
         async for reply in ask(config.control.path, {"command": "status"}):
             status = reply.get("status")
     except DaemonDeniedError:
-        raise  # a daemon runs and holds the ports
+        raise  # a daemon runs and has the ports open
     except DaemonUnreachableError:
         pass
     is_running = status is not None
@@ -163,7 +163,7 @@ async def run_check(
         findings.append(CheckLine("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
-        # Start a daemon that writes nothing, and take its status after some seconds.
+        # Start a daemon that writes nothing, and use its status after some seconds.
         service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(lambda listened_s: listened_s < seconds)
     findings += [CheckLine("configuration", good=False, words=words) for words in cannot_work(config)]
@@ -194,7 +194,7 @@ async def run_check(
 
 
 async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str | None]:
-    """Return the autopilot IMUs that exist (offsets and samples arrive), each with its part (None: unknown)."""
+    """Return the autopilot IMUs whose offsets and samples arrive, with their sensor models (None: unknown)."""
     alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
     service = Service(alone, only_listening=ONLY_CHECKING)
 

@@ -1,7 +1,7 @@
 """The daemon as a process: its subsystems on one event loop, its signals, and the watchdog of its long-lived tasks.
 
-SIGTERM and SIGINT end it in order, with old values restored and exit code 0. SIGHUP is ignored: a companion run by hand
-continues when its terminal closes. The service manager's watchdog is fed while all tasks make progress. A task that
+SIGTERM and SIGINT end the daemon with old values restored and exit code 0. SIGHUP is ignored: a daemon started in a
+terminal continues when that closes. The service manager's watchdog is fed while all tasks make progress. A task that
 hangs is logged with the place where it waits, before the manager ends the process.
 """
 
@@ -51,24 +51,24 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SETTLED_WITHIN_S: Final = 20.0
-"""Longest wait for MQTT: a small board takes seconds to start its process, and giving up a silent broker 10 s."""
+"""Longest wait for MQTT: a small board needs seconds to start its process, and a silent broker is given up in 10 s."""
 LISTEN_TURN_S: Final = 0.1
 SETTLED_AFTER_S: Final = 3.0
-"""Time after the start by which lazily imported modules (recording, the child processes) are loaded."""
+"""Time after the start by which all lazily imported modules (recording, the child processes) are loaded."""
 PERIOD_S: Final = 1.0
 FEEDS_PER_LIMIT: Final = 4.0
-"""Number of feeds of the watchdog within a short limit, so that one of them may be late."""
+"""Number of watchdog feeds within the service manager's time limit, if that is short, so that one may be late."""
 MARGIN_S: Final = 2.0
 COMPONENT_S: Final = 5.0
 ESTIMATOR_S: Final = 10.0
 AUTOMATIC_S: Final = 180.0
-"""Deadline of a task that may read a dozen parameters over a bad radio link, each with all retries."""
+"""Time limit for progress of a task that may read a dozen parameters over a bad radio link, each with all retries."""
 
 
 class Service:
-    """The daemon, made of subsystems; each uses only those created before it in `__init__`.
+    """The daemon, made of subsystems; each subsystem uses only those created before it in `__init__`.
 
-    `only_listening`: in check mode, the reason why no job starts. `link`, `offload` and `child` are for tests.
+    `only_listening`: the reason for refusing every job in check mode. Tests pass `link`, `offload` and `child`.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Service:
         )
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Run until cancelled; call `on_ready` when the control socket answers. Raises CompanionError at the start."""
+        """Run until cancelled; call `on_ready` when the control socket answers. Raises CompanionError on failure."""
         for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
@@ -106,7 +106,7 @@ class Service:
                 await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
-        """Run all tasks until cancelled, then leave the autopilot in order; tests replace `mavlink` and `ports`."""
+        """Run all tasks until cancelled, then finish or roll back a write; tests run without `mavlink` or `ports`."""
         for subsystem in (self.devices, self.offsets, self.calibrating):
             subsystem.load()
         tasks = [
@@ -132,7 +132,7 @@ class Service:
             self.core.vehicle.close()
 
     async def listen(self, goes_on: Callable[[float], bool]) -> Object:
-        """Open everything, listen while `goes_on(seconds)` is true, and return the status; nothing is written.
+        """Open all connections, listen while `goes_on(seconds)` is true, and return the status; nothing is written.
 
         The seconds are counted in turns of the event loop, so a slow process listens longer.
         """
@@ -158,7 +158,7 @@ class Service:
 
 @dataclasses.dataclass(slots=True)
 class WatchedTask:
-    """A task that must make progress, shown by its count of turns: the event loop idles even if the task hangs."""
+    """Task that must make progress, measured by its count of turns: the event loop runs on even if a task hangs."""
 
     name: str
     task: str
@@ -166,7 +166,7 @@ class WatchedTask:
     who: Any  # Object with the count `turns`
     seen: int = 0
     age_s: float = 0.0
-    """Time since the latest turn, summed up by `overdue`: while the whole event loop is stopped, no task ages."""
+    """Time since the task's latest turn, summed up by `overdue`; a stop of the whole event loop does not count."""
 
     def overdue(self, passed_s: float) -> bool:
         before, self.seen = self.seen, self.who.turns
@@ -232,7 +232,7 @@ def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
 
 
 class Supervisor:
-    """Runs a service until a signal or a fault, and feeds the watchdog."""
+    """Runs a service until a signal or a fault, and feeds the service manager's watchdog."""
 
     def __init__(self, service: Service, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager

@@ -1,1 +1,1 @@
-"""Measurement of still windows, and alignments from several: gradienter, six positions, turn on the spot."""
+"""Measurement of still windows, and alignments from several poses: gradienter zero, six positions, turn in place."""

@@ -1,4 +1,4 @@
-"""Stored results of alignments: the gradienter's zero, accelerometers measured on all sides, and the history."""
+"""Stored results of alignments: the gradienter's zero, six-position results of accelerometers, and the history."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 
 
 class ActiveAlignment:
-    """The gradienter's measured zero, and the check that it still fits the configuration."""
+    """Gradienter's measured zero, and the check that it still fits the configuration."""
 
     def __init__(self, config: Config, offload: Offload) -> None:
         self._gradienter, self._offload = config.gradienter, offload
@@ -52,7 +52,6 @@ class ActiveAlignment:
         self.on_change: Listeners[[]] = Listeners()
 
     def load(self) -> None:
-        """Load the stored alignment; blocking."""
         self._take(self._store.load())
         if self._store.unusable is not None:
             self.unused = self._store.unusable
@@ -108,7 +107,7 @@ class ActiveAlignment:
 
 
 class ActiveSixPosition:
-    """Accelerometer errors from a measurement on all sides, converted to the present offsets and scales."""
+    """Accelerometer errors from a six-position measurement, converted to the present offsets and scales."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._store, self._offload = faces_in(core.config.storage.path), core.offload
@@ -117,7 +116,6 @@ class ActiveSixPosition:
         self.record: FacesRecord | None = None
 
     def load(self) -> None:
-        """Load the stored record; blocking."""
         self.record = self._store.load()
 
     async def keep(self, record: FacesRecord) -> None:
@@ -156,7 +154,7 @@ class ActiveSixPosition:
         return None if calibration is None else self.known(name, calibration, temperature_degc)
 
     def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Sides | None:
-        """Return the errors left in one IMU's output, in its own axes; None: this sensor was never measured."""
+        """Return the errors left in one IMU's output, in sensor axes; None if this sensor was never measured."""
         imus = () if self.record is None else self.record.imus
         kept = next((imu for imu in imus if imu.name == name), None)
         if kept is None or kept.accel_id != calibration.accel_id:
@@ -194,7 +192,6 @@ class ByHand:
         self._done: list[Done] = []
 
     def load(self) -> None:
-        """Load the history; blocking."""
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:
@@ -239,7 +236,7 @@ class ByHand:
         return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]
 
     def _shown(self, done: Done) -> Object:
-        """Return an alignment as an object; `in_force`: the autopilot holds all written values (None: unknown)."""
+        """Return an alignment as an object; `in_force`: whether the autopilot has all its values (None: unknown)."""
         in_force: bool | None = None
         if done.undone_at is not None:
             in_force = False

@@ -29,10 +29,10 @@ from companion.estimation.solution.truth import Otherwise
 from companion.links.system.events import Listeners
 
 POLL_S: Final = 0.2
-"""Longest interval between checks; each complete second of samples causes one at once."""
+"""Longest interval between checks of a measurement; each complete second of samples causes a check at once."""
 SAY_WAITING_EVERY_S: Final = 10.0
 SAY_LEFT_EVERY_S: Final = 75.0
-"""Interval of messages during a measurement; long enough for none in the first minute on a deck."""
+"""Interval of messages on the time left; long enough for none in the first minute on a ship's deck."""
 READ_ATTEMPTS: Final = 2
 MOST_UPSETS: Final = 5
 
@@ -51,7 +51,7 @@ class Measuring:
         self._upsets_before = {name: imu.upsets for name, imu in self._imus.items()}
 
     async def read_state(self, job: Job, if_armed: str | None) -> tuple[CollectorStatus, str | None, int | None]:
-        """Return the collector's status, the reason to wait, and the seconds to hold still if nothing else is needed.
+        """Return the collector's status, the reason to wait, and the seconds to hold still if nothing else is missing.
 
         `if_armed`: text of the error if the aircraft was armed since the job began; None: wait until it is disarmed.
         """
@@ -129,12 +129,12 @@ class Measuring:
 
 
 class Estimator:
-    """Estimates biases with the active alignment and the present site."""
+    """Estimates biases with the active alignment, for the present place on Earth."""
 
     def __init__(self, core: Core, alignment: ActiveAlignment, faces: ActiveSixPosition, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
         self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
-        """Listeners to the inputs of a calibration's estimate: place, fallbacks, biases requested, earlier biases."""
+        """Listeners to the inputs of an estimate: place, fallbacks for sensors, biases requested, biases predicted."""
 
     async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, Otherwise]:
         config = self._core.config

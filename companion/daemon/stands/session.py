@@ -1,8 +1,8 @@
 """One alignment from its first pose to its record: guide an operator, measure, estimate, write, save.
 
-`PoseSession.run` has all steps in order. A `PoseTask` has the parts that differ between alignments: the wanted poses,
-the acceptance test, the fit and the record. No button is pressed between poses: a movement is detected, and the next
-pose begins when it has ended. So one person alone can follow the ground station's voice or the page.
+`PoseSession.run` executes all steps in order. A `PoseTask` defines the parts that differ between alignments: the
+requested poses, the acceptance test, the fit and the record. No button is pressed between poses: the next pose begins
+when a detected movement has ended. Thus one person alone can follow the ground station's voice or the web page.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 STAND_S: Final = 12.0
-"""Still time for each pose: averaging beyond 10 s improves no accelerometer (method 2.3)."""
+"""Time without motion in each pose: averaging beyond 10 s improves no accelerometer (method.md section 2.3)."""
 SETTLE_S: Final = 1.0
 STOP_WITHIN_DEG: Final = 5.0
-"""Say *stop* when the next sample of the turn would be within this angle of the target."""
+"""Remaining angle at which the operator is asked to stop: the next sample would come this close to the target."""
 TURNS_DEG: Final = 2.0
-"""Least turn within a second that counts as turning."""
+"""Minimum turn within a second that counts as turning."""
 EARLY_S: Final = 3.0
-"""Still time after which a movement counts as too early; before, the aircraft is still being set down."""
+"""Time at rest after which a movement counts as too early; before that, the aircraft is still being set down."""
 STILL_MOVING_S: Final = 20.0
 """Duration of movement after which the operator gets a message: a hand or the wind may move the aircraft."""
 LEANED_DEG: Final = 0.03
-"""Largest lean within a pose; half of it gets into the mean, as much as an error of the marks."""
+"""Largest change of tilt within a pose; half of it enters the mean, as much as an error of placement on floor marks."""
 ARMED: Final = "armed during the alignment; the earlier one stays in force"
 
 
 @dataclasses.dataclass(slots=True, eq=False)
 class SessionState:
-    """State of one alignment; kept after its end for pages that are opened later."""
+    """State of one alignment; available after its end too, for web pages that are opened later."""
 
     job: Job
     windows: list[Window] = dataclasses.field(default_factory=list)
     poses: list[HeldPose] = dataclasses.field(default_factory=list)
     ups: list[Vector] = dataclasses.field(default_factory=list)
-    """Direction of up in the aircraft's axes for each pose, from its accelerometers."""
+    """Unit vector pointing up in each pose, in vehicle axes (FRD), from the accelerometers."""
     first_calibrations: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
     outcome: str | None = None  # None while it runs
 
@@ -75,9 +75,9 @@ class SessionState:
     objection: str = ""  # Fault of the latest pose, if it was not the requested one
     share: float = 0.0
     since_s: float = 0.0
-    """Time since which the aircraft has not moved."""
+    """Event-loop time since which the aircraft has not moved."""
     moved: bool = False
-    """True: the aircraft has moved since the previous pose, or since the latest objection."""
+    """True once the aircraft has moved after the previous pose, or after the latest objection."""
     still_s: float = 0.0
     moving_since_s: float = math.inf
     hold_still_said: bool = False
@@ -113,31 +113,31 @@ class SessionState:
 
 
 class PoseTask(abc.ABC):
-    """Parts that differ between alignments: poses, acceptance test, fit, record and estimate."""
+    """Base class of the kinds of alignment: their poses, acceptance test, fit, record and estimate."""
 
     imus_alone: ClassVar[bool] = True
-    """True: do not wait for gradienter or compass, as either may fall silent when turned over."""
+    """True: do not wait for samples of gradienter or compass, as either may stop sending when turned over."""
     if_armed: ClassVar[str | None] = None
-    """Text of the error if the aircraft arms; None: the alignment goes on once disarmed."""
+    """Text of the error if the aircraft arms; None: the alignment continues once it is disarmed."""
     request: AlignmentRequest
     total: int
     fit_from: int
-    """Number of poses for the first estimate; each further pose gives another one."""
+    """Number of poses before the first fit; the fit is repeated after each further pose."""
     board: Mounting | None = None  # Tilt of the board, if it can be known
     shortfall: str | None = None
-    """Figure that is still unknown after the last pose; then nothing is written or saved."""
+    """Text on a bias or scale still unknown after the last pose; then nothing is written or saved."""
 
     @abc.abstractmethod
     def wish(self, state: SessionState) -> Wish | None:
-        """Return the next wanted pose; None: there are enough poses."""
+        """Return the next pose to request; None: there are enough poses."""
 
     @abc.abstractmethod
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
-        """Return the pose in a new window, and the objection if it is not the requested one."""
+        """Return the pose that a new window shows, and an objection if it is not the requested pose."""
 
     @abc.abstractmethod
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
-        """Estimate from all poses; return messages for the operator. Raises if they do not fit. Runs in a thread."""
+        """Fit all poses and return messages for the operator; raise CalibrationRefusedError on a bad fit. Blocking."""
 
     @abc.abstractmethod
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> HandRecord:
@@ -317,7 +317,7 @@ class PoseSession:
         return True
 
     def _object(self, state: SessionState, objection: str) -> None:
-        """Report an objection to the operator; if it is too long to be spoken whole, repeat the request."""
+        """Report an objection to the operator; if it is too long for one spoken message, repeat the request."""
         state.objection, state.hold_still_said = objection, False
         self._core.prompt(Tune.WRONG, objection)
         if len(objection) > LINE_BYTES:

@@ -1,4 +1,4 @@
-"""Kinds of alignment: on one spot, the gradienter's zero or level accelerometers; on all sides, accelerometers."""
+"""Kinds of alignment: gradienter zero and accelerometer level at one place, and accelerometers in six positions."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ from companion.physics.units import DEG, MG
 
 LEAST_STANDS: Final = 3
 READING_SIGMA_DEG: Final = 0.005
-"""Noise of one mean of a gradienter (table in method 3.4)."""
+"""Noise of one mean of a gradienter, one sigma (docs/reference/method.md section 3.4, table)."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
-EXPECTED: Final = 12  # Usual number of stands on all sides
+EXPECTED: Final = 12  # Usual number of poses in a six-position alignment
 MOST: Final = 24
-"""Largest number of stands on all sides."""
+"""Maximum number of poses in a six-position alignment."""
 _FIRST: Final = Wish("any side down, propped up, hands off")
 LOOSE_M_S2: Final = 0.5 * MG
-"""Sigma of the level bias above which its main error is the angle of the turn, not the marks."""
+"""Sigma of the level bias above which its main error is the turn's angle, not the placement on the floor marks."""
 
 
 class SpotTask(PoseTask):
-    """Base class of alignments on one spot, with the estimate."""
+    """Base class of alignments in which the aircraft turns at one place, with the estimate."""
 
     result: Alignment
     stands: Sequence[StandMeans] = ()
@@ -82,9 +82,9 @@ class SpotTask(PoseTask):
         )
 
     def _make_stands(self, state: SessionState, names: Sequence[str], north_deg: float = 0.0) -> None:
-        """Build the means of each stand for the named IMUs.
+        """Set `stands` to the mean readings in each pose, for the named IMUs.
 
-        `north_deg`: correction from the poses' north to true north, added to each heading.
+        `north_deg`: angle added to the heading of each pose, to refer it to true north.
         """
         stands = []
         for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
@@ -111,7 +111,7 @@ class SpotTask(PoseTask):
 
 
 class ZeroTask(SpotTask):
-    """Measures the gradienter's zero; with tilts also its mounting relative to each IMU."""
+    """Measures the gradienter's zero; from tilted poses also its mounting relative to each IMU."""
 
     imus_alone: ClassVar[bool] = False
     if_armed: ClassVar[str | None] = ARMED
@@ -133,7 +133,7 @@ class ZeroTask(SpotTask):
         except ValueError as error:
             raise CalibrationRefusedError(str(error)) from None
         if self._compass is None or now.heading is None:
-            pose = self._counted(state, now, up, 0.1)  # headings count from the first stand
+            pose = self._counted(state, now, up, 0.1)  # headings count from the first pose
         else:
             heading_deg = vehicle_heading_rad(self._compass, now.heading.heading_deg, up) / DEG
             pose = HeldPose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
@@ -190,7 +190,7 @@ class ZeroTask(SpotTask):
 
 
 class TurnTask(SpotTask):
-    """Measures level biases of accelerometers and the slope, without a gradienter; the board's tilt after all sides."""
+    """Measures level accelerometer biases and the ground's slope; with six-position results also the board's tilt."""
 
     def __init__(
         self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: ActiveSixPosition
@@ -252,7 +252,7 @@ class TurnTask(SpotTask):
 
 
 def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None = None) -> list[str]:
-    """Return the IMUs (of `among`) whose accelerometers can be read in all stands; raise if there is none."""
+    """Return the names of IMUs (in `among`) readable in all poses; raise CalibrationRefusedError if there are none."""
     read = [{imu.name for imu in window.imus if not imu.refused("accel")} for window in windows]
     names = [imu.name for imu in windows[0].imus if all(imu.name in each for each in read)]
     names = [name for name in names if among is None or name in among]
@@ -262,7 +262,7 @@ def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None
 
 
 def ground(local: LocalEarth, compass: CompassModel | None) -> Ground:
-    """Return gravity and the Earth's rate; without a compass, heading 0 is the first stand's, in any direction."""
+    """Return gravity and the Earth's rotation rate; without a compass, heading 0 is that of the first pose."""
     rate, of_rate = local.rate_in_body(np.eye(3), heading_known=compass is not None)
     covariance = of_rate.copy()
     if compass is not None and compass.magnetic:
@@ -280,7 +280,7 @@ def _temperatures(window: Window) -> dict[str, float | None]:
 
 
 class SidesTask(PoseTask):
-    """Measures bias and scale of accelerometers in stands of any orientation, until every figure is known."""
+    """Measures bias and scale of accelerometers in poses of any orientation, until every bias and scale is known."""
 
     total = EXPECTED
     fit_from = 1
@@ -374,7 +374,7 @@ class SidesTask(PoseTask):
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:
-        """Return mean and sigma in the sensor's own axes, in which firmwares apply the scale."""
+        """Return mean and sigma, (3,) each, in sensor axes, in which autopilots apply the scale."""
         turn = self._imus[imu.name].in_force.orientation.T
         return turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2))
 

@@ -1,7 +1,7 @@
 """Writes of alignments to the autopilot: accelerometer offsets and scales, and the level of the board.
 
 The level is ArduPilot's AHRS_TRIM, which rotates the reported attitude only, or PX4's SENS_BOARD_X/Y_OFF, which rotates
-the output of the IMUs. PX4's telemetry shows it within a second, but EKF2 learns the new tilt slowly, or at a restart.
+the output of the IMUs. PX4's telemetry shows a new level within a second, but EKF2 learns it slowly, or at a restart.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from companion.storage.changes import Origin
 
 MOST_DEG: Final = 10.0
 SEEN_DEG: Final = 0.1
-"""Least step that is visible in an attitude, which wanders by hundredths of a degree."""
+"""Smallest step that is visible in an autopilot's attitude, which wanders by hundredths of a degree."""
 SEEN_SHARE: Final = 0.2
 WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5
-"""Time until new parameters are in use: both firmwares read them once a second."""
+"""Time until written parameters are in use: both firmwares read them once a second."""
 LATEST_S: Final = 4.0
-"""Time span of attitudes that count: on a busy link they come seconds late, but an estimator wanders."""
+"""Largest age of attitude messages in use: a busy link delays them by seconds, but old estimates have wandered."""
 POLL_S: Final = 0.25
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
