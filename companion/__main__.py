@@ -1,4 +1,4 @@
-"""`python -m companion`."""
+"""Entry point of `python -m companion`, which runs the command line."""
 
 import sys
 

@@ -1,7 +1,7 @@
-"""The table of commands: one class per command, with the types, limits and help of its fields and who may use them.
+"""Table of commands: one class per command, with the type, limits and help of each field and who may set it.
 
-The options of the command line, the requests of the control socket, of MQTT and of the page are derived from it. The
-MAVLink component maps the parameters of its commands to the same fields. A new command is a class and a place in `ALL`.
+Command line options and the requests over control socket, MQTT and web page are derived from this table. The MAVLink
+component converts the parameters of its commands to the same fields. A new command needs a class and a place in `ALL`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.machine import LONGEST_S, What
 from companion.formats import Object, printable
 
-MAX_SHOWN: Final = 60  # The most characters of a value in a refusal
+MAX_SHOWN: Final = 60  # Maximum number of characters of a value in an error text
 
 
 class Interface(enum.Flag):
-    """The interfaces through which a command reaches the daemon; the control socket serves all of them."""
+    """Interfaces through which a command can reach the daemon; its control socket itself accepts every command."""
 
     COMMAND_LINE = enum.auto()
     GROUND = enum.auto()  # `companion ground` over MAVLink
@@ -36,15 +36,15 @@ _ALL: Final = _SHELLS | Interface.MQTT | Interface.PAGE
 
 
 class Field(NamedTuple):
-    """A field of a command; its type is filled in from the class."""
+    """Description of one field of a command; `type` comes from the annotation of the field."""
 
     help: str = ""
     by: Interface = _SHELL  # The interfaces that may set the field
     metavar: str | None = None
     allowed_words: str = ""
-    """Allowed values in words, if the type does not define them."""
+    """Description of the allowed values, for a type that does not list them."""
     flags: Mapping[str, str] = {}
-    """Values with an option of their own on the command line (--gyros), and the help of each."""
+    """Values of a field that have their own command line option, such as --gyros, each with its help text."""
     positional: bool = False  # True: on the command line, values that are not in `flags` are positional
     short: str = ""
     default: Any = None  # Value used by the command line if none is given
@@ -65,19 +65,19 @@ class Field(NamedTuple):
 
     @property
     def allowed(self) -> str:
-        """Allowed values in words: `allowed_words`, otherwise derived from the type."""
+        """Description of the field's allowed values: `allowed_words`, otherwise derived from the type."""
         if self.type is bool:
             return "true or false"
         return self.allowed_words or ", ".join(map(shown, self.values))
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
-    """One request to the daemon. The tag is its name."""
+    """Base class of all commands to the daemon; the `tag` of a subclass is the name of its command."""
 
     help: ClassVar[str] = ""
     by: ClassVar[Interface] = _SHELL  # The interfaces that may send the command
     urgent: ClassVar[bool] = False
-    """True: the control socket reserves connections for the command."""
+    """True: the control socket reserves connections for this command, so that others cannot block it."""
 
     @classmethod
     def name(cls) -> str:
@@ -90,7 +90,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
 
     @classmethod
     def read(cls, request: Object) -> Self:
-        """Parse a request; unknown keys are ignored, and null counts as not given.
+        """Parse the fields of a request; ignore unknown keys and keys whose value is null.
 
         Raises:
             CalibrationRefusedError: a value is not allowed.
@@ -263,7 +263,7 @@ class RecordInputs(Command, frozen=True, tag="record"):
 
 
 class Answer(Command, frozen=True, tag="answer"):
-    """Answer a question of the first-run set-up, which a page asks before there is a daemon."""
+    """Answer of the operator to a question of the first-run set-up, which runs before there is a daemon."""
 
     by = Interface.PAGE
     number: Annotated[int | None, Field(by=by, allowed_words="a whole number")] = None
@@ -276,7 +276,7 @@ ALL: Final = {
         Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, RecordInputs, Answer
     )
 }  # fmt: skip
-"""The commands by name."""
+"""Class of each command, by the name of the command."""
 
 
 def asked_by(interface: Interface) -> dict[str, type[Command]]:

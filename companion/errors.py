@@ -1,13 +1,13 @@
-"""Errors, one class for each kind of cause, with one root class: an interface catches that and shows one line.
+"""Errors: one class for each kind of cause, all below `CompanionError`. Interfaces show an error as one line.
 
-The text of an error is for a tired pilot: the place, the value found, and the values allowed.
+The text of an error is for a tired pilot: it names the place, the value found, and the allowed values.
 """
 
 from __future__ import annotations
 
 
 class CompanionError(Exception):
-    """Root of all errors that the companion raises on purpose."""
+    """Base class of all errors that the companion raises on purpose."""
 
 
 class ConfigError(CompanionError):
@@ -23,23 +23,23 @@ class DaemonUnreachableError(CompanionError):
 
 
 class DaemonDeniedError(DaemonUnreachableError):
-    """A daemon is there, but this user may not use its control socket."""
+    """The daemon runs, but this user may not use its control socket."""
 
 
 class NobodyHeardError(CompanionError):
-    """No vehicle, or no companion, answers on a ground station's link."""
+    """A ground command receives nothing from a vehicle or from its companion on the telemetry link."""
 
 
 class StorageError(CompanionError):
-    """A record could not be written or read."""
+    """A stored file, such as a record or a profile, cannot be written or read."""
 
 
 class CalibrationRefusedError(CompanionError):
-    """The measurement fails its own checks; nothing may be written."""
+    """A measurement failed its own checks, or a request is not allowed; nothing may be written to the autopilot."""
 
 
 class RequestRefusedError(CalibrationRefusedError):
-    """A request was not started; `kind` is the reason in one word, as in docs/mqtt.md (armed, busy, moving, ...)."""
+    """A request was refused; `kind` is the reason as a key word of docs/mqtt.md, such as armed, busy or moving."""
 
     def __init__(self, kind: str, reason: str) -> None:
         super().__init__(reason)
@@ -47,11 +47,11 @@ class RequestRefusedError(CalibrationRefusedError):
 
 
 class AutopilotError(CompanionError):
-    """The autopilot did not do what was asked."""
+    """The autopilot did not do what the companion requested."""
 
 
 class NotDisarmedError(AutopilotError):
-    """The autopilot is armed, or whether it is armed is unknown: nothing may be written."""
+    """The autopilot is armed, or its armed state is unknown: nothing may be written to it."""
 
 
 class ParameterTimeoutError(AutopilotError):
@@ -59,12 +59,12 @@ class ParameterTimeoutError(AutopilotError):
 
 
 class ParameterRefusedError(AutopilotError):
-    """The autopilot refused a parameter (PARAM_ERROR) or answered with another value than was set."""
+    """The autopilot refused to set a parameter (PARAM_ERROR), or confirmed another value than the requested one."""
 
 
 class ParameterMismatchError(ParameterRefusedError):
-    """The autopilot answered a write with another value than was set."""
+    """The autopilot confirmed the write of a parameter with another value than the requested one."""
 
 
 class AutopilotRebootedError(AutopilotError):
-    """The autopilot restarted in the middle of an exchange."""
+    """The autopilot restarted while the companion was waiting for its answers."""

@@ -1,4 +1,4 @@
-"""Parsing and checking of JSON files and requests, and text from outside made printable."""
+"""Functions that parse and check JSON files and requests, and that make received text printable."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any, Final
 import msgspec
 
 _FIRST_USE: Final = threading.Lock()
-"""msgspec (0.22) describes a type at its first use; two threads that do so at the same time crash the process."""
+"""Lock for the first use of a type: msgspec 0.22 crashes if two threads use a new type at the same time."""
 
 
 def decode(data: bytes, kind: Any, newest: int | None) -> Any:
-    """Parse JSON as type `kind`; raise msgspec.MsgspecError if it differs, or has a `format_version` above `newest`."""
+    """Parse JSON as type `kind`; raise msgspec.MsgspecError for other data or a `format_version` above `newest`."""
     if newest is not None:
         said = msgspec.json.decode(data, type=dict[str, msgspec.Raw]).get("format_version")
         if said is not None and (version := msgspec.json.decode(said, type=int)) > newest:
@@ -35,13 +35,13 @@ def utc_now() -> str:
     return datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
 
 
-Object = dict[str, Any]  # a request or an answer, as JSON can hold it
+Object = dict[str, Any]  # a JSON object: a request or an answer
 
 Value = str | int | float | bool | None
 
 
 def parse_request(data: bytes) -> dict[str, Any]:
-    """Parse an object of strings, numbers, true, false and null; raise ValueError with one line for anything else."""
+    """Parse a JSON object of strings, numbers, true, false and null; raise ValueError for any other content."""
     found = msgspec.json.decode(data, type=dict[str, Value])
     for key, value in found.items():
         if isinstance(value, str) and "\0" in value:
@@ -50,7 +50,7 @@ def parse_request(data: bytes) -> dict[str, Any]:
 
 
 def printable(text: str) -> str:
-    """Return a text from outside as one line; escape control characters and invisible ones.
+    """Return a text as one line with control characters and invisible characters escaped.
 
     Uses `ascii`, not a codec: Python loads a codec from a file at first use, which needs a free file descriptor.
     """

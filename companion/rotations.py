@@ -1,12 +1,12 @@
-"""MAVLink's sensor orientations by name and number.
+"""Angles of MAVLink's sensor orientations, by name and number.
 
-The angles are intrinsic yaw, then pitch, then roll (aerospace 3-2-1) of the sensor's axes seen from the vehicle's
-FRD axes. The numbers are those of MAV_SENSOR_ORIENTATION and of ArduPilot's AHRS_ORIENTATION.
+The angles turn the vehicle's axes (FRD) into the sensor's axes: first yaw, then pitch, then roll, each about the axes
+already turned (aerospace 3-2-1). The numbers are MAV_SENSOR_ORIENTATION's, and ArduPilot's for AHRS_ORIENTATION.
 """
 
 from __future__ import annotations
 
-# `_FINE_DEG` has the two angles that names round: number 38 is pitch 68.8, yaw 293.3 degrees in both firmwares.
+# `_FINE_DEG` has two angles that a name rounds: number 38 is pitch 68.8, yaw 293.3 degrees in ArduPilot and PX4.
 _NAMES = (
     "NONE", "YAW_45", "YAW_90", "YAW_135", "YAW_180", "YAW_225", "YAW_270", "YAW_315", "ROLL_180", "ROLL_180_YAW_45",
     "ROLL_180_YAW_90", "ROLL_180_YAW_135", "PITCH_180", "ROLL_180_YAW_225", "ROLL_180_YAW_270", "ROLL_180_YAW_315",
@@ -27,7 +27,7 @@ def _angles_of(name: str) -> tuple[float, float, float]:
 
 
 ROTATIONS_DEG: dict[str, tuple[float, float, float]] = {f"ROTATION_{name}": _angles_of(name) for name in _NAMES}
-"""Name to (roll, pitch, yaw) in degrees, in the order of MAV_SENSOR_ORIENTATION's numbers 0 to 40."""
+"""Roll, pitch and yaw in degrees of each orientation, by name, in the order of MAV_SENSOR_ORIENTATION (0 to 40)."""
 
 ROTATION_NAMES: tuple[str, ...] = tuple(ROTATIONS_DEG)
-"""Names by number: `ROTATION_NAMES[2] == "ROTATION_YAW_90"`."""
+"""Names of the orientations by their number in MAV_SENSOR_ORIENTATION: number 2 is "ROTATION_YAW_90"."""

@@ -1,9 +1,9 @@
 """Sensor samples: one frozen structure per kind of sensor, with units in the field names.
 
-`t_s` is the sampling time on the host's monotonic clock (the event loop's `time()`), in seconds. It comes from the
-device's clock. Without one, it is the time of the read, minus the line time of the frame and of the bytes after it
-(`protocols.decoding.clock`).
-Vectors are in the sensor's own axes until a `mounting` has turned them into the vehicle's FRD.
+`t_s` is the sampling time in seconds on the host's monotonic clock (the event loop's `time()`). It is computed from the
+device's clock. Without a device clock, it is the time of the read, minus the transmission time on the serial line of
+the frame and of the bytes after it (`protocols.decoding.clock`).
+Vectors are in the sensor's own axes until the `mounting` has rotated them to the vehicle's axes (FRD).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def rows_of(triad: Triad) -> slice:
 class ImuSample(msgspec.Struct, frozen=True, gc=False):
     """Angular rate and specific force of one IMU at one instant.
 
-    Specific force is what an accelerometer measures: (0, 0, -9.8) m/s^2 in FRD when level at rest.
+    An accelerometer measures the specific force: (0, 0, -9.8) m/s^2 in FRD when level at rest.
     """
 
     t_s: float
@@ -32,17 +32,17 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     accel_m_s2: Vector
     temperature_degc: float | None = None
     sequence: int | None = None
-    """The device's own counter, None where the protocol has none; unwrapped by `Decoder.receive`."""
+    """Sample counter of the device, without its wrap-around (`Decoder.receive`); None: the protocol has no counter."""
     t_device_s: float | None = None
-    """The device's own clock, None where the protocol has none; unwrapped by `Decoder.receive`."""
+    """Time on the device's clock, without its wrap-around (`Decoder.receive`); None: the protocol has no clock."""
     breaks: int = 0
-    """Number of restarts and clock jumps of the device so far; each may have changed its biases."""
+    """Number of restarts and clock jumps of the device before this sample; each may have changed its biases."""
     shared_variance: tuple[float, ...] | None = None
-    """Variance (6,) of an error common to neighbouring samples, gyro then accelerometer; None: no such error."""
+    """Variance of an error that neighbouring samples share: gyro x, y, z, accelerometer x, y, z; None: no error."""
 
 
 class TiltSample(msgspec.Struct, frozen=True, gc=False):
-    """Both readings of a gradienter, in its own axes and by its own law (`physics.gradienter`)."""
+    """Both tilt readings of a gradienter, in its own axes; `physics.gradienter` defines the meaning of the angles."""
 
     t_s: float
     x_deg: float
@@ -51,19 +51,19 @@ class TiltSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class CompassSample(msgspec.Struct, frozen=True, gc=False):
-    """A heading, clockwise from north, in [0, 360)."""
+    """Heading of a compass in degrees clockwise from north, in [0, 360)."""
 
     t_s: float
     heading_deg: float
     pitch_deg: float | None = None
     roll_deg: float | None = None
     north: Literal["magnetic", "true"] | None = None
-    """North that the device reports; None: the configuration gives it."""
+    """Kind of north to which the heading refers; None: the device does not report it, the configuration defines it."""
     temperature_degc: float | None = None
 
 
 class MagSample(msgspec.Struct, frozen=True, gc=False):
-    """A magnetic field vector in the device's axes; `counts` where the device gives no unit."""
+    """Magnetic field vector in the device's axes; `counts` replaces `field_gauss` if the device reports no unit."""
 
     t_s: float
     field_gauss: Vector | None = None

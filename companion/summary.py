@@ -1,4 +1,4 @@
-"""Summary of the daemon's status: the rows that every interface shows."""
+"""Summary of the daemon's status as rows of text, which all interfaces show alike."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Final, Literal
 from companion import messages
 from companion.formats import Object
 
-_HEARTBEAT_S: Final = 2.0  # an older heartbeat is a lost link
+_HEARTBEAT_S: Final = 2.0  # maximum age of the autopilot's heartbeat before the link counts as lost
 
 
 StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str, str]
-"""One connected part, or one warning: verdict, name, text, and the remedy (empty if there is none)."""
+"""One row of the status, for a connected part or a warning: verdict, name, text, remedy (empty if there is none)."""
 
 
 def headline(status: Object) -> str:
@@ -19,7 +19,7 @@ def headline(status: Object) -> str:
 
 
 def rows(status: Object) -> list[StatusRow]:
-    """List the connected parts, then the problems, from a reply of `status` or `monitor`."""
+    """List the rows of a daemon's status: first the connected parts, then the problems and warnings."""
     vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]
     heartbeat_s, signing = vehicle["heartbeat_age_s"], vehicle["signing"]
     found = [_row(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]

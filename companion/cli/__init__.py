@@ -1,8 +1,8 @@
-"""The command line.
+"""The command line `companion`.
 
-Exit codes of every command: 0 done, 1 failed or refused (the reason in `reason`), 2 usage or configuration error (one
-line on stderr), 3 no daemon answers (`companion ground`: no vehicle or no companion is heard). With --json stdout holds
-exactly one JSON object; texts go to stderr.
+Exit codes: 0 done; 1 failed or refused; 2 usage or configuration error (one line on stderr); 3 the daemon does not
+answer, or `companion ground` finds no vehicle or companion on the link. With --json a command prints exactly one JSON
+object on stdout, with `reason` after a failure; texts go to stderr.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_lines(error, error=True)
         return USAGE
     except (DaemonUnreachableError, NobodyHeardError) as error:
-        # No hint to start the daemon if it denies access (it runs), nor from the ground (out of reach).
+        # No hint to start the daemon if it denies access, as it runs; nor on the ground, as it runs on the aircraft.
         starts = "" if isinstance(error, DaemonDeniedError | NobodyHeardError) else how_to_start(options)
         _fail(options, "unreachable", str(error) + starts)
         return NO_DAEMON
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return FAILED
     except BrokenPipeError:
-        # The reader of our output has ended (| head): print no error.
+        # The program that reads our output has ended (| head): print no error.
         sys.stderr.close()
         return FAILED
 
@@ -68,7 +68,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 def _parser() -> Parser:
     from companion.cli import client, desk, ground, local, profile
 
-    # -c and --json may come before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
+    # -c and --json may precede or follow the subcommand. SUPPRESS: the later parser must not reset them to defaults.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
     common.add_argument("--json", action="store_true", help="print one JSON object on stdout")

@@ -1,4 +1,4 @@
-"""Questions of `companion setup`, one at a time: at a terminal, on a page for a phone, or answered by default."""
+"""Dialogue of `companion setup`: asks one question at a time at a terminal or on a web page, or uses the defaults."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from companion.setup.draft import Question, one_of
 _MOST_BYTES: Final = 4096
 OPEN_WITHIN_S: Final = 5.0
 EVERY_S: Final = 0.5
-SHOWN_S: Final = 1.0  # Time in which an open page has displayed the last state
+SHOWN_S: Final = 1.0  # Time after which an open web page surely displays the last state
 
 
 class Asking:
-    """Questions on stdout, or on stderr if stdout is for JSON; answers from stdin. `yes`: keep all present answers."""
+    """Asks questions on stdout (`error`: on stderr) and reads answers from stdin; `yes`: use the present answers."""
 
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
@@ -34,10 +34,10 @@ class Asking:
         print_lines(*lines, error=self._error)
 
     async def ask(self, question: Question) -> None:
-        """Ask until an answer is accepted; an empty answer, or `yes`, keeps the present one.
+        """Ask a question until its answer is valid; an empty answer means the present one.
 
         Raises:
-            CompanionError: stdin has ended; or, with `yes`, the present answer is not accepted.
+            CompanionError: stdin has ended; or no questions are asked and the present answer is not valid.
         """
         now = question.now
         if self.yes:
@@ -68,7 +68,7 @@ class Asking:
         return found
 
     async def _line(self) -> str:
-        """Read a line; unlike with `input`, Ctrl-C ends the wait at once."""
+        """Read a line from stdin; unlike Python's `input`, stop waiting at Ctrl-C at once."""
         while b"\n" not in self._rest and len(self._rest) < _MOST_BYTES:
             chunk = await _read(sys.stdin.fileno())
             if not chunk:
@@ -94,7 +94,7 @@ async def _read(descriptor: int) -> bytes:
 
 
 class PageAsking(Asking):
-    """Questions on a web page too; `async with` opens it. `storage` is the daemon's: its page uses the same token."""
+    """Asks questions on a web page, which `async with` opens. Its token is the one in the daemon's folder `storage`."""
 
     def __init__(self, bind: str, storage: Path) -> None:
         from companion.web.server import Page  # no other command needs the web server
@@ -108,7 +108,7 @@ class PageAsking(Asking):
         self._page = Page(bind, storage, self._answer)
 
     async def __aenter__(self) -> Self:
-        """Open the page; raise CompanionError with the reason if that fails."""
+        """Open the web page; raise CompanionError with the reason if that fails."""
         self._serving = asyncio.create_task(self._page.run(), name="page")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(OPEN_WITHIN_S):
@@ -151,7 +151,7 @@ class PageAsking(Asking):
         return await self._answered
 
     async def _answer(self, request: Object) -> AsyncGenerator[Object, None]:
-        """Reply to the page as the daemon's control socket does: with the status, and to the operator's answer."""
+        """Handle a request of the web page (status, monitor, answer) with replies like those of the daemon."""
         if request.get("command") == "status":
             yield {"kind": "result", "status": self._status()}
             return

@@ -50,10 +50,10 @@ def add_commands(add: AddCommand) -> None:
 async def request(
     options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None, *, in_place: bool = False
 ) -> Object:
-    """Send a request, show its progress on stderr, return its result.
+    """Send a request to the daemon, show its progress on stderr, and return its result.
 
-    Ctrl-C after the first reply sends the request `at_interrupt`; None: the daemon continues. `in_place`: show progress
-    on one line, if it only counts.
+    Ctrl-C sends the request `at_interrupt`, after the first reply; without one, the daemon continues. `in_place`: show
+    the progress on a single line that is overwritten.
 
     Raises:
         DaemonRefusedError: the daemon refuses the request.
@@ -87,7 +87,7 @@ async def request(
 
 
 def _conclude(options: argparse.Namespace, answer: Object, lines: Sequence[str], *, good: bool) -> int:
-    """Print an answer of the daemon, with the remedy after a failure."""
+    """Print the daemon's answer, with the remedy after a failure; return the exit code."""
     remedy = "" if good else messages.remedy(answer.get("reason") or "")
     return conclude(options, answer, [*lines, *([f"{show.REMEDY}{remedy}"] if remedy else [])], good=good)
 
@@ -213,7 +213,7 @@ _FIGURES: Final = {
     "gyro_bias_deg_h": ("gyro bias", "deg/h", "+.1f", 1.0),
 }
 _SHOWN: Final = {"faces": ("accel_bias_mg", "accel_scale", "accel_shear"), "turn": ()}
-"""Figures to show by kind of alignment; other kinds show all known figures except the shear."""
+"""Figures to print for a kind of alignment; kinds not in this table print all known figures except the shear."""
 
 
 def _figure_line(
@@ -223,7 +223,7 @@ def _figure_line(
 
 
 def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float], sigma: Sequence[float]) -> list[str]:
-    """Format the whole bias, and its change by a write: the residual bias in the output."""
+    """Format an accelerometer's whole bias, and its change: the residual bias `left` in the autopilot's output."""
     if words == "slant when level" or whole is None:
         return [_figure_line(words, "mg", left, sigma, "+.3f")]
     return [_figure_line(words, "mg", whole, sigma, "+.3f"), _figure_line("  change", "mg", left, None, "+.3f")]
@@ -250,7 +250,7 @@ def stands_lines(record: Object) -> list[str]:
         lines.append(f"{imu['name']}:{scatter}")
         whole = imu.get("whole_bias_mg")
         if "level_bias_mg" in imu:
-            # After a six-position calibration this figure is the tilt of the board, not a bias.
+            # After a six-position calibration the remaining bias when level comes from the tilt of the board.
             words = "bias when level" if record.get("board") is None else "slant when level"
             lines += _bias_lines(words, whole, imu["level_bias_mg"], imu["level_sigma_mg"])
         known = [key for key in _FIGURES if key != "accel_shear" and key in imu and all(imu[key]["known"])]

@@ -1,4 +1,4 @@
-"""Commands `replay` (a recording, or any log of an IMU at rest) and `flight` (a log of the autopilot)."""
+"""Command `replay`, for recordings and for logs of an IMU at rest; command `flight`, for logs of the autopilot."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from companion.lab.still_log import StillLog
     from companion.storage.records import FlightStore
 
-# Only for people: --json lists all differences.
+# Limits of the text output; --json lists all differences and reasons.
 MOST_DIFFERENCES: Final = 20
 MOST_REASONS: Final = 12
 
@@ -84,7 +84,7 @@ def _replay_recording(options: argparse.Namespace) -> int:
 
 
 def _lines(result: Replay) -> list[str]:
-    """Describe the result in lines; the last one is the verdict."""
+    """Describe the result of a replay in lines of text; the last line is the verdict."""
     from companion.lab.replay import TOLERANCE_SIGMAS
 
     lines: list[str] = []
@@ -261,7 +261,7 @@ async def flight(options: argparse.Namespace) -> int:
 
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
-    """Read the records and learned biases on this computer, and its store of flights (None: no permission)."""
+    """Read this computer's records and learned biases; return them (empty if unreadable) and the store of flights."""
     from companion.storage.records import BiasStore, FlightStore, RecordStore
 
     directory = storage_path(options)
@@ -291,7 +291,7 @@ def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
 def _flight_lines(number: int, found: Flight) -> list[str]:
     stages = found.stages
     when = f"flight of {found.began_at}" if found.began_at else "flight at an unknown time"
-    since = f"{stages.armed_s:.0f} s after" if stages.armed_s < 1e8 else "in"  # A simulated PX4 counts from 1970
+    since = f"{stages.armed_s:.0f} s after" if stages.armed_s < 1e8 else "in"  # A simulated PX4's clock starts in 1970
     begun = f"{since} start {number} of the autopilot"
     start = f"{when}: {f'armed {begun}' if stages.is_arming_logged else f'no arming in the log, which begins {begun}'}"
     after = "arming" if stages.is_arming_logged else "that"

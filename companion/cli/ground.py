@@ -1,4 +1,4 @@
-"""Commands that do not run on an aircraft: `companion ground ...` on a laptop, and `companion fleet ...`."""
+"""Commands for other computers than the aircraft's: `companion ground ...` on a laptop, and `companion fleet ...`."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
 
 @contextlib.asynccontextmanager
 async def _interruptible(station: Station) -> AsyncIterator[None]:
-    """Make Ctrl-C and SIGTERM cancel the station's request at the companion, not only the wait for it."""
+    """Context in which Ctrl-C and SIGTERM cancel the request at the companion, instead of only ending this program."""
     loop = asyncio.get_running_loop()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
@@ -169,7 +169,7 @@ async def _acl(options: argparse.Namespace) -> int:
 
 
 async def _until_stopped(runs: Sequence[Coroutine[Any, Any, None]]) -> None:
-    """Run until Ctrl-C, SIGTERM or a failure; raise a failure after all have ended."""
+    """Run coroutines until Ctrl-C, SIGTERM or the first failure; stop all of them, then raise the failure."""
     from companion.fleet.collector import stop
 
     tasks = [asyncio.ensure_future(run) for run in runs]

@@ -1,4 +1,4 @@
-"""Commands that need no running daemon: run it, check its devices, list ports, install it, make a report."""
+"""Commands that need no running daemon: they start or install it, check devices, list ports or make a report."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _absolute(text: str) -> Path:
 
 
 FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
-"""Options of the `setup` that `run` starts without a configuration. Its output contains the token of the page."""
+"""Options of `companion setup` if `companion run` starts it for lack of a configuration; it prints the page's token."""
 
 
 async def run(options: argparse.Namespace) -> int:
@@ -112,7 +112,7 @@ async def run(options: argparse.Namespace) -> int:
 
 
 async def _first_run(path: Path) -> None:
-    """Ask for the configuration on a page. If it cannot be written, ask nothing: the daemon reports the lack of it."""
+    """Ask for the configuration on a web page, unless its file is not writable: the daemon then reports its absence."""
     from companion.cli import setup as session
     from companion.setup.draft import is_writable
 
@@ -239,7 +239,7 @@ async def report(options: argparse.Namespace) -> int:
     skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
     path: Path | None = None
     if options.output == "-":
-        # Write bytes: the file has its own encoding, which may differ from the terminal's.
+        # Write bytes: the encoding of the file may differ from that of the terminal.
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
     else:

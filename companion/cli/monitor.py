@@ -1,7 +1,7 @@
-"""Command `monitor`: the state, its reason, the devices and the last result, until Ctrl-C.
+"""Command `monitor`: shows the daemon's state, its reason, the devices and the last result, until Ctrl-C.
 
-A terminal is redrawn in place with VT100 escape sequences. For other outputs (TERM=dumb, a pipe) a line is printed
-whenever the state, a device, a warning or the last result changes.
+At a terminal, the command redraws the screen with VT100 escape sequences. For other outputs (TERM=dumb, a pipe) it
+prints a line whenever the state, a device, a warning or the last result changes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from companion.formats import Object, printable
 from companion.links.system.connection import ask
 
 SILENT_S: Final = 5.0
-"""Longest silence of a daemon that is not hung."""
+"""Time without a reply after which the monitor reports that the daemon is silent."""
 AGAIN_S: Final = 1.0
 
 _FIGURES: Final = re.compile(r"\d+([.,:]\d+)*")
@@ -75,7 +75,7 @@ class _Json:
 
 
 class _Lines:
-    """Output for a pipe: prints a line, with the time of day, when its words change; changed figures are ignored."""
+    """Monitor output for a pipe: prints a line, with the time of day, when its text changes without the figures."""
 
     def __init__(self) -> None:
         self._before: set[tuple[object, ...]] = set()
@@ -132,5 +132,5 @@ class _Screen:
 
 
 def _wrapped(line: str, width: int) -> list[str]:
-    """Wrap a line; escape control characters in received text."""
+    """Wrap a line to the terminal's width, and escape control characters in it."""
     return textwrap.wrap(printable(line), max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]

@@ -1,4 +1,4 @@
-"""Command `profile`: noise of an IMU, estimated from recordings of it at rest."""
+"""Command `profile`: estimates the noise of an IMU from recordings of the IMU at rest."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from companion.storage.profiles import SavedProfile
 
 SHORT_S: Final = 1200
-LEAST_S: Final = 600  # A profile of less fails its own test too often
+LEAST_S: Final = 600  # Minimum time at rest: a profile from less fails its own test too often
 _UNITS: Final[dict[Triad, tuple[float, str, int]]] = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
@@ -90,10 +90,10 @@ async def profile(options: argparse.Namespace) -> int:
 def _learn(
     imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, *, short: bool
 ) -> tuple[SavedProfile, list[str], Object]:
-    """Estimate the noise of one IMU; return the profile to save, lines for people, and JSON.
+    """Estimate the noise of one IMU; return the profile to save, the result as lines of text, and the result as JSON.
 
     Raises:
-        CalibrationRefusedError: the recordings do not show the noise.
+        CalibrationRefusedError: the recordings are too short or too coarse to show the noise.
     """
     from companion.estimation.noise.allan import noise_profile
     from companion.lab.profile import fit_profile, rests, seconds_at_rest
@@ -184,7 +184,7 @@ def _table(fits: Sequence[AxisFit], learned: NoiseProfile, compared: NoiseProfil
 
 
 def _cell(fit: AxisFit, which: int, unit: float, digits: int) -> str:
-    """Format a figure with its standard error, or its upper limit if the recordings do not show the figure."""
+    """Format a noise figure with its standard error, or only its upper limit if the recordings do not determine it."""
     from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit

@@ -1,4 +1,4 @@
-"""Command `setup`: makes a working configuration from the connected devices and three answers."""
+"""Command `setup`: writes a working configuration from the detected devices and a few answers of the operator."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ WITHOUT: Final = {
 }
 CHECK_S: Final = 10.0
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
-"""Warning for SCALED_IMU2 and SCALED_IMU3, which have a resolution of 1 mrad/s and 1 mg."""
+"""Warning about the autopilot's IMUs 2 and 3: SCALED_IMU2 and SCALED_IMU3 have a resolution of 1 mrad/s and 1 mg."""
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
@@ -84,7 +84,7 @@ class _Session:
         }  # fmt: skip
 
     async def run(self) -> None:
-        """Ask, write and check; after any failure report what was written so far."""
+        """Ask the questions, write and check the configuration; after a failure report what was written so far."""
         try:
             await self._run()
         except asyncio.CancelledError:
@@ -160,7 +160,7 @@ class _Session:
         return draft
 
     async def _listen(self, draft: Draft) -> Survey:
-        """Listen to all serial ports and UDP; send nothing."""
+        """Listen for devices on serial and UDP ports; send nothing."""
         options = self._options
         ports = [*map(os.path.abspath, options.ports)] or ports_to_try(list_ports())
         udp = tuple(options.udp or USUAL_PORTS)
@@ -181,7 +181,7 @@ class _Session:
         return found
 
     async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
-        """Choose the url: the configured one if it is heard or in use, else another that is heard, else a typed one."""
+        """Set the autopilot's url: the configured one if detected or in use, else a detected one, else a typed one."""
         say, was = self.asking.say, draft.url
         heard = found.autopilots
         if self._options.mavlink is not None:
@@ -205,7 +205,7 @@ class _Session:
             await self.asking.ask(Question("Autopilot", "", draft.take_url))
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
-        """Choose a heard device; keep a configured one whose port another program has open."""
+        """Choose one of the detected devices of a kind; keep the configured one if its port is in use."""
         section, heard = draft.section(kind), found.devices(kind)
         if section is not None:
             port = section["port"]
@@ -314,7 +314,7 @@ class _Session:
 
 
 def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
-    """List the operator's next steps; `is_old`: the running daemon has another configuration."""
+    """List the operator's next steps; `is_old`: the running daemon still uses the previous configuration."""
     is_service = command == "companion"
     if not good:
         yield f"mend what is wrong above, then: {command} check"
@@ -353,7 +353,7 @@ def _named_values(option: str, given: Sequence[str], allowed: str, names: Sequen
 
 
 async def _daemon_status(config: Config) -> Object | None:
-    """Return the status of the running daemon; None: none runs; empty: it refuses to answer."""
+    """Return the status of the daemon; None: no daemon runs; empty: the daemon denies this user access."""
     from companion.links.system.connection import ask
 
     found: Object = {}
@@ -366,7 +366,7 @@ async def _daemon_status(config: Config) -> Object | None:
 
 
 async def _ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
-    """Offer the autopilot's IMUs that are not configured; return the parts of all IMUs that answer, by name.
+    """Ask the autopilot for its IMUs, and offer to configure missing ones; return the type of each IMU by its name.
 
     Nothing is written to the autopilot. `by_default`: default answer to the offer.
     """

@@ -1,4 +1,4 @@
-"""Text output for people: records and states as lines and tables."""
+"""Text output: formats records and states of the daemon as lines and tables."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def written_lines(written: Object) -> list[str]:
 
 
 def axes(values: Sequence[float], sigmas: Sequence[float] | None, form: str, scale: float = 1.0) -> str:
-    """Format three values divided by `scale`, with their sigmas if given; `form` such as "+9.1f"."""
+    """Format the values of x, y and z divided by `scale`, with sigmas if given, in a format such as "+9.1f"."""
     cells = [f"{axis} {value / scale:{form}}" for axis, value in zip("xyz", values, strict=True)]
     if sigmas is not None:
         pairs = zip(cells, sigmas, strict=True)
@@ -228,7 +228,7 @@ def history_lines(
     flights: Sequence[Object] = (),
     interrupted: Sequence[Object] = (),
 ) -> list[str]:
-    """Show the history, newest first in each section; `companion report` takes the `numbers` of the records."""
+    """Format the history, newest first in each section; `numbers` identify the records for `companion report`."""
     lines = ["no calibrations yet"]
     if records:
         lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]

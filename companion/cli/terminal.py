@@ -1,4 +1,4 @@
-"""Common parts of all commands: exit codes, printing, the configuration, arguments."""
+"""Common parts of all commands: exit codes, printing, loading of the configuration, and parsing of arguments."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ NO_DAEMON: Final = 3
 
 Command = Callable[[argparse.Namespace], Coroutine[Any, Any, int]]
 AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
-"""Function that adds a command to a parser by its name, function and line of help."""
+"""Function that adds a subcommand to an argument parser, from its name, its coroutine and its help text."""
 
 
 class DaemonRefusedError(CompanionError):
-    """Refusal of a request by the daemon."""
+    """The daemon has refused a request; the text is the reason."""
 
 
 def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
-    """Print lines without control characters; all output to the terminal goes through here."""
+    """Print lines with control characters escaped: lines can contain text received from elsewhere."""
     stream = sys.stderr if error else sys.stdout
     for line in lines:
         stream.write(printable(str(line)) + end)
@@ -58,7 +58,7 @@ def print_address(url: str, token: str | None) -> None:
             print_lines(f"or make this window {wide} columns wide, and its camera reads a code here")
             return
         print_lines("or let its camera read this:")
-        # Black on white, independent of the terminal's colours.
+        # Black on white, whatever the terminal's colours.
         sys.stdout.write("".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn))
         sys.stdout.flush()
 
@@ -72,7 +72,7 @@ def _code(text: str) -> list[str]:
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:
-    """Load the configuration, with or without the saved noise profiles that it names.
+    """Load the configuration, and the saved noise profiles that it names if `profiles` is True.
 
     A client of the daemon may lack the right to read profiles. `forgiving`: replace a damaged profile by a default.
     """
@@ -86,7 +86,7 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False, forgivin
 
 
 def storage_path(options: argparse.Namespace) -> Path:
-    """Return the storage directory of the configuration, or the default one if there is no configuration."""
+    """Return the configured storage folder, or the default one if there is no configuration."""
     try:
         return load_config(options).storage.path
     except ConfigError:
@@ -118,7 +118,7 @@ class _Removed(argparse.Action):
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that reports a usage error in one line, with the probable meaning."""
+    """Argument parser that reports a usage error in one line, with a suggestion for a misspelt word."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
@@ -151,7 +151,7 @@ def adder(to: argparse._SubParsersAction[Parser], *parents: Parser) -> AddComman
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
-    """Make the type of an argument: a number within limits; for `kind` int, a whole number."""
+    """Return a type for argparse that accepts a number within limits; if `kind` is int, only a whole number."""
 
     def parsed(text: str) -> float:
         try:
@@ -179,7 +179,7 @@ def add_fields(parser: argparse.ArgumentParser, kind: type[commands.Command], by
         values = [value for value in field.values if value not in field.flags]
         if field.positional:
             shape: dict[str, Any] = {"metavar": field.metavar or "|".join(values), "choices": values or None}
-            # The default of a positional argument would replace the value of a flag.
+            # Without SUPPRESS, the default of a positional argument would overwrite the value of a flag.
             to.add_argument(name, nargs="?", default=argparse.SUPPRESS, help=field.help, **shape)
         for value, words in field.flags.items():
             to.add_argument(f"--{value}", dest=name, action="store_const", const=value, help=words)

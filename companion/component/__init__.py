@@ -1,1 +1,1 @@
-"""MAVLink component 191: the companion as the rest of the network sees it."""
+"""The companion as MAVLink component 191: its heartbeat, commands, texts and parameters on the network."""

@@ -1,18 +1,17 @@
 """The command server of component 191: parses and checks requests, and sends one final COMMAND_ACK for each.
 
-A request is identified by sender's system, sender's component and command: a COMMAND_ACK carries nothing else. The
-server handles three kinds of repeat:
+The sender's system id, the sender's component id and the command identify a request: a COMMAND_ACK carries nothing
+else. The server handles three kinds of repeated requests:
 
-- The network copies a packet (two routes, a duplicated datagram). A packet that equals one of the last half second in
-  every byte, sequence number included, is ignored.
-- The sender repeats its request while the job runs. The answer is IN_PROGRESS and no second job starts: ground
+- The network delivers a packet twice (two routes, a duplicated datagram). A packet is ignored if all its bytes,
+  including the sequence number, equal those of a packet received within the last half second.
+- The sender repeats its request while the job runs. The server answers IN_PROGRESS and starts no second job: ground
   stations treat any other result as the end.
-- The sender retransmits (confirmation > 0) a request that was answered: the final ACK was lost or crossed it on the
-  way. It gets that result again, until no retransmission has come for 3 s; otherwise one press of a button would
-  calibrate twice. A request with confirmation 0 is a new press and starts a new job.
+- The sender retransmits a request (confirmation > 0) after its final ACK was sent. The server repeats that ACK until no
+  retransmission has come for 3 s: otherwise one press of a button would calibrate twice.
 
-`mavlink.allow` lists the senders that may request jobs; everybody may read. Sender ids can be forged: only signatures
-protect against that (`links/mavlink/signing.py`).
+A request with confirmation 0 is a new press of the button and starts a new job. The setting `mavlink.allow` lists the
+senders that may request jobs; everybody may read. Only signatures protect against forged ids of senders.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ from companion.links.mavlink.link import MavlinkLink
 logger = logging.getLogger(__name__)
 
 MAV_RESULT_CANCELLED = 6
-"""Value from MAVLink's common messages; ArduPilot's dialect lacks the name."""
+"""Result code for a cancelled command, from MAVLink's common messages; pymavlink's ArduPilot dialect lacks its name."""
 ACK_PERIOD_S = 0.4
-"""Interval of IN_PROGRESS: QGroundControl gives up 1.2 s after the last one, so two in a row may be lost."""
+"""Interval between IN_PROGRESS ACKs. QGroundControl gives up after 1.2 s without one: two in a row may get lost."""
 NOTHING_RAN: Final = 1  # `result_param2` of a cancel's ACK when there was nothing to cancel
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
@@ -49,7 +48,7 @@ _REFUSALS: Final = {
     "busy": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
     "unsupported": mavlink.MAV_RESULT_UNSUPPORTED,
 }
-"""ACK result for each kind of refusal; other kinds are DENIED."""
+"""MAV_RESULT of the ACK for each kind of refused request; kinds not in this table are DENIED."""
 _RESULTS = {
     "done": mavlink.MAV_RESULT_ACCEPTED,
     "failed": mavlink.MAV_RESULT_FAILED,
@@ -66,25 +65,25 @@ CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_
 
 
 class Key(NamedTuple):
-    """Identity of a request: a COMMAND_ACK names its requester and the command, nothing else."""
+    """Identity of a request: the sender's ids and the command, which are all that a COMMAND_ACK names."""
 
     system_id: int
     component_id: int
     command: int
 
 
-Request = Calibrate | Undo | Cancel | Literal["version"]  # A checked request; "version": for AUTOPILOT_VERSION
+Request = Calibrate | Undo | Cancel | Literal["version"]  # A checked request; "version": send AUTOPILOT_VERSION
 
 
 class Permission:
-    """Checks senders against `mavlink.allow`, counts refusals, and logs the first one of each sender."""
+    """Checks senders against the setting `mavlink.allow`; counts refusals, and logs the first one of each sender."""
 
     def __init__(self, senders: Senders) -> None:
         self.senders = senders
         self.refused: Counter[tuple[int, int]] = Counter()  # Refusals of the first 32 senders
 
     def refuses(self, sender: tuple[int, int], what: str) -> str:
-        """Return the reason to refuse a sender (system, component); empty: it is allowed."""
+        """Return the reason to refuse a sender (system id, component id), or an empty text if the sender is allowed."""
         if sender in self.senders:
             return ""
         system, component = sender
@@ -109,7 +108,7 @@ class _Final(NamedTuple):
 
 
 class CommandServer:
-    """Handles commands addressed to this component; `step` must be called at the times it returns.
+    """Handles commands addressed to this component; the caller must call `step` at each time that `step` returns.
 
     Commands to other components and to component 0 (everyone) are ignored: our ACK would pass for the autopilot's.
     """
@@ -129,7 +128,7 @@ class CommandServer:
         )
 
     def step(self, now_s: float) -> float:
-        """Acknowledge the running job; return the time of the next call (infinity: no job runs)."""
+        """Acknowledge the running job; return the time of the next call, or infinity if nothing is left to send."""
         retry_s = self._send_unsent(now_s)
         running = self._running
         if running is None:
@@ -143,7 +142,7 @@ class CommandServer:
         return min(retry_s, self._next_ack_s)
 
     def close(self, now_s: float) -> None:
-        """Stop handling commands, and send the running one's final ACK: no requester must wait for ever."""
+        """Stop handling commands, and send a running job's final ACK: its requester must not wait for ever."""
         for unsubscribe in self._subscriptions:
             unsubscribe()
         if self._running is None:
@@ -161,14 +160,14 @@ class CommandServer:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._link.system_id, self._link.component_id):
             return
         if message.command == mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
-            return  # `ArmAuthoriser` answers it: a verdict, not a job, and silence is a valid answer
+            return  # `ArmAuthoriser` answers arming requests: they start no job, and need no ACK
         key = Key(message.get_srcSystem(), message.get_srcComponent(), message.command)
         request = self._permit(key, judge(message))
         copy = self._is_copy(bytes(message.get_msgbuf()), now_s)
         running = self._running
         if running is not None and running.key == key and not isinstance(request, Refusal):
             if request != running.request:
-                # Reported as text: ground stations would treat an ACK as the end of the running job.
+                # Report as a text: ground stations would treat an ACK as the end of the running job.
                 before = running.request
                 doing = "undoing" if isinstance(before, Undo) else f"calibrating {_WORDS[before.biases]}"
                 self._say(Severity.WARNING, f"Still {doing}", Weight.REFUSAL)
@@ -177,10 +176,10 @@ class CommandServer:
         if copy:
             return
         final = self._finals.get(key)
-        # COMMAND_INT has no confirmation field: each one is a new request.
+        # COMMAND_INT has no confirmation field: each COMMAND_INT is a new request.
         confirmation = 0 if isinstance(message, mavlink.MAVLink_command_int_message) else message.confirmation
         if confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
-            # The 3 s start again: this copy of the ACK may be lost as well.
+            # Start the 3 s again: this copy of the ACK may be lost as well.
             self._finally(key, final.result, now_s, final.detail)
             return
         self._obey(key, request, now_s)
@@ -211,7 +210,7 @@ class CommandServer:
                     self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
                     self._link.send(autopilot_version())
                 case Refusal():
-                    # Ground stations probe by themselves which commands a component supports: no warning for that.
+                    # Do not warn: ground stations probe by themselves which commands a component supports.
                     severity = Severity.INFO if request.kind == "unsupported" else Severity.WARNING
                     self._refuse(key, request, now_s, severity)
         except Exception:
@@ -289,8 +288,8 @@ class CommandServer:
 CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    # Our parameters are all REAL32, the same in both encodings; the flags tell every client to send the number
-    # itself. Mission Planner checks PARAM_FLOAT; the present protocol requires ENCODE_C_CAST.
+    # All our parameters are REAL32, which both parameter encodings send as the number itself. Clients check either of
+    # two flags: Mission Planner checks PARAM_FLOAT; the present protocol requires ENCODE_C_CAST.
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
 )
@@ -304,7 +303,7 @@ def autopilot_version() -> mavlink.MAVLink_autopilot_version_message:
 
 
 def encode_version(version: str) -> int:
-    """Encode "major.minor.patch" as `flight_sw_version`: a byte each, then the release type (255 official, 0 not)."""
+    """Encode "major.minor.patch" as MAVLink's `flight_sw_version`: four bytes, the last one is the release type."""
     match = re.match(r"(\d+)\.(\d+)\.(\d+)", version)
     major, minor, patch = (min(int(part), 255) for part in match.groups()) if match else (0, 0, 0)
     official = match is not None and match.end() == len(version)
@@ -313,7 +312,7 @@ def encode_version(version: str) -> int:
 
 
 def judge(message: CommandMessage) -> Request | Refusal:
-    """Parse and check a command. Values are not rounded: where 0, 1 and 2 are allowed, NaN, 0.5 and 3 are refused."""
+    """Parse and check a command. Values are not rounded: if 0, 1 and 2 are allowed, then 0.5 is refused."""
     if isinstance(message, mavlink.MAVLink_command_int_message):
         last = float(message.x), float(message.y), message.z
     else:
@@ -351,9 +350,9 @@ def _calibrate(which: float, reboot: float) -> Calibrate | Refusal:
 
 
 def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refusal:
-    """Parse MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers.
+    """Parse MAV_CMD_PREFLIGHT_CALIBRATION: param1 = 1 calibrates the gyros, param5 = 1 the accelerometers.
 
-    Mission Planner's button always sets param3 (ground pressure): it is ignored beside gyros or accelerometers.
+    Mission Planner's button always sets param3 (ground pressure) too: param3 is ignored, but is not enough alone.
     """
     for number, value in enumerate(parameters, start=1):
         if value != 0 and not (number in (1, 3, 5) and value == 1):

@@ -1,4 +1,4 @@
-"""MAVLink component 191: answers arming requests; one loop sends heartbeats, ACKs, texts, tunes and parameters."""
+"""MAVLink component 191: answers requests to arm, and sends heartbeats, ACKs, texts, tunes and parameters."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.lua import to_script
 
 VALID_S: Final = 10
-"""Validity of an ACCEPTED; 0 would expire at once."""
+"""Time in seconds for which PX4 may arm after our answer ACCEPTED; 0 would expire at once."""
 TOLD_BY_US: Final = 1
-"""MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot stays silent; our STATUSTEXT has the reason."""
+"""Value of MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot shows no reason of its own; our STATUSTEXT shows it."""
 REPEAT_S: Final = 0.05
-"""Delay before the same answer is sent again: links lose packets, and PX4 drops an answer that has the same time as
-its request, as happens in SITL's lockstep."""
+"""Delay before an answer to an arming request is sent a second time. Links lose packets, and PX4 drops an answer with
+the same timestamp as its request, as happens in SITL's lockstep."""
 ATTEMPT_S: Final = 1.5
-"""Time from the start of an arming attempt after which a request begins another one; retransmissions: thrice that."""
+"""Time after the start of an arming attempt in which new requests still belong to it; retransmissions: 4.5 s."""
 _RESULTS: Final = {
     "accept": mavlink.MAV_RESULT_ACCEPTED,
     "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
@@ -36,10 +36,9 @@ _RESULTS: Final = {
 class ArmAuthoriser:
     """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST from our autopilot (PX4) at once; ignores other senders.
 
-    The protocol was observed on the firmware (autopilots 9.2) and differs from the message definitions: the validity
-    goes into result_param2, the reason into progress, and PX4 ignores an answer that is not addressed to its own
-    system id. One attempt to arm sends two requests and retransmissions of both. Each gets an answer, but only one
-    text goes to the pilot.
+    PX4 differs from MAVLink's definitions (docs/reference/autopilots.md section 9.2). It expects the validity in
+    result_param2 and the reason in progress, and ignores an answer not addressed to its own system id. One attempt to
+    arm sends two requests and retransmissions of both. Each gets an answer, but the pilot gets only one text.
     """
 
     def __init__(self, link: MavlinkLink, gate: ArmGate, say: Say) -> None:
@@ -56,7 +55,7 @@ class ArmAuthoriser:
             return
         target = (message.target_system, message.target_component)
         if target not in ((self._link.system_id, 0), (self._link.system_id, self._link.component_id)):
-            return  # PX4 sends requests on every link; `GateSetup` checks the parameters that name the authoriser
+            return  # PX4 sends requests on every link; `GateSetup` checks the parameters that name the recipient
         if self._gate.at_arm == "off":
             return
         answer, gate = self._gate.answer(), self._gate.at_arm == "gate"
@@ -82,18 +81,17 @@ class ArmAuthoriser:
 SCRIPT_PERIOD_S: Final = 0.5
 MARK: Final = b"CMPA\x01"
 REASON_BYTES: Final = 41 - len("Companion: ")
-"""Longest reason that ArduPilot shows (autopilots 5.3), after the script's prefix."""
+"""Maximum length of the reason that ArduPilot shows after this prefix (docs/reference/autopilots.md section 5.3)."""
 VERDICTS: Final = {"wait": 0, "accept": 1, "refuse": 2}
 NOT_GATING: Final = 3
 
 
 class ArmingScript:
-    """Sends the verdict to ArduPilot's arming script (companion/lua/companion_arming.lua) twice a second.
+    """Sends the arm gate's verdict twice a second to our arming script on ArduPilot (companion/lua).
 
-    The component's loop sends the verdict; the script closes the gate after 3 s without one, so a hanging loop closes
-    it too. The message is TUNNEL: unlike PARAM_SET it does not wear the flash; unlike NAMED_VALUE_FLOAT it goes to the
-    autopilot alone, and it has room for the reason as text. Payload: "CMPA", version 1, verdict (0 wait, 1 accept,
-    2 refuse, 3 the gate is off), then the reason, ASCII.
+    The script forbids arming after 3 s without a verdict, so a daemon whose loop hangs prevents arming too. The message
+    is TUNNEL: it has room for the reason. PARAM_SET would wear the flash; NAMED_VALUE_FLOAT would reach everybody.
+    Payload: "CMPA", a version byte (1), a verdict byte (0 wait, 1 accept, 2 refuse, 3 gate off), the reason in ASCII.
     """
 
     def __init__(self, link: MavlinkLink, gate: ArmGate) -> None:
@@ -101,7 +99,7 @@ class ArmingScript:
         self._next_s = -math.inf
 
     def step(self, now_s: float) -> float:
-        """Send the verdict if due; return the time of the next one (infinity: ask again at the next heartbeat)."""
+        """Send the verdict if due; return the time of the next one, or infinity if no script can receive it now."""
         autopilot = self._link.autopilot
         if autopilot is None or not self._link.connected or not self._gate.asks_script:
             return math.inf
@@ -121,7 +119,7 @@ IDLE_BEATS: Final = 5
 
 
 class MavlinkComponent:
-    """The companion on the MAVLink network; a loop that stalls stops its heartbeat too."""
+    """The companion on the MAVLink network; one loop sends everything, so a stalled loop stops the heartbeat too."""
 
     def __init__(
         self,
@@ -135,7 +133,7 @@ class MavlinkComponent:
     ) -> None:
         self._link, self._service, self._gate, self._texts, self._tunes = link, service, gate, texts, tunes
         self._woken = texts.woken
-        self._known_as = link.system_id  # The system id under which we were heard last
+        self._known_as = link.system_id  # System id of our last heartbeats
         self._next_heartbeat_s = -math.inf
         self._beats = 0
         self.turns = 0
@@ -171,12 +169,12 @@ class MavlinkComponent:
                 kind = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
                 self._link.send(mavlink.MAVLink_heartbeat_message(*kind, 0, 0, self._service.mav_state, 3))
                 self._send_values(now_s)
-                # Keep the rhythm, but do not send the heartbeats that a stall has missed.
+                # Keep the rhythm, but skip the heartbeats that a stall of this loop has missed.
                 next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
                 self._next_heartbeat_s = next_s if next_s > now_s else now_s + HEARTBEAT_PERIOD_S
             else:
-                # Retry soon, as the first heartbeat on a new connection is urgent: ArduPilot executes by itself
-                # a command for a component that it has not heard.
+                # Retry soon: until ArduPilot has received a heartbeat from a component, it executes commands for
+                # that component itself.
                 self._next_heartbeat_s = now_s + _RETRY_S
         return min(
             self._next_heartbeat_s,
@@ -188,9 +186,9 @@ class MavlinkComponent:
         )
 
     def _send_values(self, now_s: float) -> None:
-        """Send progress and readiness: at every heartbeat during a calibration, otherwise at every fifth.
+        """Send progress and readiness to arm: at every heartbeat during a calibration, otherwise at every fifth.
 
-        Mission Planner shows them in its Quick tab (`propagateNamedFloats`), QGroundControl in its MAVLink inspector.
+        Mission Planner shows both in its Quick tab (`propagateNamedFloats`), QGroundControl in its MAVLink inspector.
         """
         self._beats += 1
         if self._service.mav_state != mavlink.MAV_STATE_CALIBRATING and self._beats % IDLE_BEATS:

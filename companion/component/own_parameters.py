@@ -1,10 +1,10 @@
 """Parameters of component 191: a small server of the MAVLink parameter protocol.
 
-All are REAL32: both autopilot encodings (number, or bytes of an integer) are the same for it. All names begin with
-CMP_, which no autopilot's name does: ArduPilot executes a PARAM_SET for component 191 itself if it cannot forward it.
+All parameters have the type REAL32, which both encodings (C cast, bytewise) send alike. All names begin with CMP_, as
+no autopilot's parameter does: ArduPilot executes a PARAM_SET for component 191 itself if it cannot forward it.
 
-A PARAM_SET is answered at once, with the old value if the new one is not allowed. Other requests are answered from one
-pending set, at a pace for slow telemetry links: a flood of requests costs neither memory nor bandwidth.
+A PARAM_SET is answered at once, with the old value if the new one is not allowed. Reads wait in a set of names and are
+answered at a pace that a slow telemetry link can carry, so a flood of requests costs neither memory nor bandwidth.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from companion.links.mavlink.link import MavlinkLink
 logger = logging.getLogger(__name__)
 
 VALUES_PER_S = 40.0
-AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")  # CMP_AT_ARM
-RESULTS: Final = ("none", "done", "failed", "cancelled")  # CMP_STATE: outcome of the last calibration of this run
+AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")  # Meanings of CMP_AT_ARM 0, 1, 2
+RESULTS: Final = ("none", "done", "failed", "cancelled")  # Meanings of CMP_STATE 0 to 3: last outcome since start
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter; its limits are rounded to float32, as every value is."""
+    """One parameter of this component; values and limits are rounded to float32, as MAVLink sends them."""
 
     name: str
-    """CMP_ and at most 12 more characters from A-Z, 0-9 and _ (16 in all is the protocol's limit)."""
+    """Name: CMP_ and at most 12 more characters from A-Z, 0-9 and _ (MAVLink allows 16 in all)."""
     value: float
     minimum: float
     maximum: float
     on_set: Callable[[float], None] | None = None
-    """Called before a value takes effect; raises a CompanionError to refuse it. None: read only."""
+    """Callback for a value that a client sets; it raises a CompanionError to refuse the value. None: read only."""
 
     def allows(self, value: float) -> bool:
         return float32(self.minimum) <= value <= float32(self.maximum)
 
 
 class OwnParameters:
-    """The parameters of component 191."""
+    """Server of component 191's parameters: answers reads and writes, and sends changed values."""
 
     def __init__(
         self, link: MavlinkLink, parameters: Sequence[Parameter], texts: StatusText, permission: Permission
@@ -68,7 +68,7 @@ class OwnParameters:
         return self._values[name]
 
     def set(self, name: str, value: float) -> None:
-        """Set a value from inside the daemon and send a changed one to everyone; raise ValueError beyond the limits."""
+        """Set a parameter from inside the daemon, and broadcast a change; raise ValueError beyond its limits."""
         parameter = self._by_name[name]
         value = float32(value)
         if not parameter.allows(value):
@@ -79,7 +79,7 @@ class OwnParameters:
 
     def step(self, now_s: float) -> float:
         if not self._pending or not self._link.connected:
-            # Changes stay pending until there is a transport again.
+            # Changes stay pending until the link has a transport again.
             return math.inf
         if now_s >= self._next_s:
             name = next(iter(self._pending))
@@ -128,7 +128,7 @@ class OwnParameters:
             return
         sender = (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self._link.system_id, self._link.component_id):
-            return  # an echo, or somebody who pretends to be us
+            return  # an echo of our own message, or a sender that uses our ids
         refusal = self._permission.refuses(sender, f"setting {parameter.name}") or self._apply(parameter, message)
         if refusal:
             self._texts.say(Severity.WARNING, f"{parameter.name} not set: {refusal}", Weight.REFUSAL)

@@ -1,6 +1,6 @@
 """Interfaces that the MAVLink component needs from the daemon: the calibration service and the arm gate.
 
-The service decides whether a calibration may start; the component carries requests in and verdicts out.
+The service decides whether a calibration may start; the component receives requests and sends the decisions.
 """
 
 from __future__ import annotations
@@ -13,38 +13,38 @@ import msgspec
 from companion.estimation.machine import What
 
 MEASURED_PERCENT: Final = 70.0
-"""Progress at which measuring ends, and estimating and writing begin."""
+"""Progress of a calibration, in percent, at which the measurement ends, and estimating and writing begin."""
 WRITTEN_PERCENT: Final = 80.0
-"""Progress at which writing ends, and the check of the telemetry and the autopilot's settling begin."""
+"""Progress of a calibration, in percent, at which writing ends and the check of the autopilot's output begins."""
 
 
 class Refusal(msgspec.Struct, frozen=True):
-    """Refusal of a request; `reason` is one line for people and does not begin with "refused"."""
+    """Refusal of a request; `reason` is one line for people, without the prefix "refused"."""
 
     kind: Literal["armed", "unknown", "busy", "nothing_to_undo", "unsupported", "other"]
     reason: str
 
 
 class JobResult(msgspec.Struct, frozen=True):
-    """End of a job; `reason` is one line for people (the figures when done)."""
+    """Result of a calibration or undo; `reason` is one line for people (after success: the estimated figures)."""
 
     outcome: Literal["done", "failed", "cancelled"]
     reason: str = ""
 
 
 class AcceptedJob(Protocol):
-    """A running calibration or undo."""
+    """A calibration or undo that was accepted and now runs."""
 
     progress_percent: int
-    """0 to 100; never falls."""
+    """Progress of the job, from 0 to 100; it never decreases."""
     finished: asyncio.Future[JobResult]
 
 
 class CalibrationService(Protocol):
-    """The calibration service. Every method returns at once.
+    """Starts and cancels calibrations and undos. Every method returns at once, without waiting for the job.
 
-    The service itself reports (`StatusText.say`) the start, the waiting and the outcome of a job, as jobs are also
-    requested through other interfaces than MAVLink. The component reports refusals.
+    The service itself reports the start, the waiting and the outcome of a job (`StatusText.say`): jobs also come from
+    other interfaces than MAVLink. The component reports refusals.
     """
 
     def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal: ...
@@ -56,27 +56,27 @@ class CalibrationService(Protocol):
 
     @property
     def progress_percent(self) -> int:
-        """Progress of the running calibration or undo; 100: none runs."""
+        """Progress of the running calibration or undo in percent; 100: no job runs."""
 
     @property
     def mav_state(self) -> int:
-        """MAV_STATE_* for the heartbeat: CALIBRATING while busy, ACTIVE or STANDBY when idle, CRITICAL on a fault."""
+        """MAV_STATE for our heartbeat: CALIBRATING during a job, ACTIVE or STANDBY when idle, CRITICAL on a fault."""
 
 
 class ArmAnswer(msgspec.Struct, frozen=True):
-    """The arm gate's answer at this moment.
+    """Answer to the question whether the aircraft may arm now.
 
-    "accept": the aircraft may arm. "wait": it may soon, by itself or once held still. "refuse": somebody has to act
-    first. `words` give reason and remedy, in at most 41 characters where possible (the length that ArduPilot shows).
+    "accept": the aircraft may arm. "wait": it may arm soon, perhaps only after it was held still. "refuse": somebody
+    has to act first. `words`: reason and remedy, if possible within the 41 characters that ArduPilot shows.
     """
 
     verdict: Literal["accept", "wait", "refuse"]
     words: str
     hold_still_s: int | None = None
-    """Time to hold still, if nothing else is needed."""
-    meanwhile: str = ""  # Activity while the aircraft is held still
+    """Seconds for which the aircraft must still be held still; None: holding still is not enough."""
+    meanwhile: str = ""  # Activity of the companion while the aircraft is held still
     against: str = ""
-    """Reason why the aircraft counts as uncalibrated; empty: `words` give another reason against arming."""
+    """Reason why the aircraft counts as uncalibrated; empty: something else prevents arming, or nothing does."""
 
     @classmethod
     def hold_still(cls, seconds: float, meanwhile: str = "", against: str = "") -> ArmAnswer:
@@ -86,12 +86,12 @@ class ArmAnswer(msgspec.Struct, frozen=True):
 
 
 class ArmGate(Protocol):
-    """The arm gate. Every method returns at once."""
+    """Decides whether the aircraft may arm. Every method returns at once."""
 
     @property
     def at_arm(self) -> Literal["gate", "warn", "off"]: ...
     @property
     def asks_script(self) -> bool:
-        """Return whether a script on the autopilot (ArduPilot) waits for the answer."""
+        """True if our arming script on the autopilot (ArduPilot) waits for the gate's answer."""
 
     def answer(self) -> ArmAnswer: ...

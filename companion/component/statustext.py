@@ -1,13 +1,13 @@
 """Messages for people: short STATUSTEXT lines, and tunes on the autopilot's buzzer.
 
-Three limits protect a slow telemetry link: a text is not repeated within seconds unless a result came in between, a
-token bucket bounds the lines per second, and the queue is bounded. A full queue drops the oldest of the texts with the
-least weight, so that news and refused commands never displace a result.
+Three limits protect a slow telemetry link. A text is not repeated within 3 s, unless the result of a job came between.
+A token bucket limits the lines per second. The queue is bounded: a full queue drops the oldest text of the lowest
+priority (`Weight`), so that news and refused commands never displace a result.
 
 Texts must not begin with "[cal]": QGroundControl reads such lines as the progress of PX4's own calibration.
 
-Tunes are for an operator who looks at no screen. Both firmwares accept PLAY_TUNE (258) in QBasic's notes (ArduPilot
-`AP_Notify/ToneAlarm.cpp` and `MMLPlayer.cpp`, PX4 `mavlink_receiver.cpp` and `lib/tunes`). Neither acknowledges a tune.
+Tunes are for an operator without a screen in view. Both ArduPilot (`AP_Notify/ToneAlarm.cpp` and `MMLPlayer.cpp`) and
+PX4 (`mavlink_receiver.cpp` and `lib/tunes`) accept PLAY_TUNE (258) in QBasic's notation. Neither acknowledges a tune.
 Both would play it in flight too, so none is sent then. PX4 garbles a tune that arrives before the last one has ended.
 """
 
@@ -38,9 +38,9 @@ LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
 GOES_ON = "... "  # Beginning of a line that continues the one before
-SPOKEN = 4  # Number of spoken texts kept for page and monitor
+SPOKEN = 4  # Number of spoken texts stored for the web page and `companion monitor`
 STALE_S = 20.0
-"""Age at which a text that could not be sent (no link) is dropped, unless it is a result."""
+"""Age at which a text that waits for the link is dropped; results of jobs are never dropped for age."""
 RECENT_TEXTS = 32
 _FULL_RETRY_S = 0.1
 _FIGURE = re.compile(r"[-+]?\d+(\.\d| ?(%|mg\b|deg\b|K\b))")
@@ -52,12 +52,11 @@ _ASCII = str.maketrans(
 
 
 class Severity(enum.IntEnum):
-    """MAV_SEVERITY. CRITICAL: act this second. ERROR: a request has failed. WARNING: a fault the pilot has to know.
+    """Severity of a text, numbered as MAV_SEVERITY. INFO: a text to read. NOTICE: a short request, or a success.
 
-    NOTICE: a request to the operator or a success; it is spoken aloud, hence short. INFO: text to read.
-    QGroundControl and our page speak NOTICE and worse (`Vehicle.cc`: `severity <= MAV_SEVERITY_NOTICE`).
-    QGroundControl opens a window for ERROR and worse. Mission Planner speaks WARNING and worse and shows it on its HUD,
-    unless its user has chosen NOTICE (`MAVLinkInterface.cs`: setting "severity", 4 by default).
+    WARNING: a fault that the pilot must know. ERROR: a request has failed. CRITICAL: the pilot must act at once.
+    QGroundControl and our web page speak NOTICE and worse (`Vehicle.cc`), and QGroundControl opens a window for ERROR
+    and worse. Mission Planner speaks and shows WARNING and worse; its user can choose NOTICE (`MAVLinkInterface.cs`).
     """
 
     CRITICAL = 2
@@ -68,7 +67,7 @@ class Severity(enum.IntEnum):
 
 
 class Weight(enum.IntEnum):
-    """Priority of a text when the queue is full or the link is slow; heavier texts go first."""
+    """Priority of a text when the queue is full or the link is slow; the highest number is sent first."""
 
     NEWS = 0
     REFUSAL = 1
@@ -79,17 +78,17 @@ Say = Callable[[Severity, str, Weight], object]  # Sends a text to the ground st
 
 
 def to_ascii(text: str) -> str:
-    # Ground stations show other characters differently.
+    # Ground stations do not agree on characters beyond ASCII.
     text = unicodedata.normalize("NFKD", " ".join(text.translate(_ASCII).split()))
     text = "".join(character for character in text if not unicodedata.combining(character))
     return "".join(character if " " <= character <= "~" else "?" for character in text)
 
 
 def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
-    """Split a text into lines of one message each; only the first is spoken.
+    """Split a text into lines of one STATUSTEXT each; only the first line has a severity that is spoken.
 
-    A line ends at the last pause that fits, otherwise between two words. The first line of a NOTICE ends before the
-    first figure, as figures are to be read. MAVLink's `chunk_seq` cuts words, and some receivers speak every chunk.
+    A line ends at the last punctuation that fits, otherwise between two words. The first line of a NOTICE ends before
+    the first figure, to keep figures unspoken. MAVLink's `chunk_seq` cuts words, and some receivers speak every chunk.
     """
     found: list[tuple[Severity, str]] = []
     rest = text
@@ -125,23 +124,23 @@ def _end_of_line(text: str, *, figures: bool, most: int = LINE_BYTES) -> int:
 
 
 class StatusText:
-    """Queue of texts; `step` sends as many as the limits allow."""
+    """Queue of texts for the ground stations; `step` sends as many as the rate limit allows."""
 
     def __init__(self, link: MavlinkLink) -> None:
-        self.woken = asyncio.Event()  # Set when there is something new to send, for the caller of `step`
+        self.woken = asyncio.Event()  # Set when a new text waits, to wake the caller of `step`
         self._link = link
         self._waiting: list[tuple[Weight, float, Severity, str]] = []
         self._recent: deque[tuple[Severity, str, float]] = deque(maxlen=RECENT_TEXTS)
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
         self.spoken: deque[dict[str, object]] = deque(maxlen=SPOKEN)
-        """The latest spoken texts, the oldest first, numbered from 1."""
+        """The latest texts that ground stations speak, for the web page; oldest first, numbered from 1 since start."""
         self._numbers = itertools.count(1)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
-        """Queue a text; return False when it repeats one of the last seconds, or when the queue is full.
+        """Queue a text; return False if an equal one was queued within 3 s, or if the queue is full.
 
-        A result is never a repeat, as each ends another request; texts before it may be repeated for the next request.
+        The result of a job is always queued. After a result, earlier texts may be repeated for the next job.
         """
         text = to_ascii(text)
         now_s = asyncio.get_running_loop().time()
@@ -162,9 +161,9 @@ class StatusText:
         return True
 
     def step(self, now_s: float) -> float:
-        """Send as many lines as the token bucket allows; return the time of the next call (infinity: none pending)."""
+        """Send as many lines as the rate limit allows; return the time of the next call, infinity if none is needed."""
         if not self._link.connected:
-            # Texts stay pending: the heartbeat is due as soon as there is a transport, and `step` follows it.
+            # Texts stay pending: the loop calls `step` again with the first heartbeat on a new transport.
             return math.inf
         while self._lines.left(now_s) >= 1.0 - 1e-9:
             if not self._sending:
@@ -189,14 +188,14 @@ class StatusText:
 
 
 TUNES_APART_S: Final = 1.5
-"""Least time between the starts of two tunes: the longest tune takes 1.1 s."""
-TUNE_STALE_S: Final = 3.0  # Age at which a tune that could not be played is dropped
+"""Shortest time between the starts of two tunes; the longest tune takes 1.1 s."""
+TUNE_STALE_S: Final = 3.0  # Age at which a tune that could not be sent is dropped
 
 
 class Tune(enum.Enum):
-    """Tunes by meaning. The notes fit the first field of PLAY_TUNE: at most 29 characters.
+    """Tunes, each with its notes for PLAY_TUNE: at most 29 characters, which its first field holds.
 
-    HOLD_STILL: one long note. NEXT, this pose is done: rising notes. WRONG, not the requested pose: alternating notes.
+    HOLD_STILL: a long note. NEXT (this pose is done): rising notes. WRONG (not the requested pose): alternating notes.
     """
 
     HOLD_STILL = "MFT200O4A2"
@@ -207,7 +206,7 @@ class Tune(enum.Enum):
 
 
 class Tunes:
-    """Plays tunes while disarmed and `wanted`; `step` sends a due tune, and `play` sets `woken` for its caller."""
+    """Plays tunes on a disarmed autopilot's buzzer if `wanted` allows; `play` sets `woken`, to have `step` called."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, wanted: Callable[[], bool], woken: asyncio.Event) -> None:
         self._link, self._vehicle, self._wanted, self._woken = link, vehicle, wanted, woken

@@ -1,7 +1,7 @@
 """Configuration: parser of the TOML file, with a one-line error for every mistake.
 
-A TOML file becomes frozen structures with units in their names. Unknown keys are errors (with the nearest known
-key), so that a misspelt limit never silently becomes a default.
+The parser converts the file to frozen structures with units in their field names. An unknown key is an error that
+suggests the nearest known key: a misspelt limit must not silently become the default.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from companion.errors import ConfigError, StorageError
 
 DEFAULT_PATH = Path("/etc/companion/companion.toml")
 MOST_BYTES: Final = 64 * 1024
-"""Longest configuration file; the sample, which has every key, is a ninth of that."""
+"""Maximum size of a configuration file: nine times the sample file, which contains every key."""
 MOST_LINE: Final = 4096
-"""Most characters of a line: the time to parse a TOML key grows with the square of its dots."""
+"""Maximum number of characters in a line: the time to parse a TOML key grows with the square of its number of dots."""
 CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
 _Kind = typing.TypeVar("_Kind", bound=msgspec.Struct)
 
 Saved = Callable[[Path, str], NoiseProfile | str]
-"""Function that looks up a saved profile by storage directory and name, or returns the name.
+"""Function that loads a saved noise profile by storage directory and name. It may return the name itself instead.
 
 Raises:
-    ConfigError, StorageError: there is no such profile, or it cannot be read; the text continues "found".
+    ConfigError, StorageError: there is no such profile, or it cannot be read; callers put "found" before the text.
 """
 
 
@@ -47,13 +47,13 @@ def _none(_directory: Path, wanted: str) -> NoiseProfile:
 
 
 def load(path: Path, saved: Saved = _none) -> Config:
-    """Read and check a configuration file; raise ConfigError with one line (see `parse`)."""
+    """Read and check a configuration file; raise ConfigError with a one-line text if it cannot be used."""
     text = read(path, "companion setup makes it (or give another with -c FILE)")
     return parse(text, str(path), saved)
 
 
 def read(path: Path, missing: str) -> str:
-    """Read the text of a configuration file; `missing`: remedy in the ConfigError if there is no file."""
+    """Read the text of a configuration file; raise ConfigError, with the remedy `missing` if there is no file."""
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES + 1).decode()
@@ -64,10 +64,10 @@ def read(path: Path, missing: str) -> str:
 
 
 def parse(text: str, name: str, saved: Saved = _none) -> Config:
-    """Check the text of a configuration file; messages call the file `name`.
+    """Parse and check the text of a configuration file; error texts call the file `name`.
 
     Raises:
-        ConfigError: one line that names the file, the key, what was found and what is allowed.
+        ConfigError: one line that names the file, the key, the value found and the allowed values.
     """
     config = converted(text, name, Config)
     check_together(config, name)
@@ -75,7 +75,7 @@ def parse(text: str, name: str, saved: Saved = _none) -> Config:
 
 
 def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
-    """Convert the text of a file without the rules that span several keys; raise ConfigError (see `parse`)."""
+    """Parse the text of a file without checking keys against each other; raise ConfigError for a wrong key or value."""
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{name}: found more than {MOST_BYTES} bytes; allowed: a configuration file")
     for number, line in enumerate(text.split("\n"), 1):

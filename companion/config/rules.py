@@ -1,4 +1,4 @@
-"""Rules that span several keys of the configuration file; each check yields its complaints as text."""
+"""Rules that compare keys of the configuration file with each other; each rule yields its complaints as text."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SERIAL = 'only with source = "serial"'
 
 
 def check_together(config: Config, name: str) -> None:
-    """Check the rules; raise ConfigError with the first complaint."""
+    """Check the rules that compare keys with each other; raise ConfigError with the first complaint."""
     for complaint in _complaints(config):
         raise ConfigError(f"{name}: {complaint}")
 
@@ -118,7 +118,7 @@ def _port(port: str, here: str) -> Iterator[str]:
 
 
 def _ports_differ(config: Config) -> Iterator[str]:
-    """Check that each port has one user; roles of one device share a port and must agree on its line setting."""
+    """Check that one device uses each port; sections of the same device must agree on protocol, baud and parity."""
     used: dict[str, list[tuple[str, Imu | Gradienter | Compass]]] = {}
     for here, device in _serial_devices(config):
         for before, other in (sharing := used.setdefault(device.port or "", [])):
@@ -145,7 +145,7 @@ def _shared(
         yield _wrong(f"{here}.port", f"{device.port!r}, which {before}.port has already", "a port of its own")
     for key in ("protocol", "baud", "parity"):
         ours, theirs = getattr(device, key, None), getattr(other, key, None)
-        # A section may omit a setting that another section of the device has.
+        # One section of a device may omit a setting that another section of the same device has.
         if ours is not None and theirs is not None and ours != theirs:
             found = f"{ours!r} on {device.port}, where {before}.{key} is {theirs!r}"
             yield _wrong(f"{here}.{key}", found, f"{theirs!r} (one device serves both), or a port of its own")
@@ -165,9 +165,9 @@ _BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<por
 
 
 def bind_problem(bind: str, name: str) -> str | None:
-    """Return the reason why a page cannot be bound to an address, or None.
+    """Return the reason why a web page cannot be bound to an address, or None if it can.
 
-    Only numeric addresses are allowed: a name's address, and so who can reach the page, may change with the network.
+    Host names are refused: the address behind a name may change with the network, and with it who can reach the page.
     """
     match = _BIND.fullmatch(bind)
     host = (match["six"] or match["host"]) if match else ""
@@ -199,7 +199,7 @@ def _mounting(mounting: Mounting, here: str) -> Iterator[str]:
 
 
 def _upright(mounting: Mounting, here: str) -> Iterator[str]:
-    """Refuse a gradienter or compass on its side or upside down: it does not work there, and reports no fault."""
+    """Refuse a gradienter or compass mounted on its side or upside down: it would measure wrongly without a warning."""
     roll_deg, pitch_deg, _ = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
     if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
         yield _wrong(here, f"{mounting!r}, on its side or upside down", "within 60 degrees of upright")

@@ -20,7 +20,7 @@ _IDS: Final = re.compile(r"(?:\*|([0-9]{1,3})(?:-([0-9]{1,3}))?)")
 
 
 class Senders:
-    """MAVLink senders from a list such as "255", "255:190", "250-255", "*:190", "*"; ValueError for another entry."""
+    """Set of MAVLink senders such as "255", "255:190" (system:component), "250-255"; ValueError for other forms."""
 
     def __init__(self, entries: Iterable[str]) -> None:
         self._pairs = [_pair(entry) for entry in entries]
@@ -49,9 +49,9 @@ def _range(words: str, entry: str) -> range:
 
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-"""Profiles of the catalogue; others are learned and saved (`companion profile --save`)."""
+"""Names of the built-in noise profiles of IMUs; `companion profile --save` estimates and saves further ones."""
 UNKNOWN: Final[Profile] = "unknown"
-"""Profile of an unknown part: the figures of the worst common parts."""
+"""Noise profile for an IMU of unknown type, with the figures of the worst common types."""
 GradienterProtocol = Literal[
     "inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000", "rion", "pni", "witmotion", "stim300"
 ]
@@ -73,13 +73,13 @@ Height = Annotated[float, Meta(ge=HEIGHT_M[0], le=HEIGHT_M[1])]
 Baud = Annotated[int, Meta(ge=300, le=4_000_000)]
 PositiveFloat = Annotated[float, Meta(gt=0)]
 NonEmpty = Annotated[str, Meta(min_length=1)]
-# Plain str on purpose: msgspec (0.19 to 0.22) confuses a length limit inside a union with a tuple and corrupts memory.
+# Plain str on purpose: with a length limit in a union with a tuple, msgspec (0.19 to 0.22) corrupts memory.
 Mounting = str | tuple[float, float, float]
-"""A MAVLink rotation name, or [roll, pitch, yaw] in degrees, sensor to vehicle FRD."""
+"""Rotation from sensor axes to vehicle axes (FRD): a MAVLink rotation name, or [roll, pitch, yaw] in degrees."""
 
 
 def secret_path(name: str) -> Path:
-    """Return the path of a secret; a name without a folder is a systemd credential."""
+    """Return the path of a file with a secret; a bare file name is looked up among systemd's credentials."""
     return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / name
 
 
@@ -87,28 +87,28 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class VehicleSection(Section, frozen=True):
-    """Place and system id of the aircraft, if they should not come from the autopilot, and the platform under it."""
+    """Section [vehicle]: place and system id, instead of those from the autopilot; and the platform it is parked on."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
     height_m: Height | None = None
     system_id: Annotated[int, Meta(ge=1, le=255)] | None = None
     platform: Platform = "ground"
-    """ground: fixed to the Earth. deck: may turn and sway, such as a boat, or a vehicle with its engine running."""
+    """Platform: "ground" is fixed to the Earth; "deck" may turn and sway (a boat, a car with its engine running)."""
 
 
 class Mavlink(Section, frozen=True):
     url: NonEmpty
     component_id: Annotated[int, Meta(ge=2, le=255)] = 191
-    """MAVLink component id; 0 (broadcast) and 1 (autopilot) are reserved."""
+    """MAVLink component id of the companion; 0 (broadcast) and 1 (autopilot) are reserved."""
     allow: tuple[str, ...] = EVERYBODY
-    """Senders that may calibrate, cancel, undo and set our parameters, in the format of `Senders`."""
+    """MAVLink senders that may calibrate, cancel, undo and set our parameters, such as "255" or "255:190"."""
     signing: Signing | None = None
     signing_key_file: NonEmpty | None = None
 
     @property
     def signing_mode(self) -> Signing:
-        """Signing mode: as configured, else "require" with a key and "off" without."""
+        """Mode of MAVLink signing; if none is configured: "require" with a key file, "off" without."""
         return self.signing or ("off" if self.signing_key_file is None else "require")
 
     @property
@@ -117,11 +117,11 @@ class Mavlink(Section, frozen=True):
 
 
 class AllanModel(msgspec.Struct, frozen=True):
-    """Noise of one axis: N, B and K of the Allan deviation, in rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
+    """Coefficients of the Allan deviation of one gyro axis (unit u = rad/s) or accelerometer axis (u = m/s^2)."""
 
-    white: float  # N
-    flicker: float  # B; the floor of the Allan deviation is 0.664 B
-    walk: float  # K
+    white: float  # White noise N, u sqrt(s)
+    flicker: float  # Flicker noise B, u; the floor of the Allan deviation is 0.664 B
+    walk: float  # Random walk K, u/sqrt(s)
 
     @property
     def floor(self) -> float:
@@ -129,14 +129,14 @@ class AllanModel(msgspec.Struct, frozen=True):
 
 
 class NoiseProfile(msgspec.Struct, frozen=True):
-    """Noise of one IMU model, from the catalogue or saved. A recording contains the saved profile of each IMU."""
+    """Noise of one type of IMU: a built-in profile, or one estimated by `companion profile --save`."""
 
     name: NonEmpty
     gyro: AllanModel
     accel: AllanModel
-    origin: str = ""  # Text: recordings from which a saved profile was learned
+    origin: str = ""  # Description of the recordings from which a saved profile was estimated
     warm_up: tuple[float, float] | None = None
-    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: unknown."""
+    """Two sigma of the bias change from cold to warm: gyro in rad/s, accelerometer in m/s^2; None: unknown."""
 
     def of(self, triad: Triad) -> AllanModel:
         return self.gyro if triad == "gyro" else self.accel
@@ -147,7 +147,7 @@ class NoiseProfile(msgspec.Struct, frozen=True):
 
 
 class Imu(Section, frozen=True):
-    """One IMU to be calibrated: the autopilot's, read over MAVLink, or our own on a serial port."""
+    """Section [[imu]]: one IMU to calibrate, of the autopilot (read over MAVLink) or of the companion (serial port)."""
 
     name: NonEmpty
     source: Literal["autopilot", "serial"]
@@ -158,7 +158,7 @@ class Imu(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
     read_only: bool = False  # True: nothing is ever sent to the device on this port
-    profile: str | NoiseProfile | None = None  # Profile of the catalogue (`Profile`), or a saved one
+    profile: str | NoiseProfile | None = None  # Noise profile: a built-in one (`Profile`), or a saved one
 
 
 class Gradienter(Section, frozen=True):
@@ -170,10 +170,10 @@ class Gradienter(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: tuple[float, float] = (0.0, 0.0)
     sigma_deg: PositiveFloat | None = None
-    """Sigma of the tilt; None: the protocol's (protocols/registry.py), else 0.05."""
+    """Sigma of the gradienter's tilt; None: the figure of its protocol (protocols/registry.py), or 0.05 without one."""
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
-    """Time constant of fluid and filters; None: the protocol's."""
+    """Time constant of the gradienter's fluid and filters; None: the figure of its protocol (protocols/registry.py)."""
 
 
 class Compass(Section, frozen=True):
@@ -185,13 +185,13 @@ class Compass(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
     sigma_deg: PositiveFloat | None = None
-    """Sigma of the heading; None: the protocol's, else 3."""
+    """Sigma of the compass heading; None: the figure of its protocol (protocols/registry.py), or 3 without one."""
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
     heading: Literal["device", "field"] = "device"
-    """Source of the heading. device: the device; field: the device's field vector and the gradienter's tilt."""
+    """Source of the heading. "device": the compass itself. "field": its field vector, levelled by the gradienter."""
     counts_per_gauss: PositiveFloat | None = None
-    """Scale of a field in counts; None: the field's strength is not checked."""
+    """Scale of a compass that reports the magnetic field in counts; None: the field strength is not checked."""
 
 
 class Calibration(Section, frozen=True):
@@ -201,13 +201,13 @@ class Calibration(Section, frozen=True):
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
     max_age_min: PositiveFloat = 30.0
-    """Age since the last confirmation at which a calibration is out of date (method 3.2)."""
+    """Time after its last confirmation at which a calibration is out of date (docs/reference/method.md section 3.2)."""
     max_temperature_change_degc: PositiveFloat = 3.0
-    """Change of temperature since the last confirmation at which a calibration is out of date (method 3.2)."""
+    """Temperature change since confirmation that makes a calibration out of date, if no temperature curve is known."""
     prior: bool = True
-    """True: check new calibrations against earlier ones, and combine them (docs/calibration.md)."""
+    """True: check a new calibration against earlier ones, and combine it with them (docs/calibration.md)."""
     any_bias: bool = False
-    """True: accept biases beyond those of any part, and gravity along another axis than the tilt shows."""
+    """True: accept a bias larger than any sensor has, and measured gravity that contradicts the tilt."""
 
 
 class Push(Section, frozen=True):
@@ -215,21 +215,21 @@ class Push(Section, frozen=True):
     attitude: Literal["off", "yaw", "full"] = "off"
     attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
     stop_rivals: bool = False
-    """True: switch off functions of the autopilot that overwrite our biases; an undo switches them on again."""
+    """True: switch off the autopilot's functions that overwrite our biases; an undo switches them on again."""
 
 
 class ComponentSection(Section, frozen=True):
     tunes: bool = True
-    """True: use the autopilot's buzzer while it is disarmed."""
+    """True: play tunes on the autopilot's buzzer while it is disarmed."""
 
 
 class Mqtt(Section, frozen=True):
     host: NonEmpty
     port: Annotated[int, Meta(ge=1, le=65535)] | None = None
     base_topic: NonEmpty | None = None
-    """Beginning of all topics; None: "companion/" and the vehicle's system id."""
+    """Beginning of all MQTT topics; None: "companion/" and the vehicle's system id."""
     client_id: NonEmpty | None = None
-    """Client id; None: the base topic with "-" for "/"."""
+    """MQTT client id; None: the base topic, with each "/" replaced by "-"."""
     username: NonEmpty | None = None
     password_file: NonEmpty | None = None
     tls: bool = False
@@ -248,10 +248,10 @@ class Mqtt(Section, frozen=True):
 
 
 class Fleet(Section, frozen=True):
-    """Items for a fleet's collector, saved and sent over `mqtt`; without this section there are none."""
+    """Section [fleet]: reports for the collector of a fleet, sent over MQTT; without the section none are made."""
 
     name: NonEmpty | None = None  # Name of the aircraft
-    location: Location = "off"  # Precision of the location in the items
+    location: Location = "off"  # Precision of the location in the reports
 
 
 class Control(Section, frozen=True):
@@ -260,12 +260,12 @@ class Control(Section, frozen=True):
 
     @property
     def group_name(self) -> str | None:
-        """Group of the socket: as configured, else that of the service's unit, else None."""
+        """User group of the control socket: the configured one, else the one that systemd's unit sets, else None."""
         return self.group or os.environ.get("COMPANION_CONTROL_GROUP") or None
 
     @property
     def path(self) -> Path:
-        """Path of the socket: as configured, else in systemd's runtime directory, else /run/companion."""
+        """Path of the control socket: as configured, else in systemd's runtime directory, else in /run/companion."""
         if self.socket is not None:
             return Path(self.socket)
         return Path(os.environ.get("RUNTIME_DIRECTORY", "/run/companion")) / "control.sock"
@@ -274,11 +274,11 @@ class Control(Section, frozen=True):
 class Storage(Section, frozen=True):
     directory: NonEmpty | None = None
     recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
-    """Size of the ring of recordings; 0: no ring; None: a small ring, if mcap is installed."""
+    """Size of the ring of recordings, whose oldest part is overwritten; 0: none; None: small, if mcap is installed."""
 
     @property
     def path(self) -> Path:
-        """Storage folder: as configured, else systemd's state directory, else /var/lib/companion."""
+        """Storage folder of the daemon: as configured, else systemd's state directory, else /var/lib/companion."""
         if self.directory is not None:
             return Path(self.directory)
         return Path(os.environ.get("STATE_DIRECTORY", "/var/lib/companion"))

@@ -1,4 +1,4 @@
-"""Error texts for a configuration file, in its terms; removed keys, commands and options with their remedies."""
+"""Error texts in the terms of the configuration file; remedies for removed keys, commands and options."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KEYS: Final[dict[str, str]] = {
     "calibration.fleet_prior": "0.2: delete the line (calibration.prior, of the aircraft's own power-ups, stays)",
     "push.dither": "0.2: delete the line (floats tell every IMU: on ArduPilot install the script of companion lua)",
 }
-"""Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
+"""Removed configuration keys ("imu.port" for "imu[0].port"), each with the version that removed it and the remedy."""
 
 _RECORD: Final = "0.2: record where a gradienter or a boat is (companion record), and replay that"
 _PROXY: Final = "0.2: put a web server with https before the page, as docs/fleet.md shows (The page)"
@@ -42,7 +42,7 @@ COMMAND_LINE: Final[dict[str, str]] = {
     "companion fleet demo": "0.2: run python -m sim fleet in the folder of the companion's sources",
     "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows (Export)",
 }
-"""Removed commands ("companion NAME") and options ("companion NAME --option"), each with its version and its remedy."""
+"""Removed commands ("companion NAME") and options ("companion NAME --option"), each with version and remedy."""
 
 _LONGEST: Final = 200
 _INT_BITS: Final = 63
@@ -61,10 +61,10 @@ def refusal_of_words(command: str, word: str) -> str | None:
 
 
 def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path: str, name: str) -> None:
-    """Refuse the first unknown key, and values that no key can have.
+    """Refuse unknown keys, and values that no key can have, such as nan.
 
     Raises:
-        ConfigError: names the key and the nearest known one, or the allowed ones.
+        ConfigError: the text names the first unknown key and the nearest known key, or all allowed keys.
     """
     known = typing.get_type_hints(section)
     for key, value in raw.items():
@@ -85,7 +85,7 @@ def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path
 
 
 def _refuse_unusable(value: object, here: str, name: str) -> None:
-    """Refuse values that are valid TOML but invalid for any key: nan, inf, huge integers, invisible characters."""
+    """Refuse values that are valid TOML but wrong for every key: nan, inf, huge integers, invisible characters."""
     within = [value]
     while within:  # no recursion: dots in a key may nest to any depth
         item = within.pop()
@@ -125,7 +125,7 @@ _MISSING = re.compile(r"missing required field `(?P<field>\w+)`")
 
 
 def explain(message: str, raw: dict[str, Any]) -> str:
-    """Convert msgspec's message to `key: found ..., allowed ...` in the file's terms."""
+    """Translate an error message of msgspec into `key: found ...; allowed: ...`, in the terms of the file."""
     match = _AT_PATH.match(message)
     what, path = (match["what"], (match["path"] or "").lstrip(".")) if match else (message, "")
     missing = _MISSING.search(what)
@@ -148,7 +148,7 @@ def _value_at(raw: object, path: str) -> object:
 
 
 def allowed(path: str) -> str:
-    """Describe the allowed values of a path such as `imu[0].source`."""
+    """Describe the allowed values of a configuration key such as `imu[0].source` in words."""
     annotation: object = Config
     for key in re.findall(r"\w+(?=\[|\.|$)", re.sub(r"\[[^\]]*\]", "", path)):
         section = _section_in(annotation)

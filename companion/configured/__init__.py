@@ -1,1 +1,1 @@
-"""Devices and models made from the configuration, for daemon and replay."""
+"""Sensor models and devices created from the configuration, for the daemon and for replays of recordings."""

@@ -1,4 +1,4 @@
-"""Models and devices made from the configuration."""
+"""Functions that create sensor models and serial devices from the configuration."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltS
 from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
-"""Rate requested for each autopilot IMU unless the connection limits it; the autopilot's filters pass 20 Hz."""
+"""Message rate requested for each autopilot IMU unless a serial line limits it; the autopilot's filters pass 20 Hz."""
 LEAST_IMU_RATE_HZ: Final = 10.0
 LINE_SHARE: Final = 0.5
 BITS_PER_BYTE: Final = 10.0  # Bits on the wire for one byte (8N1): a start bit, eight bits of data, a stop bit
-# Lengths in MAVLink 2: the payload and 12 bytes of header and checksum.
-HIGHRES_BYTES: Final = 75.0  # Length of HIGHRES_IMU: 63 bytes and 12
-VISION_BYTES: Final = 129.0  # Length of VISION_POSITION_ESTIMATE: 117 bytes and 12
-SCALED_BYTES: Final = 36.0  # Length of SCALED_IMU2 and SCALED_IMU3: 24 bytes and 12
+# Lengths of MAVLink 2 messages: the payload, and 12 bytes of header and checksum.
+HIGHRES_BYTES: Final = 75.0  # Length of HIGHRES_IMU: 63 + 12 bytes
+VISION_BYTES: Final = 129.0  # Length of VISION_POSITION_ESTIMATE: 117 + 12 bytes
+SCALED_BYTES: Final = 36.0  # Length of SCALED_IMU2 and SCALED_IMU3: 24 + 12 bytes
 
 TILT_SIGMA_DEG: Final = 0.05
-"""Default sigma of a gradienter, from cell and mounting; protocols of worse devices have their own."""
+"""Default sigma of a gradienter's tilt, from its cell and mounting; protocols of worse devices set their own."""
 TILT_BY_THE_WAY_SIGMA_DEG: Final = 0.65
-"""Sigma of the tilt from a compass or an IMU without a documented figure; the value is the HMR3300's."""
+"""Default sigma of the tilt reported by a compass or an IMU; the value is that of the HMR3300 compass."""
 HEADING_SIGMA_DEG: Final = 3.0
-"""Sigma of a compass without a documented figure, from the aircraft's own iron and currents."""
+"""Default sigma of a compass heading, caused by the aircraft's own iron and currents."""
 
 
 def settings(config: Config) -> Settings:
@@ -73,9 +73,9 @@ def baud_of(url: str) -> int | None:
 
 
 def imu_rate_hz(config: Config) -> float:
-    """Return the rate for each autopilot IMU that leaves half of a serial line free (57600 baud: 38 Hz for one IMU).
+    """Return the message rate for each autopilot IMU. All IMUs use half of a serial line (57600 baud, one IMU: 38 Hz).
 
-    An autopilot whose line is full drops messages and answers late.
+    An autopilot whose serial line is full drops messages and answers late.
     """
     baud = baud_of(config.mavlink.url)
     instances = [imu.instance or 1 for imu in config.imu if imu.source == "autopilot"]
@@ -86,13 +86,13 @@ def imu_rate_hz(config: Config) -> float:
 
 
 def attitude_rate_hz(config: Config) -> float:
-    """Return an attitude rate that does not fill a serial line (57600 baud: 22 Hz)."""
+    """Return the rate of attitude messages to the autopilot: at most half of a serial line (57600 baud: 22 Hz)."""
     wanted, baud = config.push.attitude_rate_hz, baud_of(config.mavlink.url)
     return wanted if baud is None else min(wanted, LINE_SHARE * baud / BITS_PER_BYTE / VISION_BYTES)
 
 
 def cannot_work(config: Config) -> list[str]:
-    """List the settings that cannot take effect, to report them at start instead of ignoring them."""
+    """List the settings that can have no effect, to report them at start."""
     if config.push.attitude == "off" or config.compass is not None:
         return []
     return [f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known']
@@ -168,9 +168,9 @@ def longest_window_s(config: Config) -> float:
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
-    """Return place and date: the configured ones, otherwise the autopilot's.
+    """Return the place (the configured one, otherwise the autopilot's) and the date.
 
-    The date is the autopilot's (from its GNSS), otherwise the host's; it only selects the year of the magnetic model.
+    The date comes from the autopilot's GNSS, otherwise from the host; it only selects the year of the magnetic model.
     """
     unix_s = time.time() if vehicle.place.unix_time_s is None else vehicle.place.unix_time_s
     date = datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).date()
@@ -188,13 +188,13 @@ def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
 
 
 def place_doubt(config: Config, vehicle: Vehicle) -> str | None:
-    """Return the reason to wait if no place is configured and the autopilot's reports contradict each other."""
+    """Return the reason why the autopilot's position is in doubt, unless the configuration has place and height."""
     place = config.vehicle
     return None if place.latitude_deg is not None and place.height_m is not None else vehicle.place.doubt
 
 
 def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> GradienterModel | None:
-    """Return the configured model with the measured zero added, and the measured sigma."""
+    """Return the configured model of the gradienter, with the zero and the sigma that an alignment has measured."""
     if model is None or used is None:
         return model
     x_deg, y_deg = model.offset_deg
@@ -205,20 +205,20 @@ def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> Gradie
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Role:
-    """One use of a device."""
+    """Role of a serial device: IMU, gradienter or compass. One device can have several roles."""
 
     name: str
     kind: Kind
     north: Literal["magnetic", "true"] | None = None  # Configured north of a compass' headings
 
     def refuses(self, sample: Sample) -> bool:
-        """Return whether the device reports a heading from another north than the configured one."""
+        """Return True for a heading whose north (magnetic or true) is not the configured one."""
         return self.north is not None and isinstance(sample, CompassSample) and sample.north not in (None, self.north)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SerialDevice:
-    """One device and its serial settings: the configured ones, otherwise the factory's."""
+    """One device on a serial port. Baud rate and parity are the configured ones, otherwise those of the factory."""
 
     port: str
     info: ProtocolInfo
@@ -237,7 +237,7 @@ class SerialDevice:
 
     @property
     def name(self) -> str:
-        """Name of the device's first role, also the name of its bytes in a recording."""
+        """Name of the device: that of its first role. Recordings store the device's bytes under this name."""
         return self.roles[0].name
 
     @property
@@ -263,7 +263,7 @@ def _sections(config: Config) -> Iterator[tuple[Role, Imu | Gradienter | Compass
 
 
 def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) -> SerialDevice:
-    # The configuration has been checked: sections that share a port have the same settings for it.
+    # The configuration has been checked: sections that share a port do not contradict each other.
     (first, section), sections = used[0], [section for _, section in used]
     info = PROTOCOLS[first.kind][section.protocol or ""]
     return SerialDevice(
@@ -283,7 +283,7 @@ def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Samp
 
 
 def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
-    """Pass the sample of one role to the collector; return the tilt or compass sample that it accepts or derives."""
+    """Pass a sample to the collector; return the tilt, or the heading if the collector uses it, otherwise None."""
     match part:
         case ImuSample():
             into.add_imu(role.name, part)
@@ -298,9 +298,9 @@ def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | Co
 
 
 def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
-    """Predict one sigma of the gyro bias, deg/h, for each part in the catalogue.
+    """Predict the sigma in deg/h of a gyro bias averaged over the longest window, for each built-in noise profile.
 
-    The figure is the estimator's own V(T, H) for the longest window. A warm-up and integer telemetry add to it.
+    The figure contains noise and the drift in the next 180 s, but not warm-up and coarse telemetry.
     """
     mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
     known = {name: one.gyro for name, one in PROFILES.items() if one.is_named}
@@ -308,7 +308,7 @@ def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
 
 
 class Profiles:
-    """The profile of each IMU: the configured one, otherwise that of the part that its autopilot reports."""
+    """Noise profile of each IMU: the configured one, otherwise that of the sensor that the autopilot reports."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -316,13 +316,13 @@ class Profiles:
         self._parts: dict[str, Profile | None] = {}
 
     def found(self, name: str, part: Profile | None) -> bool:
-        """Set the part that the autopilot reports for an IMU (None: unknown); return whether the profile changes."""
+        """Store the type of sensor that the autopilot reports for an IMU; return whether its noise profile changes."""
         before = self.of(name)
         self._parts[name] = part
         return self.of(name) != before
 
     def of(self, name: str) -> str | NoiseProfile | None:
-        """Return the profile of an IMU; None: its part is unknown."""
+        """Return the noise profile of an IMU; None: the type of sensor is unknown."""
         return self._imus[name].profile or self._parts.get(name)
 
     def imu(self, name: str) -> Imu:

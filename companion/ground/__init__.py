@@ -1,5 +1,5 @@
-"""Client of the companion on a pilot's laptop, over the telemetry link and without a ground station program.
+"""Commands `companion ground`: clients of the companion on a pilot's laptop, over the telemetry link.
 
-The package is an interface to people over MAVLink and uses no part of the daemon, which runs on the aircraft. Only this
-package imports MAVSDK, when one of its commands runs.
+They need no ground station program. This package uses no part of the daemon, which runs on the aircraft. Only this
+package imports MAVSDK, and only when one of its commands runs.
 """

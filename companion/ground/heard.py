@@ -1,4 +1,4 @@
-"""Heartbeats and texts received on the link: components, the vehicle's armed state, and the companion's texts."""
+"""Store of heartbeats and texts received on the telemetry link, with the armed state of each autopilot."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from companion.links.system.events import Listeners
 from companion.protocols.guess import AUTOPILOT_NAMES
 
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
-FRESH_S: Final = 3.0  # longest age of a valid heartbeat: they come once a second, and two may be lost in a row
-MAX_PEERS: Final = 64  # most senders that are remembered; later ones are ignored
+FRESH_S: Final = 3.0  # maximum age of a valid heartbeat; heartbeats come once a second, two in a row may be lost
+MAX_PEERS: Final = 64  # maximum number of stored senders; later ones are ignored
 MAX_TEXTS: Final = 200
 
 Fields = Mapping[str, object]
 
 
 class Address(NamedTuple):
-    """MAVLink address of a component of a vehicle."""
+    """MAVLink address of a component: system id of its vehicle, and component id."""
 
     system_id: int
     component_id: int
 
 
 class PeerState(NamedTuple):
-    """The last heartbeat of a component."""
+    """Fields of the last heartbeat of a component, and the time of its receipt."""
 
     kind: int
     autopilot: int
@@ -41,7 +41,7 @@ class PeerState(NamedTuple):
 
 
 class Text(NamedTuple):
-    """A STATUSTEXT."""
+    """A received STATUSTEXT: a text for the pilot."""
 
     system_id: int
     severity: int
@@ -50,7 +50,7 @@ class Text(NamedTuple):
 
 
 class AutopilotSeen(NamedTuple):
-    """State of the autopilot from its heartbeat."""
+    """Firmware and armed state of an autopilot, from its last heartbeat."""
 
     system_id: int
     firmware: str | None
@@ -58,14 +58,14 @@ class AutopilotSeen(NamedTuple):
 
 
 class GroundListener:
-    """Heartbeats of all components, and texts of the companions. Never raises, whatever the messages contain."""
+    """Stores heartbeats of all components and texts of the companions. Malformed messages raise no errors."""
 
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
         self.first_s: float | None = None  # time of the first heartbeat
         self.heartbeats: dict[Address, PeerState] = {}
-        self.texts: list[Text] = []  # of all vehicles' companions, oldest first
-        self.on_text: Listeners[[Text]] = Listeners()  # Listeners for every text, with its system id
+        self.texts: list[Text] = []  # texts of all vehicles' companions, oldest first
+        self.on_text: Listeners[[Text]] = Listeners()  # callbacks for every received text of a companion
 
     def update(self, name: str, source: Address, fields: Fields, now_s: float) -> None:
         if name == "HEARTBEAT":
@@ -86,14 +86,14 @@ class GroundListener:
         return AutopilotSeen(system_id, beat.firmware, armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
-        """Return whether a heartbeat after `since_s` shows the companion at work; None: no such heartbeat."""
+        """Return whether the companion was busy in its last heartbeat; None: no heartbeat came after `since_s`."""
         beat = self.heartbeats.get(Address(system_id, self.component_id))
         if beat is None or beat.at_s <= since_s:
             return None
         return beat.system_status == mavlink.MAV_STATE_CALIBRATING
 
     def texts_of(self, system_id: int, since_s: float) -> list[Text]:
-        """List the texts of a vehicle's companion since `since_s`; continuation lines are joined."""
+        """List the texts of a vehicle's companion since `since_s`; join the lines of a text that was split."""
         found: list[Text] = []
         for text in self.texts:
             if text.system_id != system_id or text.at_s < since_s:
@@ -125,7 +125,7 @@ class GroundListener:
             )  # fmt: skip
 
     def _text(self, system_id: int, fields: Fields, now_s: float) -> None:
-        # The terminal must not execute control characters in it.
+        # Remove control characters: the terminal must not execute them.
         words = to_ascii(str(fields.get("text", "")).rstrip("\0"))
         text = Text(system_id, whole(fields, "severity"), words, now_s)
         self.texts.append(text)
@@ -134,7 +134,7 @@ class GroundListener:
 
 
 def whole(fields: Fields, name: str) -> int:
-    """Return a field that must be an integer; 0 for anything else."""
+    """Return an integer field of a message, or 0 if the field is absent or not an integer."""
     value = fields.get(name)
     return value if isinstance(value, int) else 0
 
@@ -146,7 +146,7 @@ def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
 
 
 def nobody_heard(heard: GroundListener, url: str, system_id: int | None, within_s: float) -> str:
-    """Describe in one line why no companion was found: heard senders, and the remedy."""
+    """Describe in one line that no companion was found, which senders were received instead, and the remedy."""
     others, component = heard.summary(), heard.component_id
     if not others:
         return (

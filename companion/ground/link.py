@@ -1,15 +1,14 @@
-"""Ground end of the link, on MAVSDK 4.1, and one command with all its answers (`Exchange`).
+"""Telemetry link of the ground commands, on MAVSDK 4.1, and the client of MAVLink's command protocol (`Exchange`).
 
-MavlinkDirectServer sends and receives any message, even before MAVSDK has found a system; Param is a parameter client
-with retries. MAVSDK's own `send_command` does not report progress, repeats with confirmation 0 (a new request) and does
-not ask again after a lost final answer. MAVSDK 4.1 has no signing: with a key, the companion's own link verifies and
-signs, and MAVSDK connects to it over `raw://`. MAVSDK calls back in threads of its own; all code here runs in the event
-loop.
+MAVSDK's MavlinkDirectServer sends and receives any message, even before MAVSDK has found a system; its Param is a
+parameter client with retries. Its `send_command` is not used: it reports no progress, repeats requests with
+confirmation 0 (as new requests), and does not recover a lost final answer. MAVSDK 4.1 has no signing: with a key, the
+companion's own link code verifies and signs, and MAVSDK connects to it over `raw://`. MAVSDK calls back in its own
+threads; the code of this module runs in the event loop.
 
-`Exchange` is the client of MAVLink's command protocol, over a radio that loses packets. It repeats a request with an
-increasing `confirmation` until the first answer, then follows IN_PROGRESS to the final answer. When progress stops, a
-repeated request returns a lost final answer while the companion remembers it (`component.commands`). Later the request
-would count as a new one, so it must not be sent.
+`Exchange` works over a radio that loses packets. It repeats a request with increasing `confirmation` until the first
+answer, then receives IN_PROGRESS until the final answer. If the answers stop, it repeats the request: the companion
+sends a lost final answer again for 3 s (`component.commands`). A later request would start a new job and is not sent.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[Signing]:
-    """Connect MAVSDK to a url through a signing link until the context ends; `own`: system and component id."""
+    """Connect MAVSDK to a url through a link that signs and verifies; `own`: system and component id of this end."""
     await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
     loop, parser = asyncio.get_running_loop(), mavlink.MAVLink(None)
     parser.robust_parsing = True
@@ -73,30 +72,30 @@ _HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
 
 
 class GroundLink:
-    """Ground station on an open link; `open_link` makes it."""
+    """An open telemetry link: sends commands, reads parameters, and passes received messages on."""
 
     def __init__(
         self, sdk: Any, direct: Any, own: Address, heard: GroundListener, signing: Signing | None = None
     ) -> None:
         self.own, self.heard = own, heard
         self._sdk, self._direct, self._signing = sdk, direct, signing
-        self.on_ack: Listeners[[Address, Fields]] = Listeners()  # Listeners for every COMMAND_ACK to us
+        self.on_ack: Listeners[[Address, Fields]] = Listeners()  # callbacks for every COMMAND_ACK to us
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
 
     def unbelieved(self) -> str:
-        """Describe the messages that were dropped because of their signature; empty: none."""
+        """Describe the messages that were dropped for a missing or wrong signature; empty: none."""
         if self._signing is None or not self._signing.doubted:
             return ""
         counts = ", ".join(f"{count} {reason}" for reason, count in self._signing.doubted.most_common())
         return f"messages dropped because of their signature: {counts}"
 
     def send_command(self, target: Address, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        """Send COMMAND_LONG; a failed send counts as a lost packet."""
+        """Send a COMMAND_LONG; ignore a failure to send, as packets can be lost anyway."""
         from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServerError, MavlinkMessage
 
-        # Give every field, as a number: for a wrong name or a string MAVSDK sends 0, without an error.
+        # Name every field, with a number: for a wrong name or a string MAVSDK sends 0, without an error.
         fields = {
             "target_system": target.system_id,
             "target_component": target.component_id,
@@ -115,7 +114,7 @@ class GroundLink:
         return {one.name: one.value for one in (*found.float_params, *found.int_params)}
 
     async def get_parameter(self, target: Address, name: str) -> float | None:
-        """Read one parameter; None: no answer, or no such parameter."""
+        """Read one parameter of a component; None: the component did not answer or has no such parameter."""
         from mavsdk.plugins.param import ParamError
 
         try:
@@ -162,10 +161,10 @@ class GroundLink:
 
 
 class _Log:
-    """Sink for MAVSDK's log, which would go to the terminal otherwise.
+    """Receives MAVSDK's log, which otherwise goes to the terminal.
 
-    `mavsdk.log_subscribe` fails on texts that are not UTF-8, such as a STATUSTEXT of any component: MAVSDK logs them
-    all. The text would then reach the terminal, with an error.
+    MAVSDK logs every STATUSTEXT. Its Python function `mavsdk.log_subscribe` fails on texts that are not UTF-8, so this
+    class subscribes in the C library.
     """
 
     def __init__(self) -> None:
@@ -174,14 +173,14 @@ class _Log:
 
         self.last_error = ""
         self._error = LogLevel.ERROR
-        # Keep a reference for as long as the library is loaded, since it may call back at any time.
+        # Store a reference for as long as the library is loaded: the library may call back at any time.
         _Log.callback = LogCallback(self._take)
         _cmavsdk_lib.mavsdk_log_subscribe(_Log.callback, None)
 
     callback: ClassVar[Any] = None
 
     def _take(self, level: int, message: bytes | None, *_: object) -> bool:
-        """Record a log message, in one of MAVSDK's threads; return True: MAVSDK must not print it."""
+        """Log a message of MAVSDK, in one of its threads; return True, so that MAVSDK does not print it."""
         words = (message or b"").decode(errors="replace")
         logger.debug("MAVSDK: %s", words)
         if level == self._error:
@@ -191,7 +190,7 @@ class _Log:
 
 @asynccontextmanager
 async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -> AsyncIterator[GroundLink]:
-    """Open a link as a ground station; `heard` gets all messages, or with a key only those signed with it.
+    """Open a telemetry link as a ground station. `heard` receives all messages, with a key only those signed with it.
 
     Raises:
         ConfigError: MAVSDK is not installed, or the url is invalid.
@@ -221,21 +220,21 @@ async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -
 
 
 ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
-"""Timeout of each attempt: 0.3 s for the companion, the rest for the radio. All attempts must end while the companion
-remembers the result of the first; otherwise the last could start another calibration."""
+"""Timeouts in seconds of the attempts to get a first answer: 0.3 s for the companion, the rest for the radio. At the
+last attempt, the companion must still remember its answer to the first: otherwise a second calibration could start."""
 REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
-"""Seconds without an answer after which the request is repeated: two ACKs may be lost in a row before that. The last
-repeat leaves the radio the rest of the time for which the companion remembers its final answer."""
+"""Seconds without an answer after which a running request is repeated; two IN_PROGRESS ACKs in a row may be lost
+before. The last repeat must arrive while the companion still remembers its final answer (3 s)."""
 assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
-ENDED_AFTER_S: Final = 5.0  # silence, with idle heartbeats, after which the final answer counts as lost
+ENDED_AFTER_S: Final = 5.0  # time without answers, but with idle heartbeats: the final answer counts as lost
 LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 
 
 class Exchange:
-    """A request; `run` it once, then read `result` (MAV_RESULT; None: no final answer) and `detail` (`result_param2`).
+    """Sends one command by `run`; then `result` is its MAV_RESULT (None: no final answer), `detail` its result_param2.
 
-    `on_progress` gets the percentage and the seconds since the last answer, several times a second.
+    `on_progress` is called several times a second with the percentage and the seconds since the last answer.
     """
 
     def __init__(
@@ -258,7 +257,7 @@ class Exchange:
         self.percent = 0
 
     async def run(self) -> None:
-        """Send the request and wait for its end; without an answer or a heartbeat, for at most 20 s."""
+        """Send the command and wait for its final answer; stop after 20 s without answers or heartbeats."""
         stop_watching = self._link.on_ack.add(self._on_ack)
         try:
             self.unanswered = not await self._begin()
@@ -275,7 +274,7 @@ class Exchange:
         return False
 
     async def _follow(self) -> bool:
-        """Wait for one more answer; return False if none can be expected any more."""
+        """Wait for the next answer and repeat the request meanwhile; return False if no answer can come any more."""
         loop = asyncio.get_running_loop()
         repeats = list(REPEAT_AFTER_S)
         while not await self._hears(_TICK_S):

@@ -1,4 +1,4 @@
-"""Requests from the ground: find the companion on the link, send a request, describe its outcome."""
+"""Ground station of `companion ground`: finds the companion on the link, sends a request, describes the outcome."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from companion.ground.heard import FRESH_S, Address, AutopilotSeen, GroundListen
 from companion.ground.link import Exchange, GroundLink
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
-EVERYBODY_WITHIN_S: Final = 1.3  # wait for all senders after the first heartbeat; heartbeats come once a second
-WORDS_WITHIN_S: Final = 3.0  # longest delay of the texts after the end that they describe
-QUIET_S: Final = 1.0  # silence after which a sender's texts are complete: it sends two lines a second
-CANCELLED_WITHIN_S: Final = 30.0  # a cancel waits for a safe point, and may have to restore old values
+EVERYBODY_WITHIN_S: Final = 1.3  # time after the first heartbeat in which every sender (1 Hz) is received
+WORDS_WITHIN_S: Final = 3.0  # longest wait for the companion's texts after the end of a job
+QUIET_S: Final = 1.0  # time without a text after which the texts are complete: the companion sends two lines a second
+CANCELLED_WITHIN_S: Final = 30.0  # timeout of a cancel, which may first have to restore old values
 SILENCE_WORTH_A_WORD_S: Final = 3.0
 _POLL_S: Final = 0.05
 
@@ -49,7 +49,7 @@ _SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}  # sev
 
 @dataclasses.dataclass(frozen=True)
 class RequestOutcome:
-    """Outcome of a request: for programs (`answer`, with `state` and `reason` first) and for people (`lines`)."""
+    """Outcome of a request: `answer` for programs, as JSON with `state` and `reason` first; `lines` for people."""
 
     state: State
     reason: str
@@ -63,7 +63,7 @@ class RequestOutcome:
 
 
 class Display:
-    """Progress and texts on stderr."""
+    """Prints progress and received texts on stderr."""
 
     def __init__(self) -> None:
         self._shown: tuple[str, int] | None = None
@@ -79,7 +79,7 @@ class Display:
 
 
 class Station:
-    """Client of the companion that `find` has found."""
+    """Client of one vehicle's companion: `find` selects it, the other methods send requests to it."""
 
     def __init__(self, link: GroundLink, url: str, display: Display) -> None:
         self._link, self._url, self._display = link, url, display
@@ -94,15 +94,15 @@ class Station:
         return self._heard.vehicle(self._target.system_id, asyncio.get_running_loop().time())
 
     def interrupt(self) -> None:
-        """Handle Ctrl-C: cancel the request; the second time, do not wait for its end."""
+        """Handle Ctrl-C: cancel the request; at a second Ctrl-C, do not wait for its end."""
         self._why_cancelled = self._why_cancelled or "Ctrl-C"
         self._interrupted.set()
 
     async def find(self, system_id: int | None, within_s: float) -> None:
-        """Wait for the companion's heartbeat, and its autopilot's if there is one.
+        """Find the companion by its heartbeat. Wait up to 1.3 s more for other vehicles and for its autopilot.
 
         Raises:
-            NobodyHeardError: no heartbeat in time; the text names the heard senders and the remedy.
+            NobodyHeardError: no heartbeat in time; the text names the received senders and the remedy.
             ConfigError: several vehicles have a companion, and none was selected.
         """
         loop = asyncio.get_running_loop()
@@ -124,7 +124,7 @@ class Station:
         self._target = Address(wanted[0], self._heard.component_id)
 
     async def calibrate(self, what: What, timeout_s: float | None, *, reboot: bool) -> RequestOutcome:
-        """Start a calibration and follow it to its end.
+        """Start a calibration, and show its progress until it ends.
 
         Raises:
             NobodyHeardError: no answer to the request, although the companion sends heartbeats.
@@ -149,13 +149,13 @@ class Station:
         return dataclasses.replace(outcome, reason=reason, lines=lines, more={**outcome.more, **more})
 
     async def undo(self) -> RequestOutcome:
-        """Undo the last write; raises NobodyHeardError."""
+        """Undo the last write to the autopilot; raise NobodyHeardError if the companion does not answer."""
         begun_s, exchange = asyncio.get_running_loop().time(), Exchange(self._link, self._target, UNDO)
         await self._cancellable(exchange, None)
         return await self._judge(exchange, begun_s)
 
     async def cancel(self) -> RequestOutcome:
-        """Cancel the running job, whoever started it, and wait for its end; raises NobodyHeardError."""
+        """Cancel the running job, whoever started it, and wait for its end; NobodyHeardError if no answer comes."""
         loop = asyncio.get_running_loop()
         begun_s, exchange = loop.time(), Exchange(self._link, self._target, CANCEL)
         await exchange.run()
@@ -198,7 +198,7 @@ class Station:
     # --- requests
 
     async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> None:
-        """Run an exchange. Ctrl-C or the timeout cancels it at the companion; then wait for its end too."""
+        """Run a request; at Ctrl-C or the timeout, cancel it at the companion and wait for its end."""
         running = asyncio.create_task(exchange.run())
         try:
             if not await self._ends(running, timeout_s):
@@ -217,7 +217,7 @@ class Station:
             await asyncio.gather(running, return_exceptions=True)
 
     async def _ends(self, running: asyncio.Task[None], within_s: float | None) -> bool:
-        """Wait for the end, the timeout or the next Ctrl-C; return whether the exchange ended."""
+        """Wait until a request ends, or for the timeout or the next Ctrl-C; return True if the request has ended."""
         interrupted = asyncio.create_task(self._interrupted.wait())
         try:
             await asyncio.wait({running, interrupted}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
@@ -310,7 +310,7 @@ class Station:
     def _ended(
         self, state: State, reason: str, begun_s: float, said: Text | None = None, *, good: bool = False
     ) -> RequestOutcome:
-        """Make an outcome, with the companion's warnings since `begun_s`."""
+        """Create an outcome that includes the companion's warnings since `begun_s`."""
         warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text != said]
         lines = [f"{state.upper()}: {reason}", *(f"warning: {text.words}" for text in warned)]
         return RequestOutcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
@@ -324,5 +324,5 @@ class Station:
 
 
 def _result(state: float | None) -> str | None:
-    """Name the result of the last calibration from CMP_STATE; None: no calibration, or unknown."""
+    """Return the result of the last calibration from the value of CMP_STATE; None: no calibration, or unknown."""
     return RESULTS[int(state)] if state in (1.0, 2.0, 3.0) else None

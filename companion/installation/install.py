@@ -1,4 +1,4 @@
-"""Installation and removal of the service's files: idempotent; files that the owner has changed are not overwritten."""
+"""Installs and removes the files of the systemd service, repeatably; files that the owner has changed stay."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ SHIPPED: Final = {
     MODULES: f"lib/{MODULES}",
     SAMPLE: "companion.toml.sample",
 }
-"""Target of each file of `systemd/`. Targets in lib/ are below the installation's prefix (owners change units with
-`systemctl edit`, in /etc); all others are below /etc/companion, which belongs to the owner."""
+"""Target path of each file of the source folder `systemd/`. Targets in lib/ are below the installation's prefix (owners
+change units by `systemctl edit`, in /etc); all others are below /etc/companion, which belongs to the owner."""
 
 
 def folder() -> Path:
-    """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError if there is none."""
+    """Return the folder with the service's files, in a wheel or a checkout; raise CompanionError if there is none."""
     here = Path(__file__).resolve().parent
     for candidate in (here / "systemd", here.parents[1] / "systemd"):
         if (candidate / SERVICE).is_file():
@@ -47,7 +47,7 @@ def folder() -> Path:
 
 
 def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
-    """Return a shipped file adapted to `executable`, without stamp; raise CompanionError for an unsuitable path."""
+    """Return a service file with the path of `executable`; raise CompanionError if a unit cannot hold that path."""
     text = (folder() / shipped).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
@@ -61,7 +61,7 @@ def stamped(data: bytes) -> bytes:
 
 
 def is_untouched(data: bytes) -> bool:
-    """Return whether any version of the companion wrote this content, and nobody has changed it."""
+    """Return True if some version of the companion wrote this file content and nobody has changed it since."""
     match = _STAMPED.match(data)
     return match is not None and hashlib.sha256(data[match.end() :]).hexdigest().encode() == match[1]
 
@@ -69,10 +69,10 @@ def is_untouched(data: bytes) -> bool:
 MODE: Final = 0o644
 COMMAND_TIMEOUT_S: Final = 120.0
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
-"""Folders that the unit hides from the service: ProtectHome and PrivateTmp."""
+"""Folders that the systemd unit hides from the service, by ProtectHome and PrivateTmp."""
 
 PACKAGED: Final = "packaged-by"
-"""File at the top of an environment from a Debian package; the service then belongs to the package."""
+"""File that marks a Python environment from a Debian package; that package then installs the service."""
 _START_PACKAGED: Final = "sudo systemctl enable --now companion"
 UDEV_RUNS: Final = Path("/run/udev/control")
 
@@ -114,7 +114,7 @@ def own_executable() -> str:
 
 
 def install(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
-    """Install step by step; raise CompanionError unless root runs it, or if a package has installed the service."""
+    """Install the service step by step; raise CompanionError without root, or if a Debian package installed it."""
     if target.is_this_machine:
         _check_not_packaged(_START_PACKAGED)
         _check_user("install-service")
@@ -127,7 +127,7 @@ def install(target: Installation, run: Run | None = None) -> Iterator[InstallSte
 
 
 def start_service(run: Run | None = None) -> Iterator[InstallStep]:
-    """Start the service now and at every boot; raise CompanionError (see `install`)."""
+    """Start the service now and at every boot, and install it first if need be; raise CompanionError without root."""
     if _is_packaged():
         for command in ("enable", "restart"):
             yield _command(run or _run, "systemctl", command, "companion.service")
@@ -140,7 +140,7 @@ def how_to_start() -> str:
 
 
 def uninstall(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
-    """Remove the files that `install` wrote; keep configuration and records. Raise CompanionError (see `install`)."""
+    """Remove the service, not configuration and records; CompanionError without root, or if a package installed it."""
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
         _check_user("uninstall-service")
@@ -209,7 +209,7 @@ def _check_user(command: str) -> None:
 
 
 def _check_reach(executable: str) -> None:
-    """Raise CompanionError if the service, which has its own account, could not run this installation."""
+    """Raise CompanionError if the service could not read and run this installation from its own user account."""
     package = Path(companion.__file__).parent
     for path in (Path(executable), package, Path(sys.base_prefix)):
         why = unreachable(path)
@@ -223,7 +223,7 @@ def _check_reach(executable: str) -> None:
 
 
 def unreachable(path: Path) -> str | None:
-    """Return the reason why the service cannot reach a path, in one line; None: it can."""
+    """Return the reason why the service's user account cannot read a path, in one line; None: it can."""
     resolved = path.resolve()
     for hidden in HIDDEN:
         if resolved.is_relative_to(hidden):
@@ -265,7 +265,7 @@ def systemd_runs() -> bool:
 
 
 def is_service() -> bool:
-    """Return whether this system runs systemd and has the companion's unit, in any of its folders."""
+    """Return True if this system runs systemd and has the companion's unit in one of systemd's folders."""
     folders = ("/etc", "/usr/local/lib", "/usr/lib", "/lib")
     return systemd_runs() and any(Path(folder, "systemd/system", SERVICE).exists() for folder in folders)
 

@@ -1,4 +1,4 @@
-"""Scripts that run on the flight controller; shipped here, installed there by its owner."""
+"""Script for ArduPilot flight controllers, which their owner installs there, and the messages to this script."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ARMING_SCRIPT: Final = Path(__file__).with_name("companion_arming.lua")
-"""ArduPilot's arming gate and floats; goes to APM/scripts/companion_arming.lua on the flight controller."""
+"""ArduPilot script with arming gate and IMU output; on the flight controller: APM/scripts/companion_arming.lua."""
 
 INSTALLATION: Final = (
     "save it on the flight controller as APM/scripts/companion_arming.lua (SD card or MAVFTP)",
@@ -17,11 +17,11 @@ INSTALLATION: Final = (
 )
 
 TUNNEL_TYPE: Final = 33191
-"""Payload type from the range that MAVLink leaves to local use (above 32767); a mark in the payload tells it apart."""
+"""Payload type of our TUNNEL messages, from MAVLink's range for local use (above 32767); payloads begin with a mark."""
 TUNNEL_BYTES: Final = 128
 
 
 def to_script(system_id: int, data: bytes) -> mavlink.MAVLink_tunnel_message:
-    """Return the message that brings `data` to the script in that autopilot."""
+    """Return a TUNNEL message with `data` for our script on the autopilot of a system id."""
     payload = list(data.ljust(TUNNEL_BYTES, b"\0"))
     return mavlink.MAVLink_tunnel_message(system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, TUNNEL_TYPE, len(data), payload)

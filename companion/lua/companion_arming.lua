@@ -1,22 +1,22 @@
--- companion_arming.lua: ArduPilot arms only while the companion computer says that a fresh calibration is in force,
--- flies by its gyros and GNSS as soon as the companion's heading is not to be had, and tells the companion every IMU's
--- output in floats, which no message of ArduPilot does.
+-- companion_arming.lua does three things. It lets ArduPilot arm only while the companion computer reports an active,
+-- recent calibration. It changes to heading from gyros and GNSS when the companion's heading fails. It sends the output
+-- of every IMU to the companion as floats, which no message of ArduPilot does.
 --
 -- Copyright the companion authors. SPDX-License-Identifier: Apache-2.0
 --
 -- Needs ArduPilot 4.5 or later on a board with more than 1 MB of flash and SCR_ENABLE = 1. Copy it to APM/scripts on
--- the SD card (or by MAVFTP) and reboot. It holds an auxiliary authorisation: pre-arm checks fail until the companion
--- has said "yes" within the last 3 s, and show its reason. What does not go through here: a forced arming; and the
--- moments between boot, or a restart of scripting, and this script's first line.
+-- the SD card (or by MAVFTP) and reboot. The script holds an auxiliary authorisation: pre-arm checks fail, and show the
+-- companion's reason, unless the companion has sent "accept" within the last 3 s. The script cannot prevent a forced
+-- arming, nor arming between a boot (or a restart of scripting) and its own first line.
 --
--- CMPG_ENABLE 0 opens the gate for good (1: closed without the companion). CMPG_COMPID is the companion's component id.
+-- CMPG_ENABLE = 0 allows arming always (1: never without the companion). CMPG_COMPID: the companion's component id.
 --
 -- The verdict comes twice a second as TUNNEL (#385) from our own system, type 33191; payload: "CMPA", version 1, a
--- verdict byte (0 wait, 1 accept, 2 refuse, 3 the companion does not gate any more), then the reason as ASCII.
+-- verdict byte (0 wait, 1 accept, 2 refuse, 3 gate switched off), then the reason as ASCII.
 --
--- Payload "CMPF", version 1, asks for floats. For 3 s after it, while disarmed, the port it came by gets about eleven
--- DEBUG_FLOAT_ARRAY (#350) a second, named CMP_IMU: of IMU 1, 2 and 3 the gyro in rad/s, the accelerometer in m/s^2,
--- both means of four readings in the autopilot's axes (FRD), and the temperature in deg C; zeros where there is none.
+-- Payload "CMPF", version 1, requests IMU output. For 3 s after each request, while disarmed, the script sends about 11
+-- DEBUG_FLOAT_ARRAY (#350) per second, named CMP_IMU, to the port of the request. For IMU 1, 2 and 3 they contain gyro
+-- in rad/s, accelerometer in m/s^2 (means of four readings, FRD axes), temperature in deg C; zeros for a missing IMU.
 
 local TUNNEL = 385
 local PAYLOAD_TYPE = 33191
@@ -25,11 +25,11 @@ local ACCEPT, NOT_GATING = 1, 3
 local SILENT_MS = 3000
 local PERIOD_MS = 200
 local GUARD_MS = 50
-local LONGEST = 41 -- what ArduPilot shows of a reason
+local LONGEST = 41 -- number of characters of a reason that ArduPilot shows
 local TABLE_KEY = 191
 local WARNING, INFO = 4, 6
 
--- Where the bytes of a received message lie: the packet's header, then the payload with its widest field first.
+-- Positions of the bytes in a received message: the packet's header, then the payload with its widest field first.
 local AT_SYSTEM, AT_COMPONENT, AT_MESSAGE = 8, 9, 10
 local AT_TYPE, AT_TARGET_SYSTEM, AT_TARGET_COMPONENT, AT_LENGTH, AT_PAYLOAD = 13, 15, 16, 17, 18
 
@@ -40,15 +40,15 @@ local verdict = nil
 local reason = ""
 local trouble = nil
 
--- Heading: with EK3_SRC1_YAW = 6 the EKF has the companion's and no other. When the companion's stream ends, or when in
--- flight the heading turns while the gyros do not, another source set is taken: in flight set 3, by which the gyros carry
--- the heading on and GNSS holds it, since a compass may have come to lie by then; on the ground set 2, the compass. Set 1
--- is put back when the stream has been there for 10 s: the companion sends only what agrees with the EKF. After a heading
--- that turned by itself not before the aircraft is disarmed. A set that somebody else has chosen stays. CMPG_HEADING 0: no
--- part in it.
-local FROM_NONE, FROM_COMPASS, FROM_OUTSIDE = 0, 1, 6 -- EK3_SRCn_YAW
+-- Heading: with EK3_SRC1_YAW = 6 the EKF uses only the companion's heading. The script selects another source set when
+-- the companion's stream ends, or when in flight the heading turns but the gyros do not. In flight it selects set 3:
+-- the gyros propagate the heading and GNSS corrects it, as a compass may be wrong then. On the ground it selects set 2,
+-- the compass. It restores set 1 after 10 s of stream: the companion sends only a heading that agrees with the EKF. If
+-- the heading turned by itself, it restores set 1 only once disarmed. A set that somebody else has selected stays.
+-- CMPG_HEADING = 0 switches this function off.
+local FROM_NONE, FROM_COMPASS, FROM_OUTSIDE = 0, 1, 6 -- values of EK3_SRCn_YAW
 local SET_1, SET_2, SET_3 = 0, 1, 2
-local LOST_MS = 300 -- besides the 300 ms after which visual_odom is not healthy
+local LOST_MS = 300 -- in addition to the 300 ms after which visual_odom becomes unhealthy
 local WELL_MS = 10000
 local STRAYS_RAD = math.rad(5)
 local STRAYS_WITHIN_S = 4
@@ -58,12 +58,12 @@ local STEEP_RAD = math.rad(60)
 local is_guarding = false
 local looked_ms = nil
 local silent_since_ms, well_since_ms = nil, nil
-local fell, is_latched = nil, false -- the set that was fallen back to
+local fell, is_latched = nil, false -- source set selected by this script as fallback
 local strayed_rad, last_yaw_rad, last_ms = 0, nil, nil
 local is_broken, floats_broken = false, false
 local gated_ms, gate_after_ms = nil, PERIOD_MS
 
--- Floats: the mean of four readings, 20 ms apart.
+-- IMU output as floats: each is the mean of four readings, 20 ms apart.
 local DEBUG_FLOAT_ARRAY = 350
 local PAYLOAD_BYTES = 252
 local NAME = "CMP_IMU"
@@ -71,7 +71,7 @@ local IMUS, READINGS, READ_MS, ASKED_MS = 3, 4, 20, 3000
 local asked_ms, asked_port = nil, nil
 local readings, gyro_sums, accel_sums = 0, {}, {}
 
--- To what is shown, at the end of a word if that leaves half of it.
+-- Shorten a text to the length that ArduPilot shows, at the end of a word unless less than half would remain.
 local function shorten(text)
     if #text <= LONGEST then
         return text
@@ -91,11 +91,12 @@ local function add_parameters()
 end
 
 local function own_system()
-    -- MAV_SYSID from 4.7 on, SYSID_THISMAV before
+    -- The parameter is MAV_SYSID from ArduPilot 4.7 on, SYSID_THISMAV before.
     return param:get("MAV_SYSID") or param:get("SYSID_THISMAV")
 end
 
--- Later versions want the table as first argument, earlier ones must not get it.
+-- Call a function of the table `mavlink`. Later versions of ArduPilot need the table as first argument, earlier ones
+-- refuse it.
 local function call(name, ...)
     local ok = pcall(mavlink[name], ...)
     if not ok then
@@ -109,7 +110,7 @@ local function listen()
         trouble = "Companion gate needs ArduPilot 4.5"
         return
     end
-    -- The two sizes changed places between versions: equal ones are right in all.
+    -- The order of the two sizes differs between versions: equal sizes are right in all of them.
     if call("init", 10, 10) and call("register_rx_msgid", TUNNEL) then
         listening = true
     else
@@ -128,7 +129,7 @@ local function receive()
     return nil
 end
 
--- Little endian, of so many bytes.
+-- Read a little-endian unsigned number of `bytes` bytes.
 local function number(message, at, bytes)
     local value = 0
     for k = bytes - 1, 0, -1 do
@@ -181,7 +182,7 @@ local function since_ms(then_ms)
     return (millis() - then_ms):toint()
 end
 
--- Read once a second: looking a parameter up by its name takes its time.
+-- Read the settings once a second: finding a parameter by its name is slow.
 local function look()
     if looked_ms ~= nil and since_ms(looked_ms) < 1000 then
         return
@@ -194,10 +195,10 @@ end
 
 local function angle_rad(name)
     local ok, found = pcall(function() return ahrs[name .. "_rad"](ahrs) end)
-    return ok and found or ahrs[name](ahrs) -- before 4.7
+    return ok and found or ahrs[name](ahrs) -- name before ArduPilot 4.7
 end
 
--- Whether the heading turns and the gyros do not: what is off within the last seconds.
+-- Return true if the heading has turned by more than 5 deg against the gyros within the last seconds.
 local function strays()
     local roll, pitch, yaw = angle_rad("get_roll"), angle_rad("get_pitch"), angle_rad("get_yaw")
     local gyro, before, passed_s = ins:get_gyro(0), last_yaw_rad, last_ms ~= nil and since_ms(last_ms) / 1000 or 0
@@ -251,7 +252,7 @@ local function guard()
             fall("landed")
         end
     else
-        fell = nil -- somebody else's choice
+        fell = nil -- somebody else has selected this set
     end
 end
 
@@ -285,7 +286,7 @@ local function is_asked()
     return not floats_broken and asked_ms ~= nil and since_ms(asked_ms) < ASKED_MS and not arming:is_armed()
 end
 
--- An IMU that was unhealthy at any of the readings is left out of the message.
+-- Add one reading of each IMU. An IMU that was unhealthy at any of the four readings is sent as zeros.
 local function read_imus()
     for i = 1, IMUS do
         local healthy = ins:get_gyro_health(i - 1) and ins:get_accel_health(i - 1)
@@ -324,7 +325,7 @@ local function tell_floats()
     end
 end
 
--- A script that stops on an error would leave its last word standing: so errors close the gate, and it goes on.
+-- An error must not stop the script, as its last authorisation would stay valid: errors forbid arming instead.
 local function update()
     local ok, problem = pcall(guard)
     if not ok and not is_broken then

@@ -1,14 +1,14 @@
-"""Catalogue of messages to people: their texts, causes and remedies.
+"""Catalogue of all messages to people: their texts, causes and remedies.
 
-The TOML files beside this module hold one table for each message, by identifier:
+Each TOML file beside this module has one table per message. The table's name identifies the message; its keys are:
 
-- `text`: the text, with named fields (`"IMU {imu} moves {rate} deg/s"`), which `message` fills in. The caller formats
-  the values: a field has no format specification, so that no text of the catalogue can fail;
-- `also`: equivalent texts of the arming script, the log or the autopilot; `…` stands for any value;
-- `words`: more words by which a person may search for the message;
+- `text`: the text, with named fields (`"IMU {imu} moves {rate} deg/s"`) that the function `message` fills in. Fields
+  have no format specification, as a wrong one would raise an error: the caller formats the values;
+- `also`: texts of the arming script, the log or the autopilot with the same meaning; `…` stands for any value;
+- `words`: additional words by which a person may search for the message;
 - `do`: the kind of remedy, a key of `KINDS`;
-- `cause`, `remedy`: one or two sentences; no remedy if there is nothing to do; `see`: a page of the documents, such
-  as `"arming.md#the-gate"`.
+- `cause`, `remedy`: one or two sentences each; no remedy if there is nothing to do;
+- `see`: a page of the documents, such as `"arming.md#the-gate"`.
 
 `make messages` generates docs/messages.md from the catalogue.
 """
@@ -41,15 +41,15 @@ KINDS: Final[Mapping[Kind, str]] = {
 }
 ANY: Final = "…"
 NO_MATCH: Final = "Type the line from the screen, or find the topic in docs/index.md"
-_CERTAIN_LETTERS: Final = 8  # Fewest letters of a pattern that identify a message in a longer line
-_SIMILAR: Final = 0.8  # Least ratio of `difflib` at which a word counts as misspelt
-_LEAST_SCORE: Final = 0.4  # Least share of the searched words' weight that an entry must contain
-_NAMED: Final = 0.1  # Bonus of an entry that names one of the words as its own
+_CERTAIN_LETTERS: Final = 8  # Minimum number of letters in a pattern that can identify a message in a longer line
+_SIMILAR: Final = 0.8  # Minimum similarity (difflib's ratio) at which a word counts as misspelt
+_LEAST_SCORE: Final = 0.4  # Minimum share of the searched words, by weight, that a found message must contain
+_NAMED: Final = 0.1  # Bonus for a message that has one of the searched words in its key `words`
 _WORD: Final = re.compile(r"[a-z][a-z_]+")
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One message of the catalogue."""
+    """One message of the catalogue, as its TOML table describes it."""
 
     do: Kind
     cause: str = ""
@@ -61,7 +61,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """Return the texts, with `…` instead of each value."""
+        """All texts of the message, with `…` in place of each value."""
         return (*([re.sub(r"\{[^}]*\}", ANY, self.text)] if self.text else []), *self.also)
 
     def advice(self) -> str:
@@ -70,7 +70,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 @functools.cache
 def catalogue() -> dict[str, Entry]:
-    """Load all messages by identifier; raise ValueError for a duplicate identifier."""
+    """Load all messages, by their identifiers; raise ValueError for a duplicate identifier."""
     found: dict[str, Entry] = {}
     for path in sorted(Path(__file__).parent.glob("*.toml")):
         part = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), dict[str, Entry])
@@ -81,23 +81,26 @@ def catalogue() -> dict[str, Entry]:
 
 
 def message(identifier: str, **fields: object) -> str:
-    """Return the text of a message with its fields filled in."""
+    """Return the text of a message with its fields replaced by values."""
     return catalogue()[identifier].text.format_map(fields)
 
 
 def explain(line: str) -> tuple[str, Entry] | None:
-    """Return the message that a line contains, the most specific one if it contains several."""
+    """Find the message that a line of text contains, the longest one if it contains several; None: there is none."""
     shown = [(letters, identifier) for letters, identifier, pattern in _patterns() if pattern.search(line)]
     return (found := max(shown)[1], catalogue()[found]) if shown else None
 
 
 def remedy(line: str) -> str:
-    """Return the remedy for a line; empty if the catalogue does not know the line."""
+    """Return the remedy for the message that a line of text contains; empty if the line contains no known message."""
     return "" if (found := explain(line)) is None else found[1].advice()
 
 
 def search(words: str, most: int = 3) -> list[tuple[str, Entry]]:
-    """List the best matches for a search, the best first; `words`: an identifier, a line, or words in any order."""
+    """List the messages that match a search best, the best first.
+
+    `words` may be an identifier, a line of text that contains a message, or words in any order.
+    """
     if words in catalogue():
         return [(words, catalogue()[words])]
     exact, index = explain(words), _index()
@@ -115,7 +118,7 @@ def search(words: str, most: int = 3) -> list[tuple[str, Entry]]:
 
 @functools.cache
 def _patterns() -> list[tuple[int, str, re.Pattern[str]]]:
-    """List number of letters, identifier and pattern of each text that can identify a message in a longer line."""
+    """List the texts that can identify a message in a longer line: number of letters, identifier, pattern of each."""
     found = []
     for identifier, entry in catalogue().items():
         for pattern in entry.patterns:
@@ -139,13 +142,13 @@ def _index() -> dict[str, frozenset[str]]:
 
 @functools.cache
 def _weights() -> dict[str, float]:
-    """Weight each word by its rarity."""
+    """Weight each word of the catalogue by its rarity: rare words identify a message better."""
     counts = Counter(word for words in _index().values() for word in words)
     return {word: math.log(1.0 + len(_index()) / count) for word, count in counts.items()}
 
 
 def _known(word: str, weights: Mapping[str, float]) -> str:
-    """Return the word of the catalogue that a misspelt or shortened word stands for, or the word itself."""
+    """Correct a misspelt or abbreviated word to a word of the catalogue; return it unchanged if none is similar."""
     if word in weights:
         return word
     whole = [known for known in weights if len(word) > 3 and known.startswith(word)]

@@ -1,1 +1,1 @@
-"""First-run set-up: detect devices by listening, ask the operator, and write the configuration."""
+"""First-run set-up: detects devices by listening, asks the operator, and writes the configuration file."""

@@ -1,4 +1,4 @@
-"""Editor of the configuration file's text: sets values, keeps comments, uncomments lines and sections."""
+"""Editor for the text of the configuration file: sets values, preserves comments, uncomments lines and sections."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Block:
         return keys[-1] if keys else 0
 
     def set(self, key: str, value: Any) -> None:
-        """Set a key of the section; None: comment it out."""
+        """Set a key in this section of the file to a value; None: comment the key out."""
         places = [(index, match) for index, line in enumerate(self.lines) if (match := _KEY.match(line))]
         mine = sorted(
             ((match["off"] is not None, index, match) for index, match in places if match["key"] == key),
@@ -51,7 +51,7 @@ def toml(value: Any) -> str:
 
 
 def render(text: str, wanted: Mapping[str, Any]) -> str:
-    """Change a text line by line until its values equal `wanted`; raise CompanionError if that is impossible."""
+    """Edit lines of a TOML text until its values equal `wanted`; raise CompanionError if that is impossible."""
     blocks = list(_blocks(text))
     now = tomllib.loads(text)
     for name, section in wanted.items():
@@ -102,7 +102,7 @@ def _set_list(blocks: list[_Block], name: str, now: Sequence[Table], wanted: Seq
         if index < len(there):
             _set_table(there[index], now[index], table)
             continue
-        # The sample's commented table is for a device on a port, and comes after all other tables.
+        # In the sample file, the commented table is for a device on a serial port, and is the last of its kind.
         block = _switched_on(blocks, name) if "port" in table else None
         _set_table(block or _behind(blocks, name), {}, table)
 

@@ -1,4 +1,4 @@
-"""Draft of a configuration: the present file, or the sample, changed by detected devices and answers."""
+"""Draft of a configuration: the present or the sample file, changed by detected devices and the operator's answers."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compas
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question for the operator."""
+    """A question of the set-up for the operator, with its present answer and the allowed answers."""
 
     words: str
     now: str  # Present answer
     put: Callable[[str], None]
-    """Function that stores an answer; raises ConfigError, in one line, for a wrong one."""
+    """Function that stores the operator's answer in the draft; it raises ConfigError for a wrong answer."""
     hint: str = ""
     choices: Sequence[str] = ()  # Answers that a page shows as buttons
     key: str = ""
 
 
 class Draft:
-    """Edited text of a configuration file, and the values to save; a new text is the sample, with only defaults."""
+    """Draft of a configuration file: its present text, and the values to write. `is_new`: the text is the sample."""
 
     def __init__(self, text: str, *, is_new: bool) -> None:
         self.text, self.is_new = text, is_new
@@ -54,11 +54,11 @@ class Draft:
         self.guessed: set[str] = set()
 
     def result(self) -> str:
-        """Return the new text; raise CompanionError if single lines of the text cannot be changed."""
+        """Return the text with the changed values; raise CompanionError if its lines cannot be edited one by one."""
         return render(self.text, self.wanted)
 
     def parsed(self) -> Config:
-        """Parse the new text; raise ConfigError, in one line, if it is wrong."""
+        """Parse the changed text; raise ConfigError with one line if it is no valid configuration."""
         # Do not look up saved profiles: the daemon does.
         return config.parse(self.result(), "answer", lambda _, name: name)
 
@@ -82,17 +82,17 @@ class Draft:
         return found
 
     def take_url(self, url: str) -> None:
-        """Set the autopilot's url; raise ConfigError for a wrong one."""
+        """Set the MAVLink url of the autopilot; raise ConfigError for an invalid url."""
         self._put("mavlink", "url", url)
         self.is_new = False
 
     def keep_beside(self, path: Path) -> None:
-        """Set storage and socket to paths beside the file: its owner may not write to the service's folders."""
+        """Put storage and control socket beside the configuration file: its owner may lack the service's folders."""
         self._put("storage", "directory", str(storage_beside(path)))
         self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
     def show_page(self, bind: str) -> None:
-        """Add the web page at an address unless the file has one; raise ConfigError for an invalid address."""
+        """Add the web page at the address `bind` unless the file has a page; raise ConfigError for a wrong address."""
         if "web" not in self.wanted:
             self._put("web", "bind", bind)
 
@@ -103,7 +103,7 @@ class Draft:
         return found
 
     def take(self, kind: Kind, port: str, protocol: str, line: Line) -> None:
-        """Put a device into its section; for a new protocol, delete the settings of the previous device."""
+        """Write a detected device to its section; if the protocol changes, delete the previous device's settings."""
         section = self.section(kind)
         if section is None:
             section = {"name": "own", "source": "serial"} if kind == "imu" else {}
@@ -119,7 +119,7 @@ class Draft:
         info = PROTOCOLS[kind][protocol]
         for key in ("baud", "parity")[: 1 if kind == "imu" else 2]:
             value = getattr(line, key)
-            # Do not add a factory setting for a configured device: it works without.
+            # Do not add a factory setting to a device that is configured already: the default is the same.
             if key in section or not is_there or value != getattr(info, key):
                 section[key] = value
         if kind == "gradienter" and "law" not in section:
@@ -172,8 +172,8 @@ class Draft:
                 )
 
     def part_questions(self, names: Collection[str]) -> Iterator[Question]:
-        """Yield questions for the parts of these IMUs, which give the estimator their noise."""
-        from companion.configured.models import gyro_sigmas_deg_h  # numpy takes a second on a small board
+        """Yield the question for the type of each of these IMUs, which tells the estimator its noise."""
+        from companion.configured.models import gyro_sigmas_deg_h  # importing numpy takes a second on a small board
 
         sigmas = gyro_sigmas_deg_h(self.parsed())
         price = ", ".join(f"{part} {sigma:.0f}" for part, sigma in sigmas.items())
@@ -267,7 +267,7 @@ def sample() -> str:
 
 
 def begin(path: Path) -> Draft:
-    """Load the configuration, or the sample if there is none; raise ConfigError if it cannot be used."""
+    """Begin a draft from the configuration file, or from the sample without one; raise ConfigError if it is wrong."""
     try:
         text = read_regular(path, config.MOST_BYTES).decode()
     except FileNotFoundError:
@@ -295,8 +295,8 @@ def holds(path: Path, text: str) -> bool:
 
 
 def put(path: Path, text: str) -> Path | None:
-    """Write the file atomically; return the path of the kept old file, or None if nothing had to be kept."""
-    # Replace the target of a link, not the link.
+    """Write the configuration file atomically; return the path of the old file's copy, None if there is no copy."""
+    # Write to the target of a symbolic link; do not replace the link.
     path = path.resolve()
     kept, mode = None, installing.MODE
     if path.exists() and not holds(path, sample()):

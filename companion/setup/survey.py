@@ -1,4 +1,4 @@
-"""Detection of autopilots on serial and UDP ports, and of devices on serial ports, only by listening."""
+"""Detects autopilots on serial and UDP ports, and devices on serial ports, by listening without sending."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from companion.protocols.guess import Heartbeat, Line, heartbeats
 from companion.protocols.registry import Kind, main_kind
 
 AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 115200))
-"""Line settings to try first on every port: ArduPilot's default, that of PX4's TELEM 2, and a common manual one."""
+"""Baud rates to try first on a serial port: ArduPilot's default, PX4's for TELEM 2, and one that owners often set."""
 Believed = Mapping[str, Line]
-"""Line settings of configured ports, tried first: a USB port without a UART can be read at any speed."""
+"""Line settings of the configured ports, tried first: a USB device without a UART can be read at any baud rate."""
 
 
 USUAL_PORTS: Final = (14540, 14550, 14551)
-"""UDP ports of PX4 for companions, of ground stations, and the usual second output of routers."""
+"""Usual UDP ports: PX4's for companion computers, that of ground stations, and the second one of MAVLink routers."""
 LISTEN_S: Final = 3.0
 LISTEN_TURNS: Final = 30
-"""Number of loop turns while listening; each reads the arrived messages, so a process with little processor time
-listens longer."""
+"""Number of turns of the event loop into which `LISTEN_S` is divided. Each turn reads the messages that have arrived,
+so a process that gets little processor time listens longer."""
 
 
 class HeardUdp(asyncio.DatagramProtocol):
-    """Senders heard on a UDP port."""
+    """Heartbeats received on a UDP port, by sender."""
 
     def __init__(self, senders: Iterable[Heartbeat] = (), *, from_here: bool = True) -> None:
         self.senders = dict.fromkeys(senders)
@@ -53,7 +53,7 @@ class HeardUdp(asyncio.DatagramProtocol):
 
 
 async def listen_udp(port: int) -> HeardUdp:
-    """Receive until an autopilot is heard or the time is over; raise LinkError if the port cannot be opened."""
+    """Listen on a UDP port until an autopilot is detected, for at most 3 s; raise LinkError if it cannot be opened."""
     try:
         transport, heard = await asyncio.get_running_loop().create_datagram_endpoint(
             HeardUdp,
@@ -72,7 +72,7 @@ async def listen_udp(port: int) -> HeardUdp:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Result of the set-up scan: devices heard on each serial and UDP port, or the reason why it was not scanned."""
+    """Result of the set-up's scan: for each port, the devices detected there, or the reason why it was not scanned."""
 
     serial: dict[str, Heard | str]
     udp: dict[int, HeardUdp | str]
@@ -91,7 +91,7 @@ class Survey:
         ]
 
     def devices(self, kind: Kind) -> list[tuple[str, str, Line]]:
-        """List port, protocol and line setting of the devices whose main use is this kind."""
+        """List the detected devices whose main use is `kind`, each with port, protocol and line settings."""
         return [
             (port, heard.candidate.protocol, heard.line)
             for port, heard in self.serial.items()
@@ -100,7 +100,7 @@ class Survey:
         ]
 
     def silent(self, port: str) -> bool:
-        """Return whether a serial port is absent or was scanned; False if it could not be opened."""
+        """Return True if a serial port is absent or was scanned, False if it could not be opened."""
         if port.startswith("/") and not os.path.exists(port):
             return True
         heard = [found for name, found in self.serial.items() if same_port(name, port)]
@@ -118,7 +118,7 @@ def same_port(one: str, other: str) -> bool:
 
 
 def same_url(one: str, other: str) -> bool:
-    """Return whether two MAVLink urls lead to the same endpoint; for udpin only the port number counts."""
+    """Return True if two MAVLink urls mean the same endpoint; for udpin only the port number counts."""
     (kind, where, number), theirs = parse_url(one), parse_url(other)
     if kind == "udpin":
         return theirs[::2] == (kind, number)

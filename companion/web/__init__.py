@@ -1,1 +1,1 @@
-"""Web page with the state of the daemon, and three buttons. Off unless `[web]` names an address."""
+"""Web page that shows the state of the daemon and has three buttons. Off unless the section [web] sets an address."""

@@ -1,4 +1,4 @@
-"""Process of the web page, `python -m companion.web`: a child of the daemon and a client of its control socket."""
+"""Process that serves the web page (`python -m companion.web`): the daemon's child and its control socket's client."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Final
 from companion.links.system.process import ChildSettings, ChildWork, run_child
 
 MEMORY_MIB: Final = 80
-"""Memory limit, twice the largest use: 22 MiB with a viewer, 39 with 16 stalled viewers and 1000 hostile clients."""
+"""Memory limit, twice the largest use: 22 MiB with one viewer, 39 with 16 stalled viewers and 1000 hostile clients."""
 
 
 def _page(settings: ChildSettings) -> ChildWork:
-    # Imported here: the process now has its low priority, so the import does not delay the daemon's start.
+    # Import here, where this process already has its low priority, so as not to delay the daemon's start.
     from companion.links.system.connection import ask
     from companion.web.server import Page
 

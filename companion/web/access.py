@@ -1,9 +1,9 @@
-"""Access rules of the web page: for reading, and for actions.
+"""Access rules of the web page, for reading and for actions.
 
-All clients that reach the address may read. An action needs a token in a header that a foreign site cannot set. On the
-board itself the page gets a token that is valid for the life of its process; elsewhere a person types the token of the
-storage folder, once. Against a foreign site that resolves its own name to our address (DNS rebinding), the Host header
-may name only addresses, "localhost" and the board's own names.
+All clients that reach the page may read. An action needs a token in an HTTP header that other web sites cannot set. If
+only the board itself can reach the page, the server sends it a token of its own process; elsewhere a person types the
+token from the storage folder once. Another site could resolve its name to our address (DNS rebinding): therefore the
+Host header may contain only addresses, "localhost" and the board's own names.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from companion.storage.state import read_regular, write_atomically
 
 TOKEN_HEADER: Final = "x-companion-token"  # noqa: S105 - a name
 TOKEN_FILE: Final = "web-token"  # noqa: S105 - a name
-# Without letters and digits that look alike on a phone in the sun; 12 characters have 59 bits.
+# Alphabet of a token, without letters and digits that look alike on a phone in the sun; 12 characters have 59 bits.
 _ALPHABET: Final = "23456789abcdefghjkmnpqrstuvwxyz"
 _GROUPS, _GROUP = 3, 4
 _LEAST_TOKEN: Final = _GROUPS * _GROUP
-"""Least length of a token that a person chose, without spaces and dashes."""
+"""Minimum length of a token that a person has chosen, without spaces and dashes."""
 _MOST_TOKEN_BYTES: Final = 200
 _OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
-"""Endings that a hotspot or a router appends to the board's name; names with them cannot be registered."""
+"""Suffixes that hotspots and routers append to the board's name; nobody can register a domain with such a suffix."""
 
 
 def split_address(bind: str) -> tuple[str, int]:
-    """Split "HOST:PORT" or "[HOST]:PORT", already checked by the configuration."""
+    """Split "HOST:PORT" or "[HOST]:PORT" into host and port; the configuration has already checked the form."""
     host, _, port = bind.rpartition(":")
     return host.strip("[]"), int(port)
 
@@ -43,7 +43,7 @@ def is_loopback(host: str) -> bool:
 
 
 def page_url(host: str, port: int) -> str:
-    """Return the URL for a browser; an address for all networks is replaced by the board's name."""
+    """Return the web page's URL for a browser, with the board's name instead of the addresses 0.0.0.0 and ::."""
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
         host = f"{socket.gethostname().partition('.')[0]}.local"
     return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
@@ -54,10 +54,10 @@ def new_token() -> str:
 
 
 def kept_token(directory: Path) -> str:
-    """Read the token of the storage folder; if there is none, make one that only the owner can read.
+    """Read the web page's token from the storage folder; if there is none, create one that only the owner can read.
 
     Raises:
-        StorageError: the token can be neither read nor made.
+        StorageError: the token cannot be read or created, or is too short.
     """
     path = directory / TOKEN_FILE
     try:
@@ -77,12 +77,12 @@ def kept_token(directory: Path) -> str:
 
 
 def _bare(token: str) -> str:
-    """Remove spaces and dashes, and lower capitals: they depend on the keyboard."""
+    """Normalise a typed token: remove spaces and dashes, and convert capital letters to small ones."""
     return re.sub(r"[\s-]", "", token).lower()
 
 
 class Access:
-    """Rules of one address: the token that an action needs, and whether the page gets the token automatically."""
+    """Access rules of a web page: actions need `token`; `handed_out`: the server sends the token to the page itself."""
 
     def __init__(self, token: str, *, handed_out: bool) -> None:
         self.token, self.handed_out = token, handed_out
@@ -90,7 +90,7 @@ class Access:
         self._names = {"localhost", *(name + ending for ending in _OWN_ENDINGS if name)}
 
     def refuses_host(self, headers: Mapping[str, str]) -> str | None:
-        """Return the reason why a request's Host is not ours, in one line; None: it is ours."""
+        """Return the reason to refuse a request whose Host header names another host than this board; None: accept."""
         host = headers.get("host", "")
         match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^:\[\]/@\s]+)(?::\d{1,5})?", host.lower())
         if match is not None:
@@ -100,7 +100,7 @@ class Access:
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
     def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
-        """Return the evidence that a request comes from another site's page; None: it comes from our own."""
+        """Return the reason to refuse a request that the page of another web site has sent; None: accept."""
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "asked by another site"
         origin, host = headers.get("origin"), headers.get("host", "")
@@ -109,7 +109,7 @@ class Access:
         return None
 
     def refuses_token(self, headers: Mapping[str, str]) -> str | None:
-        """Return the reason why the token allows no action; None: it is right."""
+        """Return the reason to refuse an action without the right token in its headers; None: accept."""
         given = _bare(headers.get(TOKEN_HEADER, ""))
         if not given:
             return "needs the token: companion web-token, on the board, shows it"

@@ -1,7 +1,7 @@
-"""Server of a web application at one address, on uvicorn: for the web page and for the fleet pages.
+"""HTTP server for one web application at one address, on uvicorn: for the web page and for the fleet pages.
 
-A connection carries one request, and ends with the answer or after `ANSWERED_WITHIN_S`. Beyond `MAX_CONNECTIONS` the
-oldest connection is closed for the next one. A stream is exempt from both limits: its application bounds it.
+A connection carries one request, and ends with the answer or after 20 s. If 48 connections are open, a new one replaces
+the oldest. Event streams are exempt from both limits: the application limits their number.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ HEADERS: Final = (
 )
 
 ANSWERED_WITHIN_S: Final = 20.0
-"""Timeout of request, work and answer together; an action takes 10 s at most."""
+"""Timeout of an HTTP connection, for request, work and answer together; an action takes at most 10 s."""
 MAX_CONNECTIONS: Final = 48
 MAX_HEAD_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 4096
 KERNEL_BYTES: Final = 64 * 1024
 UNHEARD_MS: Final = 10_000
-"""Timeout of the kernel for a client that acknowledges nothing: it is out of range, or asleep."""
+"""TCP_USER_TIMEOUT: the kernel closes the connection of a client that acknowledges no data for this time."""
 
 
 class Connection(H11Protocol):
-    """Connection of one client; the handler of its request gets it as `request.state.connection`."""
+    """HTTP connection of one client; the handler of its request finds it as `request.state.connection`."""
 
     def __init__(self, config: Config, state: ServerState, unanswered: dict[Connection, None]) -> None:
         super().__init__(config, state, {"connection": self})
@@ -81,7 +81,7 @@ class Connection(H11Protocol):
 
 @contextlib.asynccontextmanager
 async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) -> AsyncIterator[int]:
-    """Serve the application, with `more` headers on every answer; yield the port.
+    """Serve a web application until the context ends, with `more` headers on every answer; yield the port.
 
     Raises:
         OSError: the address cannot be used.
@@ -93,7 +93,7 @@ async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) 
         lifespan="off",
         interface="asgi3",
         log_config=None,
-        # Clients could fill the log with warnings.
+        # Log no warnings: clients could fill the log with them.
         log_level="error",
         access_log=False,
         proxy_headers=False,
@@ -104,8 +104,8 @@ async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) 
     config.load()
     state, unanswered = ServerState(), dict[Connection, None]()
     state.default_headers = config.encoded_headers
-    # Not uvicorn.Server: it replaces the signal handlers, ends the process if an address is in use, and wakes up ten
-    # times a second.
+    # Do not use uvicorn.Server: it replaces the signal handlers, ends the process if the address is in use, and wakes
+    # up ten times a second.
     loop = asyncio.get_running_loop()
     server = await loop.create_server(lambda: Connection(config, state, unanswered), host, port)
     try:
@@ -121,7 +121,7 @@ async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) 
 
 
 def _guarded(app: ASGIApp) -> ASGIApp:
-    """Handle cancellation and lack of memory, which uvicorn would log as faults before it continues."""
+    """Wrap an application to handle cancellation and lack of memory: uvicorn would log both as faults and continue."""
 
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Server of the web page: its routes, the event streams of its viewers, and its status."""
+"""Server of the web page: its HTTP routes, the event streams to its viewers, and its status."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ logger = logging.getLogger(__name__)
 
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
 
-WORTH_S: Final = 10.0  # Least duration of an open page that resets the backoff
+WORTH_S: Final = 10.0  # Time for which the page must be open to reset the backoff of its next opening
 WRONG_TOKEN_S: Final = 2.0
 MAX_WAITING: Final = 16
-"""Most answers to wrong tokens that are delayed at one time: each holds a connection."""
+"""Maximum number of answers to wrong tokens that are delayed at the same time: each occupies a connection."""
 ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 MAX_VIEWERS: Final = 16
 MAX_STRANGERS: Final = 4
-"""Maximum number of viewers without the token from one address; no limit if only the board itself can connect."""
+"""Maximum number of viewers from one address without the token; unlimited if only the board itself can connect."""
 MAX_BEHIND: Final = 20
-"""Most unread events of a viewer, ten seconds of them; a viewer further behind is disconnected, and reconnects."""
-AGAIN_S: Final = 0.5  # Pause before the next request after a failed one for the status
+"""Maximum number of events that wait for a slow viewer (10 s); with more it is disconnected, and then reconnects."""
+AGAIN_S: Final = 0.5  # Pause before the status is requested again after a failure
 ACTIONS: Final = asked_by(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
 _STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
@@ -54,9 +54,9 @@ _SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
 
 
 class Page:
-    """Server of the page at HOST:PORT; `run` it as a task.
+    """Server of the web page at an address HOST:PORT; the caller runs `run` as a task.
 
-    If other computers can reach the address, the token is that of the storage folder.
+    If other computers can reach the address, the token from the storage folder is used.
     """
 
     def __init__(self, bind: str, directory: Path, ask: Ask) -> None:
@@ -124,13 +124,13 @@ class Page:
     async def _events(self, request: Request) -> Response:
         self._refuse_stranger(request)
         peer, token = _peer(request), request.query_params.get("token", "")
-        # A browser's EventSource cannot send our header.
+        # The token is in the query: a browser's EventSource cannot set headers.
         has_token = self.access.refuses_token({TOKEN_HEADER: token}) is None
         viewer = Viewer(request.state.connection, peer, has_token=has_token)
         if (why := self._no_room_for(viewer)) is not None:
             if token:
                 await self._delay_guess(peer)
-            # As an event: a browser does not give the body of an error to the page.
+            # Send the reason as an event: a browser does not pass the body of an HTTP error to the page.
             return Response(event({"reason": why}, "refused"), media_type="text/event-stream")
         token_for_page = self.access.token if self.access.handed_out else None
         viewer.send(event({"version": __version__, "page": self._tag, "token": token_for_page}, "hello"))
@@ -177,7 +177,7 @@ class Page:
             reply = await self._result(asked)
         finally:
             with contextlib.suppress(CompanionError):
-                await self._show({"command": "status"})  # changed by the action
+                await self._show({"command": "status"})  # the action has changed it
         return _json({key: value for key, value in reply.items() if key != "kind"})
 
     async def _result(self, asked: Object) -> Object:
@@ -202,9 +202,9 @@ class Page:
             raise HTTPException(403, why)
 
     async def _delay_guess(self, peer: str) -> None:
-        """Delay the answer to a wrong token, against guessing; beyond `MAX_WAITING` delayed answers, do not delay."""
+        """Delay the answer to a wrong token, against guessing, unless 16 answers are being delayed already."""
         if self.access.handed_out:
-            return  # probably the token of the process before a restart, not a guess
+            return  # not a guess, but probably the token of this process before its restart
         self._wrong_tokens += 1
         logger.warning("page: wrong token from %s", peer)
         if self._delayed < MAX_WAITING:
@@ -217,7 +217,7 @@ class Page:
     # --- viewers
 
     def _no_room_for(self, viewer: Viewer) -> str | None:
-        """Return the reason to refuse a viewer, in one line; None: there is room. For the token, disconnect another."""
+        """Return the reason to refuse a viewer, None: accept. A viewer with the token replaces another if need be."""
         if not viewer.has_token:
             if len(self._viewers) >= MAX_VIEWERS:
                 return f"{MAX_VIEWERS} are looking already; the token makes room: companion web-token, on the board"
@@ -250,14 +250,14 @@ class Page:
                     return
                 if "status" in reply:
                     status = reply["status"]
-                    # The status of the first-run set-up has no vehicle, and so no rows.
+                    # The status of the first-run set-up has no vehicle: no rows can be made of it.
                     data = event({**status, "rows": rows(status)} if "vehicle" in status else status)
                     for viewer in tuple(self._viewers):
                         viewer.send(data)
 
 
 class Viewer:
-    """One viewer of the page: its connection, and its queue of events."""
+    """One browser that shows the page: its connection, and the queue of events to send to it."""
 
     def __init__(self, connection: Connection, peer: str, *, has_token: bool) -> None:
         self.connection, self.peer, self.has_token = connection, peer, has_token
@@ -275,7 +275,7 @@ class Viewer:
 
 
 class _OwnNames:
-    """Middleware that refuses requests for other host names than the board's, against DNS rebinding."""
+    """Middleware against DNS rebinding: refuses requests to other host names than the board's own."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
@@ -320,7 +320,7 @@ def event(value: object, name: str | None = None) -> bytes:
 
 
 def _assembled() -> bytes:
-    """Return the page as one document, so that a phone at the edge of the hotspot gets all of it or nothing."""
+    """Return the page, styles and scripts as one document: a phone at the edge of the hotspot gets all or nothing."""
     html = (_PARTS / "page.html").read_bytes()
     html = _STYLE.sub(lambda found: b"<style>\n" + (_PARTS / found[1].decode("ascii")).read_bytes() + b"</style>", html)
     return _SCRIPT.sub(
@@ -329,7 +329,7 @@ def _assembled() -> bytes:
 
 
 def _security_headers(html: bytes) -> tuple[tuple[str, str], ...]:
-    """Return headers that allow only the page's own style and script, and connections only to this server."""
+    """Return HTTP headers that allow only this page's own styles and scripts, and connections only to this server."""
 
     def hashes(tag: bytes) -> str:
         found = re.findall(b"<" + tag + b">(.*?)</" + tag + b">", html, re.DOTALL)

@@ -1,12 +1,12 @@
 "use strict";
-// What the ground stations speak is spoken here too, and the phone stays awake while something runs.
+// Speaks the texts that ground stations speak too, and keeps the phone awake while a job runs.
 const SPEAK_KEY = "aloud";
 let spokenUpTo = null, awakeLock = null, waking = false;
 
 function aloud(status) {
   keepAwake(status.progress !== null);
   const texts = status.spoken, latest = texts.length ? texts[texts.length - 1].number : 0;
-  // What was said before this page looked, or before the daemon began anew, is no news.
+  // Do not speak texts from before this page was opened, or from before a restart of the daemon.
   if (spokenUpTo !== null && document.getElementById("aloud").checked) {
     for (const {number, text} of texts) if (number > spokenUpTo) speak(text);
   }
@@ -17,7 +17,7 @@ function speak(text) {
   words.lang = "en";
   speechSynthesis.speak(words);
 }
-// Browsers have it only where nobody in between can read along: https, or the board itself.
+// Browsers offer the wake lock only over https, or on the board itself.
 async function keepAwake(wanted) {
   if (!navigator.wakeLock || waking) return;
   if (!wanted && awakeLock) {
@@ -27,7 +27,7 @@ async function keepAwake(wanted) {
     try {
       awakeLock = await navigator.wakeLock.request("screen");
       awakeLock.addEventListener("release", () => { awakeLock = null; });
-    } catch { /* the battery is low: the browser's to decide */ }
+    } catch { /* the browser refuses, for example when the battery is low */ }
     waking = false;
   }
 }
@@ -36,8 +36,8 @@ if (window.speechSynthesis) {
   try { box.checked = localStorage.getItem(SPEAK_KEY) === "1"; } catch { /* private window */ }
   document.getElementById("voice").hidden = false;
   box.addEventListener("change", () => {
-    try { localStorage.setItem(SPEAK_KEY, box.checked ? "1" : "0"); } catch { /* likewise */ }
-    // Phones let a page speak only once it has spoken at a touch.
+    try { localStorage.setItem(SPEAK_KEY, box.checked ? "1" : "0"); } catch { /* private window */ }
+    // Phones let a page speak only after it has spoken once in response to a touch.
     if (box.checked) speak("The companion speaks.");
     else speechSynthesis.cancel();
   });

@@ -22,7 +22,7 @@ const signed = (value, digits) => (value < 0 ? "−" : "+") + Math.abs(value).to
 const ago = s => s < 99.5 ? Math.round(s) + " s ago" : s < 5970 ? Math.round(s / 60) + " min ago" : (s / 3600).toFixed(1) + " h ago";
 const utc = iso => iso.slice(0, 16).replace("T", " ") + " UTC";
 
-// --- what is shown
+// --- display
 
 function headline(tone, word, reason) {
   $("head").dataset.tone = tone;
@@ -60,7 +60,7 @@ function show(status) {
   byHand(status.by_hand);
   aloud(status);
   stands(status.stands);
-  // Whether it may is the daemon's to say, with the reason; here only what makes no sense at all is off.
+  // Disable only buttons that make no sense: the daemon decides whether an action is allowed, and gives the reason.
   $("calibrate").disabled = busy;
   for (const button of document.querySelectorAll("#align button")) button.disabled = busy;
   for (const it of document.querySelectorAll(".wants-gradienter")) it.hidden = !status.devices.some(({name}) => name === "gradienter");
@@ -71,7 +71,7 @@ function show(status) {
   const key = JSON.stringify([status.last, status.headline.word === "READY", busy]);
   if (key !== shownRecords) { shownRecords = key; records(); }
 }
-// How good what is in force is, beside what was asked for.
+// Sigmas of the active calibration, beside the configured targets.
 function quality(status) {
   const rows = [["gyro", "°/h", 1], ["accel", "mg", 2]].flatMap(([triad, unit, digits]) => {
     const {wanted, met} = status.arming.quality[triad];
@@ -104,7 +104,7 @@ function axes(names, digits, biases, sigmas, unit, title, held, before) {
   }
   return [make("h3", `${title}, ${unit}${held ? ", held back" : ""}`), ...words, ...rows];
 }
-// The same figures of the calibration before this one, as far as it has been read.
+// Figures of the previous calibration, if its record has been read.
 function earlier(found, name, triad) {
   const at = recordsRead.findIndex(({record}) => record.started_at === found.started_at);
   if (at < 0) return null;
@@ -159,7 +159,7 @@ function link(good, name, words, remedy) {
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
-// The rows are the companion's own summary, as the command line shows it.
+// The daemon composes these rows; the command line shows the same ones.
 function links(status) {
   $("links").replaceChildren(...status.rows.map(([verdict, name, words, remedy]) => link(verdict === "ok", name, words, remedy)));
 }
@@ -192,7 +192,7 @@ function figures(imu) {
   return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
     + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written` : "");
 }
-// Plots are drawn by the page's process, as in reports, and only for who looks.
+// The page's server draws the plots, as in reports, and only on request.
 async function temperature() {
   const it = $("temperature");
   if (!it.open || document.hidden) return;
@@ -201,18 +201,18 @@ async function temperature() {
     if (!answer.ok || words === shownTemperature) return;
     it.lastElementChild.replaceChildren(new DOMParser().parseFromString(words, "text/html").body.firstChild);
     shownTemperature = words;
-  } catch { /* the headline says that nothing is heard */ }
+  } catch { /* the headline shows that the daemon does not answer */ }
 }
 let shownTemperature = null;
 $("temperature").addEventListener("toggle", temperature);
 setInterval(temperature, DRAWN_MS);
 
-// --- listening
+// --- event stream
 
-let refused = null; // why there is no room for this page
+let refused = null; // reason why the server does not accept this viewer
 function listen() {
   if (source) source.close();
-  // With the token there is room among many who only look.
+  // A viewer with the token is accepted even if many viewers without it are connected.
   source = new EventSource("/events" + (token ? "?token=" + encodeURIComponent(token) : ""));
   source.addEventListener("hello", event => {
     const hello = JSON.parse(event.data);
@@ -238,7 +238,7 @@ setInterval(() => {
 }, 500);
 document.addEventListener("visibilitychange", () => { if (!document.hidden && Date.now() - heardAt > GONE_MS) listen(); });
 
-// --- acting
+// --- actions
 
 let saidTimer = 0;
 function say(words, bad) {
@@ -270,7 +270,7 @@ $("ask").addEventListener("submit", event => {
   $("ask").hidden = true;
   if (token) { remember(token); say("token kept: press again"); }
 });
-function remember(value) { try { localStorage.setItem("token", value); } catch { /* private window: until it closes */ } }
+function remember(value) { try { localStorage.setItem("token", value); } catch { /* private window: remembered until it closes */ } }
 if (location.hash.startsWith("#token=")) {
   token = decodeURIComponent(location.hash.slice(7));
   remember(token);
@@ -304,7 +304,7 @@ for (const button of document.querySelectorAll("button.hold")) {
     from = [event.clientX, event.clientY];
     start();
   });
-  // A glove rolls: only a finger that clearly goes away lets go.
+  // A gloved finger rolls: only a large movement counts as releasing the button.
   button.addEventListener("pointermove", event => {
     if (from && Math.hypot(event.clientX - from[0], event.clientY - from[1]) > SLIP_PX) { from = null; stop(); }
   });

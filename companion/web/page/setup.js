@@ -1,5 +1,5 @@
 "use strict";
-// The first run: what `companion setup` says and asks. It thinks; here its words are shown and answers go back.
+// First-run set-up: shows the texts and questions of `companion setup`, and sends the answers back.
 let asked = 0;
 
 function firstRun(found) {

@@ -1,8 +1,8 @@
 "use strict";
-// Alignments: how to hold the aircraft now, how far the stand is, what has been done. All of it is the daemon's word.
+// Alignment: shows how to hold the aircraft, the progress of the pose and the finished poses, as the daemon reports.
 
 const SVG = "http://www.w3.org/2000/svg";
-// An aircraft in its own axes, forward, right, down; what looks up when it stands level is "top".
+// Outline of an aircraft in body axes (forward, right, down); "top" is the side that faces up when it is level.
 const PARTS = [
   ...[[.14, 0], [0, .14], [-.14, 0], [0, -.14]].flatMap(([y, z], k, ring) => {
     const [y2, z2] = ring[(k + 1) % 4], side = z + z2 < 0 ? "top" : "under";
@@ -20,7 +20,7 @@ const spherical = (azimuth, elevation) => [Math.cos(elevation) * Math.cos(azimut
 const AZIMUTH = -.95, ELEVATION = .38;
 const EYE = spherical(AZIMUTH, ELEVATION), RIGHT = [-Math.sin(AZIMUTH), Math.cos(AZIMUTH), 0], TOP = spherical(AZIMUTH, ELEVATION + Math.PI / 2);
 
-// From the aircraft's axes to north, west, up: it heads north, and `up` is up by the shortest turn from level.
+// Rotation from body axes to north, west, up. The aircraft heads north; the shortest turn from level brings `up` up.
 function attitude(up) {
   const from = [up[0], -up[1], -up[2]], cosine = from[2];
   const axis = [from[1], -from[0], 0], sine = Math.hypot(axis[0], axis[1]);
@@ -38,7 +38,7 @@ function draw(tag, attributes) {
 const onScreen = point => [60 * dot(point, RIGHT), -60 * dot(point, TOP)];
 const path = points => "M" + points.map(point => onScreen(point).map(value => value.toFixed(1)).join(" ")).join("L");
 
-// A picture of the aircraft so held, above the ground; with an arrow where it is to be turned.
+// Picture of the aircraft in this pose above the ground, with an arrow if it has to be turned.
 function picture(up, turnDeg, label) {
   const turned = attitude(up), svg = draw("svg", {role: "img", "aria-label": label, class: "hold"});
   const parts = PARTS.map(([name, points]) => [name, points.map(turned)]);
