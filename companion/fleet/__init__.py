@@ -1,1 +1,1 @@
-"""Fleet server: collectors that write the items of aircraft into a database. Not part of the daemon."""
+"""Fleet server, not part of the daemon: collectors write calibrations and other results of aircraft to a database."""

@@ -1,6 +1,6 @@
-"""Access list of Mosquitto: each aircraft publishes below its own name only, the collector only its answers.
+"""Access list for the MQTT broker Mosquitto: an aircraft publishes under its own name only, the collector only answers.
 
-No user of the list may publish below an aircraft's `request/`: the operator adds the users who may send requests.
+No user of this list may publish under an aircraft's `request/`: the operator adds the users who may send requests.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _READS: Final = (
 
 
 def access_list(aircraft: Sequence[str]) -> list[str]:
-    """Make the lines of the file for aircraft given as "USER=ID"; without any, each aircraft's user name is its id.
+    """Make the lines of the access list for aircraft given as "USER=ID"; if none is given, user names must be ids.
 
     Raises:
-        ConfigError: an entry is not such a pair, or an id has two users.
+        ConfigError: an entry is not USER=ID, or an id has two users.
     """
     lines = ["# mosquitto.conf: allow_anonymous false, password_file FILE, acl_file THIS FILE", f"user {COLLECTOR}"]
     lines += [f"topic write fleet/+/{what}" for what in ("confirmed", "wanted")]

@@ -1,7 +1,7 @@
-"""Collector of a fleet: receives the items of aircraft from a broker, writes them into the database, confirms them.
+"""Collector of a fleet: receives items of aircraft (calibrations, armings, ...) by MQTT, stores and confirms them.
 
-A collector has no state of its own. Any failure of the broker or the database ends both connections. Aircraft resend
-unconfirmed items; at each new connection the collector requests the items that the database lacks.
+A collector stores everything in the database. If the broker or the database fails, both connections end. Aircraft
+resend unconfirmed items, and at each new connection the collector requests the items that the database lacks.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ logger = logging.getLogger(__name__)
 BATCH: Final = 500
 GATHER_S: Final = 0.1
 ASK_AFTER: Final = 50
-"""Wait for items sent with a hello (any collector may get them) before missing ones are requested, in `GATHER_S`."""
+"""Wait after an aircraft's hello message, in units of `GATHER_S`, before items are requested that may be on the way."""
 WAITING: Final = 20 * BATCH
-"""Most messages that wait to be written; further ones are dropped, and their aircraft resend them."""
+"""Most received messages that wait to be stored; further ones are dropped, and the aircraft resend them."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
-BATCH_BYTES: Final = 4 * 1024 * 1024  # Most bytes of a batch; a database makes several copies of it
-AT_ONCE: Final = 50  # Answers sent concurrently; the time that aiomqtt takes for each grows with their number
-SWEEP_S: Final = 5.0  # Time to receive the retained hellos, which need a subscription that is not shared
+BATCH_BYTES: Final = 4 * 1024 * 1024  # Most bytes stored at once; a database makes several copies of them
+AT_ONCE: Final = 50  # Answers sent concurrently; the time that aiomqtt needs for each grows with their number
+SWEEP_S: Final = 5.0  # Time for the broker to deliver retained hellos, which needs an unshared subscription
 JUDGE_S: Final = 2.0
 REST: Final = 4.0  # Pause after a judgement, as a multiple of its duration: collecting has priority
 ANSWER_S: Final = 10.0
@@ -58,10 +58,10 @@ class _Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_broker(path: Path) -> Mqtt:
-    """Read the section [mqtt] of a collector's configuration file.
+    """Read the settings of the broker, section [mqtt], from a collector's configuration file.
 
     Raises:
-        ConfigError: one line that names the file, the key, what was found and what is allowed.
+        ConfigError: one line that names the file, the key, the value found and the values allowed.
     """
     mqtt = converted(read(path, "write one with a section [mqtt] that names the broker"), str(path), _Settings).mqtt
     for wrong in broker_complaints(mqtt):
@@ -70,10 +70,10 @@ def load_broker(path: Path) -> Mqtt:
 
 
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
-    """Cancel tasks until they have ended; return their exceptions.
+    """Cancel tasks again and again until they have ended; return their exceptions.
 
-    One cancellation is not enough: before Python 3.12 `asyncio.wait_for`, which aiomqtt uses, loses a cancellation at
-    the moment of its result.
+    One cancellation is not enough: aiomqtt uses `asyncio.wait_for`, which before Python 3.12 loses a cancellation that
+    arrives together with the result.
     """
     pending = found = set(tasks)
     while pending:
@@ -84,7 +84,7 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
 
 
 class BoundedMessages(asyncio.Queue[Any]):
-    """Queue of messages, bounded in number and in bytes: one message may have 256 KiB."""
+    """Queue of received messages, limited in number and in bytes, because one message may have 256 KiB."""
 
     def __init__(self, maxsize: int = WAITING, most_bytes: int = WAITING_BYTES) -> None:
         super().__init__(maxsize)
@@ -104,7 +104,7 @@ class BoundedMessages(asyncio.Queue[Any]):
 
 
 class Collector:
-    """Collector at one broker, beside any number of others; `run` it as a task."""
+    """Collector of items from one broker; several collectors may share the broker. Start `run` as a task."""
 
     def __init__(self, settings: Mqtt, store: Store) -> None:
         self.store = store
@@ -113,10 +113,10 @@ class Collector:
         self._reconnection = Reconnection("fleet", worth_s=WORTH_S, first_s=FIRST_WAIT_S, cap_s=LONGEST_WAIT_S)
 
     async def run(self) -> None:
-        """Collect until cancelled.
+        """Receive and store items until cancelled.
 
         Raises:
-            StorageError: a newer companion has written the database.
+            StorageError: the database has tables of another version of the companion.
         """
         await self._reconnection.keep(self._once)
 

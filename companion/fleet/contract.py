@@ -1,6 +1,6 @@
-"""Parser of the aircraft's payloads (docs/fleet/asyncapi.yaml): from bytes to rows of the tables.
+"""Parser of the MQTT payloads that aircraft send to the fleet (docs/fleet/asyncapi.yaml): from bytes to table rows.
 
-The tables of schema.py define the allowed values. Any invalid bytes raise `NotTakenError` and nothing else.
+The columns in fleet/schema.py define the allowed values. Invalid bytes raise `NotTakenError` and nothing else.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
 _EARLIEST: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _LATEST: Final = datetime.datetime(2200, 1, 1, tzinfo=datetime.UTC)
-"""Latest accepted time; the earliest is that of a clock without a battery."""
+"""Latest accepted time. The earliest one, 1970, is allowed because a clock without a battery starts there."""
 _STATES: Final = ("done", "failed", "cancelled")
 _KEY: Final = ("aircraft", "epoch", "sequence")
 _TRIADS: Final = [name for name, _ in schema.biases.c.items() if name.endswith(("_rad_s", "_m_s2"))]
@@ -44,11 +44,11 @@ Rows = dict[str, list[Row]]
 
 
 class NotTakenError(Exception):
-    """A payload breaks the contract; the message is one line with the reason."""
+    """Error: a payload breaks docs/fleet/asyncapi.yaml; the text is one line with the reason."""
 
 
 class Hello(msgspec.Struct, frozen=True):
-    """Range of the items that an aircraft keeps."""
+    """Message of an aircraft at each connection: the range of sequence numbers of the items that it stores."""
 
     format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]
     aircraft: _Aircraft
@@ -60,7 +60,7 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class ReceivedItem(msgspec.Struct, frozen=True):
-    """Item of an aircraft; a newer format may change everything except its key."""
+    """Received item: a result or event of an aircraft. Newer formats may change all but aircraft, epoch, sequence."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
     aircraft: _Aircraft
@@ -81,7 +81,7 @@ def _row(table: sa.Table, told: _Object) -> Row:
 
 
 def _fitting(column: sa.Column[Any], value: object) -> Any:
-    """Convert a value to the type of a column; raise NotTakenError if it does not fit."""
+    """Convert a JSON value to the type of a database column; raise NotTakenError if it does not fit."""
     kind = column.type
     if value is None and column.nullable:
         return None
@@ -192,14 +192,14 @@ KINDS: Final[dict[str, Callable[[_Object], Rows]]] = {
     "curve": lambda _: {},
     "flight": _flight,
 }
-"""Parsers of the bodies by kind; items of other kinds are stored until a newer companion can parse them."""
+"""Parsers of an item's body, by kind. Items of other kinds are stored until a newer companion can parse them."""
 
 
 def moment(words: str) -> datetime.datetime:
-    """Parse a time of ISO 8601, in UTC unless it names another zone.
+    """Parse an ISO 8601 time, in UTC unless it names another zone; return it in UTC.
 
     Raises:
-        NotTakenError: not a time, or out of range.
+        NotTakenError: the text is not a time, or the time is out of range.
     """
     try:
         found = datetime.datetime.fromisoformat(words)
@@ -212,28 +212,28 @@ def moment(words: str) -> datetime.datetime:
 
 
 def addressed(topic: str) -> tuple[str, str] | None:
-    """Return the aircraft of a topic and "hello" or "item"; None for another topic."""
+    """Split a topic fleet/ID/hello or fleet/ID/item into the aircraft's id and the last part; None: another topic."""
     match = _AIRCRAFT.fullmatch(topic)
     return None if match is None else (match[1], match[2])
 
 
 def read_hello(aircraft: str, payload: bytes) -> Hello:
-    """Parse a hello; raise NotTakenError if it is invalid, names another aircraft, or has a newer format."""
+    """Parse a hello; raise NotTakenError if it is invalid, has a newer format, or its topic has another aircraft."""
     return _decode(aircraft, payload, Hello)
 
 
 def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
-    """Parse the key of an item of any format; raise NotTakenError if it has none or names another aircraft."""
+    """Parse an item's key, in any format; raise NotTakenError if it has none or its topic has another aircraft."""
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
     return _decode(aircraft, payload, ReceivedItem)
 
 
 def rows_of(item: ReceivedItem) -> tuple[Row, Rows]:
-    """Parse an item into its own columns and rows of other tables; `state` "unknown": a newer kind or format.
+    """Parse an item into columns of the table `items` and rows of other tables.
 
-    Raises:
-        NotTakenError: kind and format are known, but the body does not fit them.
+    An item of a newer kind or format has `state` "unknown" and no rows. Raises NotTakenError if the body does not fit
+    a known kind and format.
     """
     if item.format_version != FORMAT_VERSION:
         return {"state": "unknown", "kind": None, "at": None, "clock": None, "same": None}, {}
@@ -282,7 +282,7 @@ def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
 
 
 def _same(item: ReceivedItem, rows: Rows, body: _Object) -> str:
-    """Hash the content that is equal when an item is resent under another epoch: all but `undone_at`."""
+    """Hash an item's content without `undone_at`: equal if an aircraft with a new memory card sends the item again."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
     told_again = msgspec.json.encode((item.kind, item.at, content if rows else body), order="deterministic")
     return hashlib.sha256(told_again).hexdigest()[:32]

@@ -1,8 +1,8 @@
-"""Judgement of an aircraft's sensors: from the rows of its calibrations to rows of `parts` and `findings`.
+"""Detection of failing sensors of an aircraft: from all its calibrations to rows of the tables `parts` and `findings`.
 
-Each IMU becomes a `PartHistory` over its power-ups. The history becomes columns for the tests of sequential.py, and
-their alarms become findings. The input is always all calibrations, never an earlier judgement, so that every collector
-gets the same result.
+Each IMU's biases at its power-ups become a `PartHistory`, then columns for the tests in fleet/sequential.py, and alarms
+of these tests become findings. The input is always all calibrations, never an earlier result, so that every collector
+gets the same findings.
 """
 
 from __future__ import annotations
@@ -24,44 +24,44 @@ from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
 LEARNS: Final = 16
-"""Power-ups at the beginning that define the usual level and scatter, if there is no model."""
+"""Number of first power-ups that define an IMU's usual bias and scatter, if no statistics of its model exist."""
 _WITH_MODEL: Final = 10
-"""Power-ups at the beginning that define the level, if a model defines the scatter."""
+"""Number of first power-ups that define an IMU's usual bias, if statistics of its model define the scatter."""
 _OF_MODEL, _OF_OWN = 1.5, 3.0
-"""Largest accepted scatter of a part, as a multiple of its model's scatter or of that of its first power-ups."""
+"""Largest scatter accepted as usual for an IMU, as a multiple of its model's, or of its own at the first power-ups."""
 WANDER: Final = (0.03, 0.3)
-"""Least and largest wander of a bias from one power-up to the next, in scatters."""
+"""Limits of a bias's lasting change (sigma) from one power-up to the next, as fractions of its turn-on scatter."""
 LEAST_SIZE: Final = 1.8
 LEAST_TIMES: Final = 1.4
 _FEW_TELL: Final = 1.2
-"""Factor on the scatter of a part's first power-ups: estimated from few values, it may be too small."""
+"""Factor on the scatter at an IMU's first power-ups: estimated from few values, the scatter may be too small."""
 _LEAST_NOISE: Final = 0.08
-"""Least scatter of the logarithm of a noise that is measured over some ten seconds."""
+"""Least assumed scatter of the natural logarithm of an IMU's noise, as each noise is measured over some ten seconds."""
 _BOUND_DEG: Final = 5.0
 _DRIFT_AFTER_POWER_UPS: Final = 8
 SHOWN_POWER_UPS: Final = 30
 _AXES: Final = [f"{triad} {axis}" for triad in ("gyro", "accel") for axis in "xyz"]
 LEAST_ZERO_SIGMAS: Final = 8.0
 ZERO_USUAL_DEG: Final = 0.05
-"""One sigma between two alignments of a good gradienter, from the air's temperature."""
+"""One-sigma difference between two zeros of a good gradienter (inclinometer), due to the air's temperature; degrees."""
 MOST_CALIBRATIONS: Final = 2000
-"""Most calibrations of an aircraft that are used, the latest ones: five years at one a day."""
+"""Number of latest calibrations of an aircraft that are used: five years at one a day."""
 SAME_POWER_UP_WITHIN: Final = datetime.timedelta(minutes=30)
 MOST_DEGC: Final = 150.0
-"""Limit of a plausible temperature, to detect kelvins that were not converted to degrees Celsius."""
+"""Largest plausible temperature: a larger one is ignored, because it is probably in kelvins."""
 _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
 _TOGETHER_WITHIN_POWER_UPS: Final = 10
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
-"""Size of a finding, by kind, from which the advice is `replace` instead of `watch`."""
+"""Size of a finding, by kind, above which the advice is to replace the IMU, not only to watch it."""
 
 
 class PartHistory(NamedTuple):
-    """One IMU over its n power-ups, in order of time; NaN: unknown.
+    """Measurements of one IMU at its n power-ups, in order of time; NaN: unknown.
 
-    Arrays are (n,), or (n, 6) for gyro x y z in rad/s and accelerometer x y z in m/s^2. `biases` are from the readings
-    alone, `white` is in their units times sqrt(s), and `new_zero` is True where the gradienter's zero differs from the
-    power-up before.
+    Columns of (n, 6) arrays are gyro x y z in rad/s, then accelerometer x y z in m/s^2. `biases` are not combined with
+    earlier calibrations. `white` is the white noise, in these units times sqrt(s). `new_zero`, (n,), is True where the
+    gradienter has another zero than at the power-up before.
     """
 
     at: Sequence[datetime.datetime]
@@ -73,10 +73,10 @@ class PartHistory(NamedTuple):
 
 
 class PartFinding(NamedTuple):
-    """Complaint about a sensor: bias, drift, scatter, noise, zero or compass.
+    """Finding about a sensor that may be failing.
 
-    `axis` is 0 to 5, or -1 for none; `since` is the index of a power-up; `size` is a multiple of the usual value;
-    `moved` is the change of a level, rad/s or m/s^2.
+    `axis`: 0 to 2 gyro x y z, 3 to 5 accelerometer x y z, -1 none. `since`: index of the power-up at which it began.
+    `size`: multiple of the usual value. `moved`: change of the bias, rad/s or m/s^2.
     """
 
     kind: str  # bias, drift, scatter, noise, zero, compass
@@ -88,7 +88,7 @@ class PartFinding(NamedTuple):
 
 
 def columns_of(history: PartHistory, model: Floats | None) -> Columns:
-    """Make the columns of the biases, (n, 6), and of their noise, (n, 6); `model`: scatter of the other parts."""
+    """Make the 12 columns to be tested: 6 biases and their 6 noises. `model`: scatter of other IMUs of this model."""
     turn_on = _FEW_TELL * scatter_of_part(history.biases[:LEARNS], history.temperature_degc[:LEARNS])[0]
     wander = np.full(6, WANDER[0])
     first, most_own = np.full(12, LEARNS), np.full(12, _OF_OWN)
@@ -100,7 +100,7 @@ def columns_of(history: PartHistory, model: Floats | None) -> Columns:
     unit = np.where(turn_on > 0.0, turn_on, np.nan)
     use = np.square(history.sigma_use)
     usual = np.array([middle_of(column) for column in use.T])
-    # The usual sigma is part of the scatter already.
+    # The usual sigma is already included in the scatter.
     variance = np.nan_to_num(np.maximum(use - usual, 0.0) / unit**2)
     noise = np.log(np.where(history.white > 0.0, history.white, np.nan))
     # At the end of a warm-up the sigma is that of a fitted line, which does not show the noise.
@@ -126,7 +126,7 @@ def columns_of(history: PartHistory, model: Floats | None) -> Columns:
 
 
 def counts(alarm: Alarm) -> bool:
-    """Return whether an alarm of these columns is a complaint: noise that falls or scatters is not."""
+    """Return False for an alarm that shows no fault: a noise that became smaller, or that scatters more."""
     return alarm.column < 6 or (alarm.kind == "level" and alarm.size > 0.0)
 
 
@@ -160,13 +160,13 @@ def judge(history: PartHistory, model: Floats | None) -> list[PartFinding]:
                 f" {'deg/h' if axis < 3 else 'mg'}, {abs(size):.1f} times {its}"
             )
             found[axis, "level"] = PartFinding(kind, axis, since, size, words, size * unit)
-    # A larger scatter also raises alarms of the level: drop those.
+    # A larger scatter also raises false alarms of a changed bias: drop those.
     left = [each for (axis, what), each in found.items() if what != "level" or (axis, "scatter") not in found]
     return sorted((each._replace(size=abs(each.size)) for each in left), key=lambda each: -each.size)
 
 
 def judge_compass(heading_bound_deg: Floats) -> list[PartFinding]:
-    """Judge the compass by the bound of the heading's error at each power-up, (n,); NaN: unknown."""
+    """Judge the compass by the error bound of the heading at each calibration, in degrees, (n,); NaN: unknown."""
     if len(heading_bound_deg) <= LEARNS:
         return []
     columns = compass_column(heading_bound_deg)
@@ -217,7 +217,7 @@ def _figures(calibration: _CalibrationOfImu, name: str) -> list[float]:
 
 
 def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Row]]:
-    """Judge an aircraft by all calibrations in the database; return its rows of `parts` and of `findings`."""
+    """Judge an aircraft's sensors by its calibrations in the database; return rows of `parts` and `findings`."""
     done = _done(connection, aircraft)
     imus: dict[str, list[_CalibrationOfImu]] = {}
     biases = _biases(connection, aircraft)
@@ -297,9 +297,9 @@ def _biases(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], d
 
 
 def _power_ups(calibrations: list[_CalibrationOfImu]) -> list[_CalibrationOfImu]:
-    """Select the last calibration of each power-up, of the part that is in the aircraft now.
+    """Select the last calibration of each power-up, since the present sensor was installed in this IMU's place.
 
-    Calibrations of one power-up must also agree, as a wrong clock could join many.
+    Calibrations soon after each other count as one power-up only if their biases agree, because a clock may be wrong.
     """
     ids = [(axes[0].gyro_id, axes[0].accel_id) for _, axes in calibrations]
     others = [place for place, each in enumerate(ids) if each != ids[-1]]
@@ -320,7 +320,7 @@ def _history(calibrations: Sequence[_CalibrationOfImu]) -> PartHistory:
     )
     samples = np.array([axes[0].samples or np.nan for _, axes in calibrations], dtype=np.float64)
     took_s = np.array([about.duration_s for about, _ in calibrations])
-    # Sample rate by the quickest of the calibrations before: the duration of others includes waiting.
+    # Sample rate from the quickest of the last calibrations: the duration of the others includes waiting.
     rate = samples / np.maximum(took_s, 1.0)
     rate = np.array([np.fmax.reduce(rate[max(k - 7, 0) : k + 1]) for k in range(len(rate))])
     degc = np.array([axes[0].temperature_degc for _, axes in calibrations], dtype=np.float64)

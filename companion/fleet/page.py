@@ -1,4 +1,4 @@
-"""Pages of the fleet and of one aircraft, read from the views."""
+"""HTML pages of the whole fleet and of one aircraft, from the database views in fleet/views.sql."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.samples import TRIADS, Triad, Vector
 STALE: Final = datetime.timedelta(days=30)
 SILENT: Final = datetime.timedelta(days=7)
 MOST_AIRCRAFT: Final = 500
-"""Most aircraft on the page, which then has some 90 kB; the views have all."""
+"""Most aircraft listed on the fleet's page, which then has some 90 kB; the database views list all."""
 MOST_CALIBRATIONS: Final = 120
 MOST_LISTED: Final = 25
 MOST_REFUSED: Final = 5
@@ -35,7 +35,7 @@ _STANDINGS: Final = (
     ("caution", "last try failed", "tried_state IN ('failed', 'cancelled') AND tried_reason <> ''"),
     ("fine", "calibrated", "1 = 1"),
 )
-"""Kind, name and SQL condition of each standing, the worst first: the first true condition counts."""
+"""Kind, name and SQL condition of each calibration status, worst first: the first condition that is true counts."""
 _CASES: Final = " ".join(f"WHEN {holds} THEN {place}" for place, (_, _, holds) in enumerate(_STANDINGS))
 _FLEET: Final = (
     f"SELECT f.*, CASE {_CASES} END AS standing,"  # noqa: S608 - constants
@@ -47,7 +47,7 @@ _ORDERED: Final = (
     " ORDER BY w.size DESC NULLS LAST, s.untold, s.standing, s.heard_at DESC NULLS LAST, s.aircraft"
     " LIMIT :most"
 )
-"""Query in the order of the page. Ids without a calibration are last: invented ids displace no real aircraft."""
+"""SQL query of aircraft in the page's order. Ids without a calibration are last: they may be invented by somebody."""
 
 
 def standing(one: Any) -> tuple[str, str, str]:
@@ -102,7 +102,7 @@ def _line(one: Any, now: datetime.datetime) -> Markup:
 
 
 def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
-    """Render the page of one aircraft; None: unknown aircraft."""
+    """Render the HTML page of one aircraft; return None if the aircraft is unknown."""
     query = f"SELECT * FROM ({_FLEET}) s WHERE aircraft = :which"  # noqa: S608 - constants
     found = _rows(connection, query, which=which, stale=now - STALE, silent=now - SILENT)
     if not found:
@@ -181,7 +181,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:
-    """Return a figure of three axes in deg/h or mg; None: it is unknown for an axis."""
+    """Return a figure of one IMU for x y z, in deg/h or mg; None if it is unknown for any axis."""
     column = f"{triad}_{what}_{UNITS[triad].name.replace('/', '_')}"
     x, y, z = (getattr(axes[axis], column) for axis in "xyz")
     return None if None in (x, y, z) else (x, y, z)
@@ -219,7 +219,7 @@ def _notes(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _refused(connection: sa.Connection, now: datetime.datetime) -> Markup | None:
-    """Render the latest rejected payloads by topic; under the broker's access list only a topic's owner sends them."""
+    """Render the latest rejected payloads by topic; by the broker's access list, only a topic's owner can send them."""
     last = sa.select(rejected).order_by(rejected.c.last_at.desc()).limit(MOST_REFUSED).subquery()
     of = last.c.topic.startswith("fleet/" + known.c.aircraft + "/")
     query = sa.select(last, known.c.name).outerjoin_from(last, known, of).order_by(last.c.last_at.desc())
@@ -241,7 +241,7 @@ _TIMES: Final = dict.fromkeys(("heard_at", "calibrated_at", "tried_at", "armed_a
 
 
 def _rows(connection: sa.Connection, query: str, **values: Any) -> Sequence[Any]:
-    """Run a query; return times as datetimes, even if the database stores them as text."""
+    """Run an SQL query; return times as datetimes, even if the database stores them as text."""
     times = [
         sa.bindparam(name, type_=UtcTime()) for name, value in values.items() if isinstance(value, datetime.datetime)
     ]
@@ -253,7 +253,7 @@ def _moment(at: datetime.datetime | None) -> str:
 
 
 def _ago(at: datetime.datetime | None, now: datetime.datetime) -> str:
-    """Format the age of a time, rounded; show a future time in full, because a clock is wrong."""
+    """Format how long ago a time was, rounded. Show a future time in full, because some clock is wrong."""
     if at is None:
         return "never"
     ago_s = (now - at).total_seconds()

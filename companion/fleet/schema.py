@@ -1,8 +1,8 @@
 """Database of the collector, PostgreSQL or SQLite: its schema, connections and errors.
 
-The table `items` has the received payloads. All other tables are derived from them and can be rebuilt. Axes are the
-vehicle's FRD. Times are UTC by the aircraft's clock, which may be wrong; `heard_at`, `received_at` and `last_at` are by
-the collector's clock.
+The table `items` has the received payloads. All other tables are derived from it and can be rebuilt. Axes are the
+vehicle's FRD. Times are UTC by the aircraft's clock, which may be wrong. Only `heard_at`, `received_at` and `last_at`
+are by the collector's clock.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from companion.errors import StorageError
 
 VERSION: Final = 4
 _LOCK: Final = 0x636F6D70616E696F
-"""Key of PostgreSQL's advisory lock that a collector holds while it reads and changes the schema's version."""
+"""Key of the PostgreSQL advisory lock that a collector holds while it checks the schema and creates tables."""
 _STATEMENT_MS: Final = 30_000
 _BUSY_S: Final = 10.0
 OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
-"""Errors of a database that is unreachable, full or broken."""
+"""SQLAlchemy errors due to the database itself: it is unreachable, full or broken."""
 OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
 
 
 class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
-    """Time in UTC, with its zone; SQLite stores text without a zone."""
+    """Column type for a time in UTC, with its zone in Python, although SQLite stores text without a zone."""
 
     impl = sa.DateTime(timezone=True)
     cache_ok = True
@@ -41,7 +41,7 @@ class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
 
 
 class Words(sa.types.TypeDecorator[str]):
-    """Text; zero bytes, which PostgreSQL refuses, are replaced."""
+    """Column type for text; zero characters, which PostgreSQL refuses, are replaced by U+FFFD."""
 
     impl = sa.Text
     cache_ok = True
@@ -247,14 +247,14 @@ _VIEWS: Final = Path(__file__).with_name("views.sql")
 
 
 def bring_up_to_date(connection: sa.Connection) -> None:
-    """Create missing tables and views in the connection's transaction, under a lock against other collectors.
+    """Create missing tables and views in the connection's transaction, under a lock that other collectors respect.
 
     Raises:
         StorageError: the tables are of another version.
     """
     if connection.dialect.name == "postgresql":
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
-        connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # large tables take long
+        connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # large tables need long
     inspector = sa.inspect(connection)
     found = connection.execute(sa.select(_version)).scalar_one() if inspector.has_table(_version.name) else None
     if found not in (None, VERSION):
@@ -276,12 +276,12 @@ def bring_up_to_date(connection: sa.Connection) -> None:
 
 
 def views() -> list[tuple[str, str, str]]:
-    """List name, purpose and query of each view, in order of dependency."""
+    """List name, purpose and SQL query of each database view; a view comes after those that it uses."""
     return _VIEW.findall(_VIEWS.read_text(encoding="utf-8"))
 
 
 def url_of(database: str) -> sa.URL:
-    """Parse postgresql://..., sqlite:///... or the path of a file.
+    """Parse a database address: postgresql://..., sqlite:///... or the path of an SQLite file.
 
     Raises:
         StorageError: the text is none of these.
@@ -301,7 +301,7 @@ def url_of(database: str) -> sa.URL:
 
 
 def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
-    """Make an engine without opening a connection.
+    """Make the SQLAlchemy engine of a database, without opening a connection.
 
     Raises:
         StorageError: the address cannot be parsed.

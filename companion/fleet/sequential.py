@@ -1,12 +1,12 @@
-"""Statistics of a figure that is measured at each power-up: its scatter, and tests for a change of level or scatter.
+"""Statistics of values measured at each power-up (biases, noise): scatter, and tests for a change of mean or scatter.
 
-A Kalman filter predicts each value from the earlier ones, by a wandering level and a cubic over temperature. Its
-normalised residuals are the input of two-sided CUSUMs (Page, Biometrika 41 (1954) 100-115) for a changed level. The
-scatter of each value about the three before it is the input of a likelihood-ratio CUSUM for twice the scatter. A single
-value counts at most `CLIP` sigmas, so that one knock raises no alarm.
+A Kalman filter predicts each value from the earlier ones: a slowly changing level plus a cubic over temperature. Its
+normalised residuals are summed in two-sided CUSUM tests (Page, Biometrika 41 (1954) 100-115) for a changed level. A
+likelihood-ratio CUSUM of each value's distance from the three before it detects twice the scatter. One value counts at
+most `CLIP` sigmas, so that one knock raises no alarm.
 
-With these limits tests/judgement_study.py finds less than one false alarm per hundred aircraft and month. Columns of a
-part are gyro x y z, then accelerometer x y z, vehicle FRD, SI units.
+With these limits tests/judgement_study.py finds less than one false alarm per hundred aircraft and month. The columns
+of an IMU are gyro x y z, then accelerometer x y z, vehicle FRD, SI units.
 """
 
 from __future__ import annotations
@@ -24,46 +24,46 @@ from companion.physics.statistics import MAD_TO_SIGMA
 LEAST_POWER_UPS: Final = 8
 LEAST_PARTS: Final = 4
 WANDER_LAG: Final = 30
-"""Lag, in power-ups, between two biases whose difference gives the random walk from power-up to power-up."""
+"""Distance, in power-ups, of two biases whose difference shows the bias's random walk from power-up to power-up."""
 _POWER_UPS_PER_TEMPERATURE_TERM: Final = 24
 _OUTLIER_SIGMAS: Final = 3.0
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
-"""Columns that share one scatter, in any mounting; the gradienter's errors add to the level accelerometers."""
+"""Columns with a common scatter: gyros, accelerometers x and y with the gradienter's error, and accelerometer z."""
 CLIP: Final = 3.0
 LEAST_SHIFT: Final = 0.5
-"""Reference value of the CUSUMs in sigmas: half of the shift that they detect fastest."""
+"""Reference value of the CUSUM tests, in sigmas: half of the shift of a level that they detect fastest."""
 LEVEL_LIMIT: Final = 17.0
 SCATTER_LIMIT: Final = 20.0
 _FURTHER: Final = 6.0
-"""Largest excess of the sum over its limit: the sum must fall soon after the scatter falls."""
+"""Largest excess of the scatter test's sum over its limit, so that the sum falls soon after the scatter falls."""
 _TWICE: Final = (0.375, np.log(2.0))
-"""Factor of z^2, and the constant, in the log-likelihood ratio for twice the scatter."""
+"""Factor of z^2 (z: residual in sigmas), and subtracted constant, in the log-likelihood ratio of doubled scatter."""
 OWN_WEIGHT: Final = 8.0
-"""Weight of the model's scatter, in power-ups: parts of a model differ by a quarter in their scatter."""
+"""Weight of the initial scatter against an IMU's own, in power-ups: scatters within one model differ by a quarter."""
 _HELD_SIGMAS: Final = 2.5
-_MEAN_SQUARE_OF_HELD: Final = 0.9775  # for a standard normal number, clipped to `_HELD_SIGMAS`
-_VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # for standard normal numbers
+_MEAN_SQUARE_OF_HELD: Final = 0.9775  # mean square of a standard normal number clipped to `_HELD_SIGMAS`
+_VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # variance of the median of three standard normal numbers
 _STEP_K: Final = 15.0
 _AT_DEGC: Final = 20.0
 _INITIAL_VARIANCES: Final = np.square(
     [100.0, 50.0, 10.0, 2.0]
-)  # in scatters: the level, three coefficients over temperature
+)  # squared multiples of the usual scatter: level, three coefficients over temperature
 _NEW_LEVEL: Final = 1e4
 _BASE_POWER_UPS: Final = 20
 
 
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Floats:
-    """Estimate the scatter of a part from its power-ups in order, (n, c) and (n,); NaN: not measured.
+    """Estimate the scatter of an IMU's c values at n power-ups in order, (n, c), with temperatures (n,); NaN: unknown.
 
-    Rows of the result, (2, c): sigma between two power-ups at one temperature, errors of the calibrations included;
-    sigma of the lasting step. The input is the steps between successive power-ups, less the part explained by
-    temperature: neither ageing nor a single change of level makes them larger.
+    First row of the result, (2, c): turn-on sigma at one temperature, errors of the calibrations included. Second row:
+    sigma of the lasting change per power-up. Both are from the steps between power-ups, corrected for temperature:
+    neither ageing nor one sudden change of the bias makes these steps larger.
     """
     return np.array([_column(column, temperature_degc) for column in biases.T]).T
 
 
 def scatter_of_model(parts: Sequence[Floats]) -> Floats | None:
-    """Return the median scatter of the parts, (2, 6); None: fewer than `LEAST_PARTS` have one."""
+    """Return the median scatter of IMUs of one model, (2, 6), rows as in `scatter_of_part`; None: too few IMUs."""
     telling = [part for part in parts if np.isfinite(part[0]).any()]
     if len(telling) < LEAST_PARTS:
         return None
@@ -85,7 +85,7 @@ def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float]:
         return np.nan, np.nan
     known = np.isfinite(degc)
     warmer = np.where(known, degc - (degc[known].mean() if known.any() else 0.0), 0.0) / _STEP_K
-    # A line for few power-ups, up to a cubic for many.
+    # Polynomial over temperature: a line for few power-ups, up to a cubic for many.
     laws = warmer[:, None] ** np.arange(1, 2 + min(len(value) // _POWER_UPS_PER_TEMPERATURE_TERM, 2))
     step, by = np.diff(value), np.diff(laws, axis=0)
     weight = np.ones(len(step))
@@ -106,10 +106,10 @@ def _sigma(steps: Floats) -> float:
 
 
 class Alarm(NamedTuple):
-    """Change of one column's figure, detected at power-up `at`; `since` is the first power-up of the change.
+    """Change of one column's level or scatter, detected at power-up `at`; `since` is the first power-up of the change.
 
-    `until` is the power-up at which the scatter was usual again; n: not yet, or a change of level. `size` is the change
-    of the level, or the scatter since the change, in usual scatters.
+    `until`: power-up at which the scatter was usual again; the number of power-ups for "not yet" and for a change of
+    level. `size`: change of the level, or scatter since the change, as a multiple of the usual scatter.
     """
 
     column: int
@@ -121,23 +121,23 @@ class Alarm(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Figures of n power-ups in order, in c columns that are tested independently; NaN: unknown.
+    """Input of the tests: values at n power-ups in order, in c columns that are tested independently; NaN: unknown.
 
-    The first three arrays and `relevel` are (n, c), the others (c,). All but `temperature_degc`, `first` and `unit` are
-    in usual scatters.
+    The first three arrays and `relevel` are (n, c), the others (c,). All but `temperature_degc`, `relevel`, `first` and
+    `unit` are multiples of the usual scatter; `unit` is this scatter.
     """
 
-    values: Floats  # (n, c) in usual scatters; NaN: not measured
+    values: Floats  # (n, c) multiples of the usual scatter; NaN: not measured
     variance: Floats
-    """Variance of a value in excess of the usual one."""
+    """Excess of each value's variance over the usual variance, (n, c), in squared multiples of the usual scatter."""
     temperature_degc: Floats
     wander: Floats
-    """One sigma of the step of the level from one power-up to the next."""
+    """One-sigma change of a column's level from one power-up to the next, (c,), as a multiple of the usual scatter."""
     relevel: NDArray[np.bool_]
-    """True where the reference of the measurement has changed, so that the level may differ."""
+    """True at power-ups where the reference of a measurement was replaced, so that the level may jump; (n, c)."""
     first: NDArray[np.int_]
-    """Number of power-ups at the beginning that define the usual level and scatter, at least 3."""
-    most_own: Floats  # (c,) largest accepted scatter of the column itself, in usual scatters
+    """Number of first power-ups that define the usual level and scatter of each column, (c,), at least 3."""
+    most_own: Floats  # (c,) largest scatter of a column accepted as usual, as a multiple of the usual scatter
     least: Floats  # (c,) least change of level, or scatter, that raises an alarm
     unit: Floats
 
@@ -178,7 +178,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
         usual = np.clip(own / count, 1.0, most_own**2)
         ph = (p * h[:, None, :]).sum(axis=2)
         of_filter = (ph * h).sum(axis=1)
-        # A value without a temperature may have any temperature.
+        # A value of unknown temperature may belong to any temperature, so its variance is larger.
         law = np.square(x[:, 1:]) + p[:, range(1, 4), range(1, 4)]
         more = variance[k] + unknown[k] * law.sum(axis=1)
         total = of_filter + usual + more
@@ -190,7 +190,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
         x += gain * (np.clip(z, -most, most) * np.sqrt(total))[:, None]
         p -= gain[:, :, None] * ph[:, None, :]
 
-        # Scatter about the median of the three values before: a change of level makes only two large residuals.
+        # Distance from the median of the three values before: a change of level makes only two of them large.
         before = y[latest, every] - (laws[latest, every, 1:] * x[:, 1:]).sum(axis=2)
         middle = before.sum(axis=0) - before.max(axis=0) - before.min(axis=0)
         apart = h[:, 1:] - laws[latest, every, 1:].mean(axis=0)
@@ -207,7 +207,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
         down = np.where(here, np.maximum(down - z - LEAST_SHIFT, 0.0), down)
         up_0, down_0 = np.where(up == 0.0, k + 1, up_0), np.where(down == 0.0, k + 1, down_0)
 
-        # Learn the column's own scatter, except while it is in doubt or the filter does not know the level.
+        # Learn the column's own scatter, except during a suspected change or while the level is uncertain.
         learns = here & (wide < SCATTER_LIMIT / 4.0) & (of_filter < usual)
         own = own + np.where(learns, usual * np.minimum(np.square(z), _HELD_SIGMAS**2) / _MEAN_SQUARE_OF_HELD, 0.0)
         count = count + learns
@@ -239,9 +239,9 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
 
 
 def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
-    """Fit level and law of one column's first power-ups; return them, their covariance and the sum of squares.
+    """Fit level and temperature polynomial to one column's first power-ups; return them, covariance, sum of squares.
 
-    Huber weights: knocked windows count little.
+    Huber weights reduce the effect of calibrations during which the aircraft was knocked.
     """
     weight: Floats = there.astype(np.float64)
     for _ in range(8):
@@ -258,5 +258,5 @@ def _scatter(level: Floats) -> float:
 
 
 def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:
-    """Reduce the values of one column to one temperature, (n,)."""
+    """Convert the values of one column, (n,), to a common temperature by the fitted polynomial `x`."""
     return np.asarray(y[:, column] - laws[:, column, 1:] @ x[column, 1:])

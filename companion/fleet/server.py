@@ -1,4 +1,4 @@
-"""HTTP server of the fleet pages: read only, for this computer alone or for clients with the password."""
+"""HTTP server of the fleet's pages, read only: for this computer alone, or for clients that send the password."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ logger = logging.getLogger(__name__)
 LEAST_PASSWORD: Final = 12
 WRONG_PASSWORD_S: Final = 2.0
 AGAIN_S: Final = 30
-SOON_S: Final = 2  # Period after which a browser tries again when the database could not be read
+SOON_S: Final = 2  # Time after which a browser reloads the page if the database could not be read
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
 
 
 def read_password(path: Path) -> str:
-    """Read the password from a file.
+    """Read the password of the fleet's pages from a file.
 
     Raises:
         ConfigError: the file cannot be read, or the password is too short.
@@ -57,7 +57,7 @@ def read_password(path: Path) -> str:
 
 
 class Server:
-    """Server of the pages at HOST:PORT, read only; `run` it as a task.
+    """HTTP server of the fleet's pages at HOST:PORT, read only; start `run` as a task.
 
     Raises:
         ConfigError: the address is invalid, or other computers could read the pages without a password.
@@ -122,7 +122,7 @@ class Server:
 
 
 class _Door:
-    """Filter that admits requests with the password; if none is set, requests for this computer's own name."""
+    """HTTP filter: admits requests with the password or, if none is set, requests addressed to this computer."""
 
     def __init__(self, app: ASGIApp, password: str | None) -> None:
         self._app, self._password = app, password

@@ -1,4 +1,4 @@
-"""Writer of the database: each batch is one transaction, so that no item is written in part or twice."""
+"""Writer of the fleet's database. Each batch is one transaction, so that no item is stored in part or twice."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ logger = logging.getLogger(__name__)
 MOST_REJECTED: Final = 10_000
 _SHOWN_BYTES: Final = 4096
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
-_AGAIN: Final = 500  # Items of a newer aircraft that are parsed again in one transaction after an update
+_AGAIN: Final = 500  # Stored items parsed per transaction after an update that knows their kind or format
 
 
 class BatchResult(NamedTuple):
-    """Result of a batch: sequences to confirm and to ask for, by aircraft and epoch; rejected messages with reasons."""
+    """Result of a batch: item numbers to confirm and to request, by aircraft and epoch (id of a numbering); rejects."""
 
     confirmed: dict[tuple[str, str], list[int]]
     wanted: dict[tuple[str, str], list[list[int]]]
@@ -51,7 +51,7 @@ class BatchResult(NamedTuple):
 
 
 class Store:
-    """Store of items, hellos and judgements; calls block, so call them in a thread."""
+    """Access to the fleet's database: items, hellos, findings about sensors. Methods block: call them in a thread."""
 
     def __init__(self, database: str) -> None:
         self._engine, self._reads = engine_of(database), engine_of(database, reads_only=True)
@@ -73,10 +73,10 @@ class Store:
             raise LinkError(f"{self.where}: {why(error)}") from None
 
     def prepare(self) -> None:
-        """Update the tables, and parse the items that an older version did not know.
+        """Create missing tables, and parse stored items that an older companion could not parse.
 
         Raises:
-            StorageError: the tables are of a newer companion.
+            StorageError: the tables are of another version of the companion.
             LinkError: the database cannot be reached, or fails.
         """
         with self._link_errors():
@@ -86,7 +86,7 @@ class Store:
                 pass
 
     def judge(self) -> bool:
-        """Judge one aircraft with new calibrations or undos; return False if there is none.
+        """Judge the sensors of one aircraft with new calibrations or undos; return False if there is no such aircraft.
 
         Raises:
             LinkError: the database cannot be reached, or fails.
@@ -117,7 +117,7 @@ class Store:
             return None
 
     def take(self, messages: Sequence[Incoming]) -> BatchResult:
-        """Write a batch into the database; refused messages go to the table `rejected` with their reasons.
+        """Store a batch of messages in the database; refused ones go to the table `rejected` with their reasons.
 
         Raises:
             LinkError: the database cannot be reached, or fails; nothing of the batch may be confirmed.
@@ -199,7 +199,7 @@ class Store:
         connection.execute(insert.on_conflict_do_nothing(), values)
 
     def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
-        """Make one statement for all rows, and its values; with JSON PostgreSQL needs a third of the time."""
+        """Return one INSERT statement for all rows, and its values; for PostgreSQL as JSON, which is 3 times faster."""
         insert, names = self._insert(table), list(rows[0])
         if self._insert is sqlite.insert:
             return insert, rows
@@ -225,7 +225,7 @@ class Store:
             row |= {"name": hello.name, "epoch": hello.epoch, "first": hello.first, "last": hello.last}
             with contextlib.suppress(NotTakenError):
                 row["hello_at"] = moment(hello.at)
-            if not retained:  # a retained hello is old
+            if not retained:  # a retained hello does not show that the aircraft is connected now
                 row["heard_at"] = now
         if rows:
             insert, values = self._insert_many(table, [row for _, row in sorted(rows.items())])
@@ -272,7 +272,7 @@ class Store:
         return outcome
 
     def _take_in_again(self) -> bool:
-        """Parse items of newer aircraft whose kind is now known; return whether there may be more."""
+        """Parse stored items whose kind and format have become known by an update; return True if there may be more."""
         items, each, refused = schema.items, schema.items.c, []
         of_a_kind = each.kind.is_(None) | each.kind.in_(KINDS)
         known = sa.select(items).where(each.state == "unknown", each.format_version == FORMAT_VERSION, of_a_kind)
@@ -303,7 +303,7 @@ def _raw(item: ReceivedItem, message: Incoming) -> Row:
 
 
 def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str, str], list[list[int]]]:
-    """List the sequences that these aircraft keep (by their last hellos) and the database lacks."""
+    """List ranges of items that the database lacks and that these aircraft store, by their last hello messages."""
     one, items = schema.aircraft.c, schema.items.c
     of = one.aircraft.in_(sorted(which))
     before = sa.select(one.aircraft, one.epoch, one.last, (one.first - 1).label("number")).where(of)

@@ -1,1 +1,1 @@
-"""MQTT process: a client of the daemon and of the broker."""
+"""MQTT process, separate from the daemon: a client of the daemon and of an MQTT broker."""

@@ -1,6 +1,6 @@
-"""Connection to a broker by aiomqtt 2: credentials, TLS, the version of MQTT, and texts of refusals.
+"""Connection to an MQTT broker by the library aiomqtt 2: credentials, TLS, MQTT version, and texts for errors.
 
-Only this module and `client` use aiomqtt, because its version 3 will be a different library.
+Only this module and mqtt/client.py use aiomqtt, because its version 3 will be a different library.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 _quiet = logging.getLogger(f"{__name__}.aiomqtt")
-# The library raises its errors too; they are logged once, as text for people.
+# aiomqtt logs its errors and raises them too: we log them only once, as text for people.
 _quiet.setLevel(logging.CRITICAL)
 
 MQTT_3_1_1: Final = 4
@@ -35,7 +35,7 @@ _LEAST_REFUSAL_CODE: Final = 128
 
 
 class Broker:
-    """Connects one client with the newest version of MQTT that the broker supports.
+    """Broker to which one client connects, by the newest version of MQTT that the broker supports.
 
     MQTT 5 is tried first: only MQTT 5 marks messages that were published as retained, and lets a client limit the
     length of messages. Credentials are read for every connection, so that a correction needs no restart.
@@ -51,7 +51,7 @@ class Broker:
 
     @contextlib.asynccontextmanager
     async def connected(self, most_bytes: int, **options: Any) -> AsyncIterator[aiomqtt.Client]:
-        """Connect for the time of the context; `most_bytes`: longest packet that the broker may send (MQTT 5).
+        """Connect while the context lasts; `most_bytes`: longest packet that the broker may send (only with MQTT 5).
 
         Raises:
             LinkError: the connection failed or ended, with the cause.
@@ -125,7 +125,7 @@ async def subscribe(client: aiomqtt.Client, topic: str, **options: Any) -> None:
 
 
 def read_password(settings: Mqtt) -> str | None:
-    """Read the password; None: none is configured.
+    """Read the broker's password from its file; return None if no file is configured.
 
     Raises:
         LinkError: one line that names the file and what is wrong with it.
@@ -157,7 +157,7 @@ def is_open_to_all(settings: Mqtt) -> bool:
 
 
 def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
-    """Make the TLS context; None: without TLS.
+    """Make the TLS context for the broker; return None if TLS is not configured.
 
     Raises:
         LinkError: one line that names the file and what is wrong with it.
@@ -183,12 +183,12 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
 
 
 UNSUPPORTED_PROTOCOL: Final = 132
-"""Reason code of MQTT 5 (its section 2.4) for a version that the broker does not support."""
+"""Reason code of a broker that does not support the client's MQTT version (MQTT 5, section 2.4)."""
 _BAD_PASSWORD: Final = (134, 135)
 _LOST: Final = "has ended the connection (stopped? network? another client called {id!r}?)"
-"""Text for a lost connection: paho's own code 7, and 128 of MQTT 5."""
+"""Error text for a lost connection: code 7 of the library paho, and code 128 of MQTT 5."""
 _SILENT: Final = "is silent"
-"""Text for silence during twice the keepalive: paho's own code 16, and 141 of MQTT 5."""
+"""Error text after silence of twice the keepalive time: code 16 of the library paho, and code 141 of MQTT 5."""
 _STATES: Final = {
     7: _LOST,
     16: _SILENT,
@@ -201,11 +201,12 @@ _STATES: Final = {
     141: _SILENT,
     142: "has another client called {id!r}: a second companion for this vehicle? (change mqtt.base_topic)",
 }
-"""Texts by reason code: MQTT 5 (section 2.4), and paho's own below 128; paho converts those of MQTT 3.1.1."""
+"""Error texts by reason code: codes from 128 on are of MQTT 5 (section 2.4), those below of the library paho. The
+library converts reason codes of MQTT 3.1.1 to those of MQTT 5."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
-    """List an error and its causes, outermost first; follow only the first member of a group."""
+    """List an error and its causes, outermost first; of an exception group use only the first member."""
     found: list[BaseException] = []
     inner: BaseException | None = error
     while inner is not None and inner not in found:
@@ -227,12 +228,12 @@ def is_of_protocol(error: BaseException) -> bool:
 
 
 def _is_unanswered(error: BaseException) -> bool:
-    """Return whether the broker accepted the connection and then was silent (aiomqtt has no error type for it)."""
+    """Return True if the broker accepted the connection and then was silent (aiomqtt has no error type for this)."""
     return any(str(cause) == "Operation timed out" for cause in causes(error))
 
 
 def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
-    """Describe the cause of a failed or lost connection in one line, without the address; `reached`: it was lost."""
+    """Describe in one line why a connection could not be made, or was lost (`reached`); omit the broker's address."""
     code = _reason_code(error)
     if code in _BAD_PASSWORD:
         user = f"user {settings.username!r}: unknown, or the password is wrong"

@@ -1,6 +1,6 @@
-"""Connection of the MQTT process: it reconnects after every loss and sends from a bounded outbox.
+"""MQTT client that reconnects after every loss and sends messages from an outbox of limited size.
 
-A broker that sends more than the memory limit of this process ends only this process.
+It runs in the MQTT process: a broker that sends more than fits that process's memory cannot end the daemon.
 """
 
 from __future__ import annotations
@@ -31,33 +31,31 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 GREETING_DEADLINE_S: Final = 5.0
-"""Timeout of the broker's first answer; after silence to MQTT 5 the client tries MQTT 3.1.1."""
+"""Timeout of the broker's first answer. If the broker does not answer to MQTT 5, the client tries MQTT 3.1.1."""
 ANSWER_DEADLINE_S: Final = 5.0
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
-WORTH_S: Final = 10.0  # Least duration of a connection that resets the backoff
+WORTH_S: Final = 10.0  # Least duration of a connection that resets the wait before the next attempt
 MAX_PACKET_BYTES: Final = 64 * 1024
-"""Longest message that the broker may send us (MQTT 5)."""
+"""Longest message that the broker may send us; only MQTT 5 has such a limit."""
 MAX_WAITING: Final = 1000
-"""Most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
-than it empties it, so a flood of some hundred requests must fit. With 64 KiB each they fit the process's memory."""
+"""Most received messages that wait to be handled; more are dropped without an answer. aiomqtt fills this queue faster
+than it empties it, so some hundred requests at once must fit. With 64 KiB each they fit the process's memory."""
 MAX_ANSWERS: Final = 64
 LONG_BYTES: Final = 1024  # Messages above this length may be too long for a broker
 MOST_TRIES: Final = 3
-"""Connections that may end during the send of one long message before it is given up."""
+"""Attempts to send one long message, each ended by a lost connection, after which the message is given up."""
 
 
 class Incoming(NamedTuple):
-    """A message from the broker."""
-
     topic: str
     payload: bytes
     retained: bool = False
-    """True if the broker had stored the message, or (only known in MQTT 5) if it was published as retained just now."""
+    """True if the broker had stored the message; with MQTT 5 also if it was published as retained just now."""
 
 
 class Parcel(msgspec.Struct, eq=False):
-    """Message to send; telemetry has QoS 0."""
+    """Message to send; telemetry is sent once (QoS 0), all else at least once (QoS 1)."""
 
     topic: str
     payload: bytes
@@ -68,18 +66,18 @@ class Parcel(msgspec.Struct, eq=False):
 
     @property
     def is_given_up(self) -> bool:
-        """True if the broker ended the connection during this long message more than `MOST_TRIES` times."""
+        """True if the connection was lost more than `MOST_TRIES` times while this long message was sent."""
         return self.tries > MOST_TRIES and len(self.payload) > LONG_BYTES
 
 
 class Outbox:
-    """Bounded queues of three kinds of messages.
+    """Messages that wait to be sent, of three kinds; each kind is limited in number.
 
-    - kept: retained at the broker. Only the latest value of each topic counts. It is sent again at every connection,
+    - kept: retained by the broker. Only the latest value of each topic is stored. It is sent again at every connection,
       because a restarted broker may have lost it. The topics are few and our own.
-    - answers: each is sent, in order, even if the connection was lost in between. With 64 waiting, the oldest droppable
-      one (a refusal) is dropped; without a droppable one, the oldest of all.
-    - telemetry: only the latest value of each topic, and none without a connection.
+    - answers: each is sent, in order, even if the connection was lost in between. If 64 are waiting, the oldest
+      droppable answer, such as a refusal, is dropped. If none is droppable, the oldest of all is dropped.
+    - telemetry: only the latest value of each topic is stored, and none without a connection.
     """
 
     def __init__(self) -> None:
@@ -97,7 +95,7 @@ class Outbox:
         return len(self._unsent) + len(self._answers) + len(self._telemetry)
 
     def keep(self, topic: str, payload: bytes, *, again: bool = False) -> None:
-        """Send a retained payload, if it is new; an empty one deletes the topic. `again`: send it even if unchanged."""
+        """Send a retained payload if it differs from the last, or if `again`. An empty payload deletes the topic."""
         if again or self.kept(topic) != payload:
             self._kept[topic] = self._unsent[topic] = Parcel(topic, payload, retain=True)
             self._notify()
@@ -121,7 +119,7 @@ class Outbox:
             self._notify()
 
     def opened(self) -> None:
-        """Start a connection: send all kept payloads again."""
+        """Note that a connection has been made, and queue all retained messages again."""
         self._open = True
         self._unsent = {topic: parcel for topic, parcel in self._kept.items() if not parcel.is_given_up}
         self._notify()
@@ -132,7 +130,7 @@ class Outbox:
         self._notify()
 
     async def next(self) -> Parcel:
-        """Return the next parcel; it stays in the outbox until `sent`."""
+        """Wait for the next message to send and return it; it stays in the outbox until `sent` is called."""
         while not len(self):
             self._filled.clear()
             await self._filled.wait()
@@ -141,7 +139,7 @@ class Outbox:
         )
 
     def sent(self, parcel: Parcel) -> None:
-        """Remove a parcel that was sent or given up; keep a newer value of its topic."""
+        """Remove a message that was sent or given up; a newer message of its topic stays in the outbox."""
         for latest in (self._unsent, self._telemetry):
             if latest.get(parcel.topic) is parcel:
                 del latest[parcel.topic]
@@ -160,9 +158,9 @@ class Outbox:
 class MqttLink:
     """Connection to the broker: sends the messages of `outbox` and passes received ones to `on_message`.
 
-    A second client with the same id replaces the first. `will` is the last will, topic and payload: the broker
-    publishes it, retained, when the connection is lost. Its topic should be among the subscriptions, to verify that our
-    messages come back. `on_message` must not block.
+    The broker disconnects a client when a second one with its id connects. `will` is the last will (topic, payload): a
+    message that the broker publishes, retained, when the connection is lost. Subscribe to its topic too, to verify that
+    our own messages come back. `on_message` must not block.
     """
 
     def __init__(
@@ -194,7 +192,7 @@ class MqttLink:
             connected_for_s = now_s - self._connected_s
             since = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=connected_for_s)
             if self._will is not None and not self._echoed and connected_for_s > ANSWER_DEADLINE_S:
-                # Few brokers report to a client that its access list forbids publishing or receiving.
+                # Few brokers report to a client that their access list forbids it to publish or to receive.
                 faults.append(message("broker_refuses", what="our own messages: none comes back (its access list?)"))
             connected = message("mqtt_connected", broker=self._broker.where, detail=f"since {since:%H:%M:%S} UTC")
             words = "; ".join((connected, *faults))
@@ -212,7 +210,7 @@ class MqttLink:
         }
 
     async def run(self) -> None:
-        """Stay connected until cancelled; report a loss in `status`, never as an exception."""
+        """Stay connected until cancelled; a lost connection shows in `status` and raises no exception."""
         try:
             await asyncio.to_thread(_load_library)
         except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
@@ -221,7 +219,7 @@ class MqttLink:
         await self._reconnection.keep(self._once)
 
     async def flush(self, within_s: float) -> None:
-        """Wait until everything was sent, for `within_s` at most; return at once without a connection."""
+        """Wait until all messages were sent, for `within_s` seconds at most; without a connection return at once."""
         if self.connected:
             await comes(self.outbox.emptied, within_s)
 
@@ -301,7 +299,7 @@ class MqttLink:
 
 
 def _load_library() -> None:
-    """Import aiomqtt, which is slow (run it in a thread); raise ImportError if it is absent or not version 2."""
+    """Import aiomqtt, which is slow: call this in a thread. Raise ImportError if it is missing or not version 2."""
     if not version("aiomqtt").startswith("2."):
         raise ImportError(f"found version {version('aiomqtt')}; allowed: 2")
     importlib.import_module("aiomqtt")

@@ -1,6 +1,6 @@
-"""Client of the daemon in the MQTT process: a stream of its status and attitude, and answers to requests.
+"""Client of the daemon in the MQTT process: receives its status and attitude, and forwards MQTT requests to it.
 
-Requests go to the control socket, as from the command line, and get the same refusals.
+Requests go to the daemon's control socket, like those of the command line, and get the same refusals.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from companion.messages import message
 logger = logging.getLogger(__name__)
 
 SILENT_S: Final = 5.0
-"""Timeout of the stream, which has five replies a second; after it the daemon counts as hung."""
+"""Time without a reply after which the daemon counts as hung; its status stream has five replies a second."""
 AGAIN_S: Final = 1.0
 ANSWER_WITHIN_S: Final = 10.0
 CLOCKS_AGREE_S: Final = 2.0
@@ -35,8 +35,8 @@ Transaction = str | int | None
 MAX_PAYLOAD_BYTES: Final = 4096
 MAX_TRANSACTION: Final = 128
 MAX_NUMBER: Final = 2**53
-"""Largest integer that every JSON parser represents exactly."""
-MAX_PENDING: Final = 8  # Most pending requests, such as cancels during a write
+"""Largest integer that every JSON parser can represent exactly."""
+MAX_PENDING: Final = 8  # Most requests executed at the same time, such as cancels during a write
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
 KNOWN: Final = asked_by(Interface.MQTT)
@@ -44,9 +44,9 @@ _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 class Daemon:
-    """Latest state of the daemon. `news` is set at every reply and at the end of the stream.
+    """Latest status and attitude that the daemon sent; the event `news` is set at each change or loss of the stream.
 
-    `clock_agrees`: the autopilot's GNSS time confirms the clock of this computer.
+    `clock_agrees` is True if the autopilot's GNSS time confirms the clock of this computer.
     """
 
     def __init__(self, ask: Ask) -> None:
@@ -89,7 +89,7 @@ class Daemon:
         self.news.set()
 
     async def result(self, request: Object) -> Object:
-        """Return the final reply to a short request.
+        """Send a short request to the daemon and return its final reply.
 
         Raises:
             CompanionError: the daemon refuses, is gone, or gives no answer within 10 s.
@@ -105,7 +105,7 @@ class Daemon:
 
 
 class Request(msgspec.Struct):
-    """A request, and its last response. `problem`: fault of the request; empty: it can be sent to the daemon."""
+    """MQTT request with its last response. `problem` is why it is invalid; empty: it can be sent to the daemon."""
 
     command: str
     transaction: Transaction = None
@@ -116,7 +116,7 @@ class Request(msgspec.Struct):
 
 
 def parse(command: str, payload: bytes) -> Request:
-    """Parse the payload of a request: empty, or a JSON object with known keys. Never raises."""
+    """Parse the payload of an MQTT request: empty, or a JSON object with known keys. Errors go to `problem`."""
     request = Request(command)
     try:
         _read(request, payload)
@@ -165,14 +165,14 @@ def _is_transaction(value: object) -> bool:
 
 
 class Requests:
-    """Handler of requests: answers each by `respond`, executes none twice, and bounds a flood.
+    """Handler of MQTT requests: answers each by `respond`, executes none twice, and refuses too many at once.
 
-    An answer repeats the request's transaction. A calibration gets two answers: "accepted" at once, then its result;
-    any other request gets one. Three kinds of messages are not executed:
+    An answer contains the request's transaction id. A calibration gets two answers: "accepted" at once, then its
+    result. Any other request gets one. Three kinds of messages are not executed:
 
-    - a retained request, because it returns at every connection: it is refused, with one line in the log;
-    - the empty payload that deletes a retained request (on MQTT 3.1.1 it looks like a request): it is ignored;
-    - a repeated transaction (QoS 1 delivers at least once): it gets its latest answer again.
+    - A retained request is refused, with one line in the log, because it would return at every connection.
+    - The empty payload that deletes a retained request is ignored; with MQTT 3.1.1 it looks like a request.
+    - A request with a known transaction id gets its latest answer again, because QoS 1 may deliver a message twice.
     """
 
     def __init__(self, ask: Ask, topic: str, respond: Callable[[str, Object], None]) -> None:
@@ -206,7 +206,7 @@ class Requests:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def _is_repeat(self, request: Request) -> bool:
-        """Return whether the transaction is already known; if so, repeat its answer."""
+        """Return True if this transaction id is already known; if so, send its latest answer again."""
         if request.transaction is None:
             return False
         known = self._known.get((request.command, request.transaction))

@@ -1,7 +1,7 @@
-"""Saves items for the fleet, and sends them over the broker's connection until a collector has confirmed them.
+"""Sender of an aircraft's results to the fleet: saves them as numbered items, and sends each until it is confirmed.
 
-The broker's acknowledgement is not enough: a broker may lose a message before a collector reads it. An item without
-confirmation in time is sent again; a collector that was restored from a backup requests the items that it lacks.
+The confirmation comes from a collector. The broker's acknowledgement is not enough: a broker may lose a message before
+a collector reads it. A collector that was restored from a backup requests the items that it lacks.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ logger = logging.getLogger(__name__)
 
 COLLECT_EVERY_S: Final = 2.0
 BATCH: Final = 20  # Most entries read from the disk at once: a whole history may be unread
-WINDOW: Final = 8  # Most items sent and not confirmed
+WINDOW: Final = 8  # Most items that are sent before any of them is confirmed
 CONFIRMED_WITHIN_S: Final = 30.0
 LONGEST_WAIT_S: Final = 600.0
 HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
 PAUSE_S: Final = 0.05
-CURVES_AFTER_S: Final = 60.0  # Delay of the first temperature curves, which take time to compute
+CURVES_AFTER_S: Final = 60.0  # Delay of the first curves of bias over temperature, which are slow to compute
 CURVES_EVERY_S: Final = 6 * 3600.0
 INBOX: Final = 64
 AIRCRAFT_MARK, CURVE_MARKS = "aircraft", "curve/"
@@ -63,16 +63,16 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_deg": 1,
     "inclination_expected_deg": 1,
 }
-"""Decimals of published figures that reveal the location, gravity and field included: it is known to about 1 km."""
+"""Decimals of sent figures that reveal the location (gravity, magnetic field, ...): it is then known to about 1 km."""
 _WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "effective": None}
-"""Substitutes for figures whose digits reveal the gravity and the latitude from which they were computed."""
+"""Values sent in place of figures whose digits would reveal the local gravity and the latitude."""
 _EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 
 
 class AircraftFleet:
-    """Fleet client of one aircraft, also for kept items of earlier aircraft with this companion; `run` it as a task.
+    """Fleet client of one companion: sends items of the present aircraft, and those stored of earlier aircraft.
 
-    `link` returns the current connection to the broker, or None; `offload` runs a blocking call in a thread.
+    `link` returns the connection to the broker, or None. `offload` runs a blocking call in a thread. `run` is a task.
     """
 
     def __init__(
@@ -91,12 +91,12 @@ class AircraftFleet:
         self._kept: list[Kept] = []
         self._aircraft: str | None = None
         self._has_news = True
-        self._caught_up = False  # True once files of earlier runs were read
+        self._caught_up = False  # True once the files that earlier runs left were read
         self._started_s = 0.0
         self._curves_s = math.inf
         self._connection: tuple[MqttLink, int] | None = None
         self._greeted: dict[str, int] = {}
-        """Last sequence in the hello of this connection, by aircraft; -1: a new hello is requested."""
+        """Last item number announced by a hello in this connection, by aircraft; -1: a new hello must be sent."""
         self._hello_s = 0.0
         self._under_way: set[tuple[str, int]] = set()
         self._sent = 0
@@ -128,13 +128,13 @@ class AircraftFleet:
         return bool(vehicle.get("version_known")) and vehicle["uid"] is None
 
     def on_message(self, message: Incoming) -> None:
-        """Accept a message of the fleet; ignore a retained one, which would return at every connection."""
+        """Queue a message of a collector; ignore a retained one, because it would return at every connection."""
         if message.topic.startswith("fleet/") and not message.retained:
             self._inbox.append(message)
             self._woken.set()
 
     async def run(self) -> None:
-        """Save and send items until cancelled; faults are reported in `status`, never raised."""
+        """Save and send items until cancelled; faults show in `status` and are never raised."""
         self._started_s = asyncio.get_running_loop().time()
         self._curves_s = self._started_s + CURVES_AFTER_S
         try:
@@ -150,7 +150,7 @@ class AircraftFleet:
             self._items.close()
 
     async def _try(self, step: Callable[[], Awaitable[None]]) -> str | None:
-        """Run a step and return its error as text, so that a failed save does not block sending, nor the reverse."""
+        """Run a step and return its error as text, so that a failure to save does not block sending, nor vice versa."""
         try:
             await step()
         except Exception as error:
@@ -216,7 +216,7 @@ class AircraftFleet:
         await self._add(current.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
-        """Return a function that rates the clock at a time: "good" in this run, if the autopilot's GNSS confirms it."""
+        """Return a function that rates a timestamp: "good" if it is of this run and GNSS time confirms the clock."""
         run_s = asyncio.get_running_loop().time() - self._started_s
         began = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=run_s)
         since, agrees = began.isoformat(timespec="milliseconds"), self._daemon.clock_agrees
@@ -247,7 +247,7 @@ class AircraftFleet:
                     if of == aircraft and any(first <= sequence <= last for first, last in sequences)
                 }
                 if self._wait_s > CONFIRMED_WITHIN_S:
-                    self._begin_again()  # a collector has returned: send in order, from the first item
+                    self._begin_again()  # a collector is connected again: send in order, from the first item
         elif await self._offload(self._items.confirm, aircraft, epoch, sequences, None) and sequences:
             self._begin_again()
         else:
@@ -261,7 +261,7 @@ class AircraftFleet:
         return link if link is not None and link.connected else None
 
     async def _greet(self) -> None:
-        """Subscribe to the fleet's answers and send a hello, at every connection and after new items."""
+        """Subscribe to the collectors' answers and send a hello, at every connection and after new items."""
         link, now_s = self._link, asyncio.get_running_loop().time()
         if link is None:
             return
@@ -292,9 +292,9 @@ class AircraftFleet:
         self._sent, self._wait_s = 0, CONFIRMED_WITHIN_S
 
     async def _send(self) -> None:
-        """Send the next window of items once the last one is confirmed or timed out.
+        """Send the next few items once those sent before are confirmed or timed out.
 
-        After the last item, sending restarts at the first: an item that is never confirmed does not block others.
+        After the last item, sending restarts at the first unconfirmed one, so that no item blocks the others.
         """
         link, now_s = self._link, asyncio.get_running_loop().time()
         if link is None or not any(kept.waiting for kept in self._kept):
@@ -324,7 +324,7 @@ def _answer_topics(aircraft: str) -> tuple[str, str]:
 
 
 def parse(payload: bytes) -> tuple[str, list[Range]] | None:
-    """Return the epoch and sequences of a collector's message; None: not such a message. Never raises."""
+    """Parse a collector's message: id of the numbering (epoch), and ranges of item numbers; None: it is invalid."""
     try:
         said = decode(payload, dict[str, Any], FORMAT_VERSION)
         epoch, sequences = msgspec.convert((said.get("epoch"), said.get("sequences")), tuple[str, _Ranges])

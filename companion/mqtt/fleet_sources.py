@@ -1,7 +1,7 @@
-"""Search of the storage directory for results that are not yet items for the fleet; each becomes an item once.
+"""Search of the storage directory for new results (calibrations, armings, ...); each becomes a fleet item once.
 
-The files are read as plain JSON: the collector checks the bodies, and the types of the records would load numpy. The
-source is the disk, not the daemon's events: it includes results before a crash and before the fleet was configured.
+The files are read as plain JSON: the collector checks the contents, and the types of the records would import numpy.
+Unlike the daemon's events, the files include results from before a crash or before the fleet was configured.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/"
 TOLD: Final = "told"
 _WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles", "flights")
 _NAME: Final = re.compile(r"([a-z0-9][a-z0-9._-]*)\.json")
-_LISTED: Final = 200  # Most entries of a list; the daemon keeps no more
+_LISTED: Final = 200  # Most entries read from a list; the daemon stores no more
 FORMAT_VERSION: Final = 1
 
 
@@ -50,11 +50,11 @@ def utc(at: str) -> str:
 
 
 class CurrentAircraft(msgspec.Struct, frozen=True):
-    """Aircraft of the items found now, and the function that rates the clock at a time."""
+    """Aircraft to which items found now belong, and the function that rates a timestamp as "good" or "unknown"."""
 
     aircraft: str
     system_id: int | None
-    """MAVLink system id; records of another one do not belong to the aircraft. None: all records belong to it."""
+    """MAVLink system id: records with another id belong to other aircraft. None: all records belong to this one."""
     clock: Callable[[str], Clock]
 
     def owns(self, system_id: int | None) -> bool:
@@ -68,7 +68,7 @@ class CurrentAircraft(msgspec.Struct, frozen=True):
 
 
 class Sources:
-    """Files of one storage directory; `items` holds the read positions (marks). Reading blocks."""
+    """Result files of one storage directory; `items` stores what was already read ("marks"). Methods block."""
 
     def __init__(self, directory: Path, items: FleetItems) -> None:
         self._directory, self._items = directory, items
@@ -76,9 +76,9 @@ class Sources:
         self._settled = False
 
     def has_news(self) -> bool:
-        """Return whether something may have been written since the last call.
+        """Return True if a file may have been written since the last call, and once more after each change.
 
-        It is True once more after each change: a second write in one tick of the file system's clock changes no stamp.
+        The repetition is needed because a second write in one tick of the file system's clock changes no timestamp.
         """
         seen = tuple(_stamp(self._directory / name) for name in _WATCHED)
         settled, self._settled = self._settled, seen == self._seen
@@ -86,7 +86,7 @@ class Sources:
         return not (settled and self._settled)
 
     def entries(self, current: CurrentAircraft) -> Iterator[SourceItems]:
-        """Yield the results that are not yet items.
+        """Yield the results in the storage directory that are not yet items for the fleet.
 
         Raises:
             StorageError: a list or a folder cannot be read.
@@ -95,7 +95,7 @@ class Sources:
             yield from source(current)
 
     def _changed(self, prefix: str, stamps: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-        """Yield each key whose stamp differs from its mark, with the mark's value; forget marks without a key."""
+        """Yield key and stored value of each source that changed since it was read; delete marks of deleted sources."""
         marks = self._items.marks(prefix)
         for key, stamp in stamps.items():
             before = marks.pop(prefix + key, Mark("", ""))
@@ -198,7 +198,7 @@ class Sources:
 
 
 def _parts(current: CurrentAircraft, record: _Keys) -> dict[str, str]:
-    """Return the device ids of the record's IMUs as JSON, by mark key; IMUs without ids are left out."""
+    """Return the device ids of a record's IMUs as JSON, by key of their mark; IMUs without ids are left out."""
     ids = {imu.get("name", ""): {key: imu.get(key) for key in ("gyro_id", "accel_id")} for imu in record.imus}
     known = {name: each for name, each in ids.items() if any(value is not None for value in each.values())}
     return {f"{IMU}{current.aircraft}/{name}": msgspec.json.encode(each).decode() for name, each in known.items()}

@@ -1,4 +1,4 @@
-"""MQTT process: publishes the daemon's state, answers requests, and sends items until the fleet confirms them."""
+"""Main part of the MQTT process: publishes the daemon's state, answers requests, and sends results to the fleet."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
 
 MEMORY_MIB: Final = 128
-"""Memory limit; the process needs 30 MiB, fleet client included."""
+"""Memory limit of the MQTT process, which needs 30 MiB, fleet client included."""
 FOUND_WITHIN_S: Final = 3.0
-"""Timeout for the autopilot's system id; after it the vehicle is number 1, MAVLink's default."""
+"""Longest wait for the autopilot's MAVLink system id; then the topics use MAVLink's default, 1."""
 NEWS_WITHIN_S: Final = 1.0
 PROGRESS_S: Final = 0.5
 ANSWER_AT_END_S: Final = 0.5
@@ -43,7 +43,7 @@ _VEHICLE = ("system_id", "firmware", "armed", "summary")
 
 
 class MqttProcess:
-    """Work of the process. Tests pass the function that asks the daemon; by default it uses the control socket."""
+    """All tasks of the MQTT process. Only tests pass `asks`, to replace requests to the daemon's control socket."""
 
     def __init__(self, settings: ChildSettings, asks: Ask | None = None) -> None:
         config = settings.config
@@ -68,7 +68,7 @@ class MqttProcess:
         return {**self.link.status(), "base_topic": self.topics.base, "fleet": fleet}
 
     async def run(self) -> None:
-        """Serve the broker until cancelled; in a check, only connect to the broker."""
+        """Publish and answer requests until cancelled; under the command `check`, only connect to the broker."""
         if self._only_listening:
             self.topics = Topics(self._base())
             self.link = MqttLink(self._settings, client_id=f"{self._client_id(self.topics.base)}-check")
@@ -110,7 +110,7 @@ class MqttProcess:
             await self._publish_as(Topics(self._base()))
 
     async def _publish_as(self, topics: Topics) -> None:
-        """Publish and handle requests under one base topic, until the vehicle's base topic changes."""
+        """Publish and handle requests under one base topic, until the vehicle gets another one."""
 
         def respond(command: str, response: Object) -> None:
             droppable = response["state"] == "refused" or "repeated" in response
@@ -151,7 +151,7 @@ class MqttProcess:
         except asyncio.CancelledError:
             await requests.close(ANSWER_AT_END_S)
             self.daemon.news.clear()
-            await self._news()  # such as the record of a calibration that was just cancelled
+            await self._news()  # for example the record of a calibration that was just cancelled
             self._publish(link, topics)
             link.outbox.keep(topics.status, OFFLINE)
             raise
@@ -184,7 +184,7 @@ class MqttProcess:
 
 
 def summary(status: Object) -> Object:
-    """Return the part of the status that is published as the state: without figures that change all the time."""
+    """Select the part of the daemon's status that is published as its state, without figures that always change."""
     return {
         **{key: status[key] for key in _COPIED},
         "vehicle": {key: status["vehicle"][key] for key in _VEHICLE},
@@ -197,10 +197,10 @@ def summary(status: Object) -> Object:
 
 
 class Pace:
-    """Limits how often the state is published.
+    """Limit on how often the daemon's state is published.
 
-    A change of the state itself is published at once, any other change within a second. If only texts with the age of
-    an event change, the state is published every ten seconds.
+    A change of the field `state` is published at once, any other change within a second. If only texts with the age of
+    an event change, they are published every ten seconds.
     """
 
     def __init__(self) -> None:
@@ -226,7 +226,7 @@ def _lasting(state: Object) -> Object:
 
 
 class Topics:
-    """Topics under one base, such as "companion/1"; those of requests and responses lack the command's name."""
+    """MQTT topics under a base such as "companion/1". Append a command's name to `request` and `response`."""
 
     def __init__(self, base: str) -> None:
         self.base = base

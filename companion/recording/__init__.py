@@ -1,1 +1,1 @@
-"""Recordings: MCAP files of the received bytes and of all other inputs of a calibration."""
+"""Recordings: files in MCAP format with the received bytes and all other inputs of a calibration."""

@@ -1,7 +1,7 @@
 """MCAP files of a recording: a single file, or a ring of files. Write them in a thread, not on the event loop.
 
-An MCAP file may be cut anywhere: each chunk is compressed independently, and every `write`, once a second, finishes and
-syncs a chunk. Writing raises StorageError, in one line, if the disk fails.
+A file cut off anywhere stays readable: each chunk is compressed independently, and every `write`, once a second,
+finishes a chunk and syncs it to the disk. Writing raises StorageError, in one line, if the disk fails.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from companion.messages import message
 from companion.recording import messages
 from companion.recording.messages import Message, Start
 
-CHUNK_BYTES: Final = 256 * 1024  # a second of a busy aircraft has less
+CHUNK_BYTES: Final = 256 * 1024  # Size of a chunk, above the bytes of one second of a busy aircraft
 RESERVE_BYTES: Final = 32 * 1024 * 1024
-"""Bytes left free on the disk for the undo values and the records, which are worth more than any recording."""
+"""Free space on the disk that recordings must leave for undo values and calibration records."""
 LEAST_FREE: Final = 0.1
-"""Share of the disk that a recording on request leaves free: its files are never deleted."""
+"""Fraction of the disk that a recording on request must leave free, because its files are never deleted."""
 PARTS: Final = 8
-"""Least number of files in a full ring: the deletion of the oldest file then loses only a small part."""
+"""Least number of files in a full ring, so that the deletion of the oldest one loses only a small part."""
 
 FOLDER_MODE: Final = 0o700
 
@@ -37,13 +37,13 @@ _NAME = re.compile(r"(\d{6,})\.mcap")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Beginning:
-    """Header data of a file that begins now."""
+    """Header data of a new recording file."""
 
     t_s: float
     offset_ns: int
-    """UTC minus the daemon's clock, fixed at the daemon's start: a change of the host's clock makes no jump."""
+    """UTC minus the daemon's monotonic clock, fixed at start so that corrections of the host's clock make no jump."""
     config: bytes  # JSON
-    states: Sequence[Message]  # states that apply at `t_s`
+    states: Sequence[Message]  # state messages that apply at time `t_s`
 
 
 def free_bytes(folder: Path) -> int:
@@ -51,7 +51,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def disk_shortage(folder: Path) -> str | None:
-    """Return the reason why a recording on request must not use more of this disk; None: it may, or unknown."""
+    """Return a text if the disk is too full for a recording on request; None if not, or if that is unknown."""
     try:
         usage = shutil.disk_usage(folder)
     except OSError:
@@ -78,8 +78,6 @@ def _failed(path: Path, step: str, reason: OSError | str) -> StorageError:
 
 
 class RecordingFile:
-    """One MCAP file that is being written."""
-
     def __init__(self, path: Path) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
 
@@ -109,7 +107,7 @@ class RecordingFile:
         return 0 if self._file is None else int(self._file.tell())
 
     def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
-        """Append messages, finish the chunk and sync it to disk. The first call writes `beginning` first."""
+        """Append messages, finish the chunk and sync it to disk. The first call begins with the header `beginning`."""
         if self._file is None:
             return
         try:
@@ -152,7 +150,7 @@ class RecordingFile:
             self._add(*state)
 
     def _ns(self, t_s: float) -> int:
-        """Convert a time on the daemon's clock to UTC in ns; a replay subtracts the same whole offset."""
+        """Convert a time on the daemon's clock to UTC in ns; a replay subtracts the same integer offset again."""
         return 0 if self._begun is None else max(0, round(t_s * 1e9) + self._begun.offset_ns)
 
     def _add(self, topic: str, t_s: float, data: bytes) -> None:
@@ -181,7 +179,7 @@ class RecordingFile:
 
 
 def unused_path(folder: Path) -> Path:
-    """Create the folder and return an unused path for a recording on request without a name."""
+    """Create the folder, and return an unused path in it for a recording that was requested without a name."""
     try:
         folder.mkdir(FOLDER_MODE, exist_ok=True)
         numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
@@ -197,7 +195,7 @@ def create_on_request(path: Path) -> RecordingFile:
 
 
 class Ring:
-    """Ring of files with a limited total size; the oldest are deleted. Numbered: the wall clock may be wrong."""
+    """Ring of recording files: the oldest are deleted to limit the size. Numbered, as the wall clock may be wrong."""
 
     def __init__(self, folder: Path, most_bytes: int) -> None:
         self.folder, self.most_bytes = folder, most_bytes

@@ -1,7 +1,7 @@
-"""Topics of a recording, the messages on them, and the queue to the thread that writes them.
+"""Topics of a recording, their messages, and the queue to the thread that writes them.
 
-Raw bytes are recorded unchanged; an empty message marks missing bytes. Records are JSON. All other messages are
-MessagePack, which preserves every float exactly, infinities included.
+Bytes received from a port are recorded unchanged; an empty message marks missing bytes. Calibration records are JSON.
+All other messages are MessagePack, which preserves every float exactly, infinities included.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from companion.estimation.turning.turn import Turn
 FORMAT_VERSION: Final = "4"
 METADATA: Final = "companion"  # name of the metadata record with versions and clocks
 CONFIG: Final = "configuration.json"  # name of the attachment with the active configuration
-SERIAL: Final = "/serial/"  # prefix of the raw bytes of a port; the name of the device follows
+SERIAL: Final = "/serial/"  # prefix of the topic for bytes from a serial port; the device's name follows
 MAVLINK: Final = "/mavlink/in"
-IMU: Final = "/autopilot/imu/"  # prefix of `ImuState`; the name of the IMU follows
+IMU: Final = "/autopilot/imu/"  # prefix of the topic for `ImuState`; the name of the IMU follows
 EKF_BIAS: Final = "/autopilot/ekf_bias"
 RAW_MEAN: Final = "/autopilot/raw_mean"
 PLACE: Final = "/companion/place"
 START: Final = "/companion/start"
-TICK: Final = "/companion/tick"  # empty message: a tick of the collector, at the message's time
+TICK: Final = "/companion/tick"  # empty message: the sample collector was called at the message's time
 MEASURED, SOLVED, RECORD = "/companion/measured", "/companion/solved", "/companion/record"
 
 Message = tuple[str, float, bytes]  # topic, time on the daemon's clock, data
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Start of a recording, or its restart after a gap."""
+    """Message at the start of a recording, and at its restart after a gap."""
 
     lost: int = 0  # messages dropped just before, because the disk was too slow
     continues: bool = False  # True: this file begins where the previous one of the ring ends
 
 
 class ImuState(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one IMU of the autopilot from here on: its messages, and its calibration parameters."""
+    """State of one IMU of the autopilot from the message's time on: its sample messages and calibration parameters."""
 
     sender: tuple[int, int]  # system and component id of the autopilot
     firmware: FirmwareName | None
@@ -55,16 +55,16 @@ class ImuState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RawOutput(msgspec.Struct, frozen=True):
-    """Mean of an IMU in floats, beside its stream of integers, corrected by the active offsets."""
+    """Mean output of an IMU in floats, corrected by the active offsets; the stream of samples has integers."""
 
     imu: str
     output: tuple[float, float, float, float, float, float]
-    """Gyro in rad/s, accelerometer in m/s^2, vehicle FRD."""
+    """Gyro x y z in rad/s, then accelerometer x y z in m/s^2, vehicle FRD."""
     temperature_degc: float | None
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """Measurement of a window. Values other than its ends may depend on time before the recording."""
+    """Measured window. All values but its start and end may depend on samples from before the recording."""
 
     start_s: float
     end_s: float
@@ -74,7 +74,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):
-    """Calibration from the latest window: all other inputs of the estimator."""
+    """Inputs of the bias estimator besides the latest window: recorded so that a replay gets the same result."""
 
     where: Whereabouts
     what: str
@@ -91,7 +91,7 @@ _TYPES: Final[dict[str, Any]] = {
     MEASURED: Measured,
     SOLVED: Solved,
 }
-MOST_BYTES: Final = 1024 * 1024  # most bytes of one of these messages; usual ones have some thousand
+MOST_BYTES: Final = 1024 * 1024  # most bytes of one MessagePack message; usual ones have some thousand
 
 
 def encoding(topic: str) -> str:
@@ -124,16 +124,16 @@ def _array(_kind: Any, plain: Any) -> Any:
 
 
 MOST_MESSAGES: Final = 12_000
-"""Most queued messages: 15 s of a 200 Hz IMU and 100 Hz telemetry, which exceeds the stalls of a memory card."""
+"""Most queued messages: 15 s of a 200 Hz IMU and 100 Hz telemetry, longer than a memory card stalls."""
 MOST_WAITING_BYTES: Final = 2 * 1024 * 1024  # most queued bytes: 15 s of an IMU at 1 kHz have 1.4 MB
 
 
 class Tape:
-    """Bounded queue to the writer. On overflow all queued messages are dropped: a replay cannot bridge a gap."""
+    """Queue of limited size to the writing thread. If full, it drops all messages: a replay cannot bridge a gap."""
 
     def __init__(self) -> None:
-        self.is_on = False  # True: messages are queued; states are always kept
-        self.lost = 0  # messages dropped since `begin`; above 0, all further messages are dropped
+        self.is_on = False  # True: messages are queued. State messages are stored in any case
+        self.lost = 0  # messages dropped since `begin`; once there is one, all further ones are dropped too
         self.lost_in_all = 0
         self._waiting: list[Message] = []
         self._bytes = 0
@@ -171,7 +171,7 @@ class Tape:
             self._waiting.append((topic, t_s, data))
 
     def put_state(self, topic: str, t_s: float, data: bytes) -> None:
-        """Add a message that applies until the next one on its topic; later files begin with it."""
+        """Add a state message: it applies until the next one on its topic, and later files begin with it."""
         self._states[topic] = (topic, t_s, data)
         self.put(topic, t_s, data)
 
@@ -181,21 +181,21 @@ class Tape:
 
 
 _ID: Final = (256).to_bytes(3, "little")
-"""Message id of SETUP_SIGNING in a MAVLink 2 header; MAVLink 1 has no such id."""
+"""Message id of SETUP_SIGNING (256) in a MAVLink 2 header; MAVLink 1 has no ids above 255."""
 _ID_AT: Final = 7
 _HEADER: Final = 10
 _MARKER: Final = 0xFD
 
 
 class KeyFilter:
-    """Filter that zeroes the key in SETUP_SIGNING: autopilots forward this message, and recordings may be shared.
+    """Filter that zeroes the secret key in MAVLink's SETUP_SIGNING, because recordings may be given to others.
 
-    Use one filter for each direction of each link, and pass it all bytes in order.
+    Autopilots forward this message. Use one filter for each direction of each link, and pass it all bytes in order.
     """
 
     def __init__(self) -> None:
         self._before = b""
-        self._left = 0  # bytes still to come of a payload that has begun
+        self._left = 0  # bytes not received yet of a payload that has begun
 
     def __call__(self, data: bytes) -> bytes:
         known = self._before + data
@@ -205,7 +205,7 @@ class KeyFilter:
         return self._blank(known, len(known) - len(data))
 
     def restart(self) -> None:
-        """Discard a partly received message: bytes are missing at this point."""
+        """Discard a partly received message; call this where bytes are missing."""
         self._before, self._left = b"", 0
 
     def _blank(self, known: bytes, behind: int) -> bytes:

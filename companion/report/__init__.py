@@ -1,1 +1,1 @@
-"""Building blocks of HTML pages, shared by reports, the live page and the fleet."""
+"""Building blocks of HTML pages, shared by calibration reports, the live page and the fleet's pages."""

@@ -1,4 +1,4 @@
-"""Page of one calibration, from the files of the storage directory; it needs no daemon and changes nothing."""
+"""HTML page of one calibration, made from files in the storage directory; needs no daemon and changes no file."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
 
 
 Numbered = Sequence[tuple[int, Record]]
-"""Calibrations of one aircraft with their numbers, oldest first; the page shows the last."""
+"""Numbers and records of one aircraft's calibrations, oldest first; the page is about the last one."""
 
 
 def read_material(directory: Path, wanted: int | None) -> tuple[Numbered, list[ArmingRecord], list[str]]:
-    """Read a calibration by its number; None: the latest.
+    """Read the data for the page of calibration number `wanted` (None: the latest).
 
     Returns:
-        Earlier calibrations, then the wanted one; armings while it was active, oldest first; damaged files.
+        Earlier calibrations and, last, the wanted one; armings while it was active; errors of unreadable files.
     """
     store, records = RecordStore(directory), directory / "records"
     try:
-        # Without this, a folder that only root may enter looks like a missing one.
+        # Check access first: a folder that only root may enter would look like a missing one.
         next(iter(records.iterdir()), None)
     except FileNotFoundError:
         raise StorageError(f"no calibration yet: there is no {records} (--storage DIR names another folder)") from None

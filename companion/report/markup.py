@@ -1,8 +1,8 @@
-"""HTML and plots in SVG, built from parts that are escaped unless they are markup already.
+"""HTML and SVG plots, built from parts: plain text is escaped, markup made here is not.
 
-Names, reasons and warnings come from files and from the autopilot: none of them may become a tag, and no invisible
-character may turn the reading direction of the text beside it. Plots are drawn in classes (`sx`, `sy`, `sz`, ...): the
-style sheet has the colours; series differ by the shape of their markers as well.
+Names, reasons and warnings come from files and from the autopilot. None of them may become a tag, and no invisible
+character may turn the reading direction of other text. The x, y and z series have the classes `sx`, `sy` and `sz`: the
+style sheet has their colours, and the shapes of their markers differ too.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Final
 import msgspec
 
 MAX_TEXT: Final = 600
-"""Maximum characters in one piece of text: bounds the size of a page for any file."""
+"""Most characters in one piece of text, so that no file can make a page too large."""
 
-# Controls (except line breaks and tabs), direction marks and overrides, zero-width characters, lone surrogates.
+# Controls (except line breaks and tabs), marks of text direction, zero-width characters, unpaired surrogates.
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 _VOID: Final = frozenset({"meta", "path", "line", "rect", "circle", "br"})
 
@@ -31,7 +31,7 @@ _MOST: Final = 1e12
 
 Pair = tuple[float, float]
 Dot = tuple[float, float, float]
-"""Position on both axes, and half the length of the error bar."""
+"""Data point of a plot: x, y, and half the length of the error bar in y, in the units of the axes."""
 
 
 class Markup(str):
@@ -39,7 +39,7 @@ class Markup(str):
 
 
 Child = str | None
-"""A plain `str` is escaped, `Markup` is HTML already, None adds nothing."""
+"""Content of an HTML element: a plain `str` is escaped, `Markup` is used unchanged, None adds nothing."""
 
 
 def text(words: str) -> Markup:
@@ -55,7 +55,7 @@ def join(*children: Child) -> Markup:
 
 
 def tag(element: str, /, *children: Child, **attributes: str | float | None) -> Markup:
-    """Make an element; `class_` becomes class, other underscores become dashes, an attribute of None is omitted."""
+    """Make an HTML element. In attribute names, `class_` means class and _ means a dash; None omits the attribute."""
     given = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{text(value if isinstance(value, str) else str(value))}"'
         for key, value in attributes.items()
@@ -83,7 +83,7 @@ class Axis(msgspec.Struct, frozen=True):
 
 
 def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Axis:
-    """Make a linear axis around the values, at least `least` wide: tiny scatter must not fill the plot."""
+    """Make a linear axis around the values, at least `least` wide, so that tiny scatter does not fill the plot."""
     known = [value for value in values if abs(value) < _MOST] or [0.0]
     low, high = min(known), max(known)
     width = max(high - low, least, 1e-4 * max(abs(low), abs(high)), 1e-9)
@@ -105,7 +105,7 @@ def in_order(labels: Sequence[str]) -> Axis:
 
 
 def dates(values: Sequence[float]) -> Axis:
-    """Make an evenly spaced axis of UTC times (s since 1970); within one day the labels are times of day."""
+    """Make an axis of UTC times (s since 1970), evenly spaced; labels are dates, or times of day within one day."""
     moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
     form = "%H:%M" if len({each.date() for each in moments}) == 1 else "%-d %b %y"
     return in_order([each.strftime(form) for each in moments])
@@ -117,10 +117,10 @@ def _nice(step: float) -> float:
 
 
 class Plot:
-    """SVG plot in one frame with axes; later marks cover earlier ones.
+    """SVG plot in one frame with axes; what is drawn later covers what was drawn earlier.
 
-    `x_label` None: neither label nor ticks, for a plot above another one; empty: ticks only. `name` and `told` are for
-    a screen reader.
+    `x_label`: "" for ticks without a label, None for neither, as in a plot above another one. `name` and `told` are
+    title and description for a screen reader.
     """
 
     def __init__(
@@ -160,13 +160,13 @@ class Plot:
         self._below.append(_path(f"M{_xy(*self.at(x, self._y.low))}V{_n(self._top)}", class_))
 
     def points(self, dots: Sequence[Dot], class_: str) -> None:
-        """Draw markers: `sy` (squares), `sz` (triangles) or others (circles), each with a bar."""
+        """Draw a marker with error bar at each data point: a square for class `sy`, triangle for `sz`, else circle."""
         ends = [(self.at(x, y - by), self.at(x, y + by)) for x, y, by in dots]
         bars = [f"M{_xy(*bottom)}V{_n(top)}" for bottom, (_, top) in ends]
         self._parts.append(_path("".join(bars), f"bar {class_}"))
         places = [self.at(x, y) for x, y, _ in dots]
         if class_ not in {"sy", "sz"}:
-            # Zero-length line with round caps: a quarter of the characters of a circle element.
+            # A circle is drawn as a line without length and with round caps: a quarter of the characters.
             self._parts.append(_path("".join(f"M{_xy(*place)}h.01" for place in places), f"dot {class_}"))
             return
         marker = _square if class_ == "sy" else _triangle
@@ -232,6 +232,5 @@ def _xy(x: float, y: float) -> str:
 
 
 def _n(value: float) -> str:
-    """Format a coordinate to a tenth of a pixel."""
     found = f"{value:.1f}"
     return found.removesuffix(".0") if found != "-0.0" else "0"

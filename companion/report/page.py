@@ -1,4 +1,4 @@
-"""Frame of every page, and parts that several pages share: cards, biases over time and over temperature."""
+"""Frame of all HTML pages, and parts that several pages share: boxes, plots of bias over time and temperature."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
 AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
-"""Largest value in a plot (SI): a larger one comes from a damaged file and would compress the scale."""
+"""Largest bias or sigma in a plot (rad/s, m/s^2): a larger one is from a damaged file and would spoil the scale."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
-"""Three of an autopilot and our own. Others are listed without plots: a page stays below half a megabyte."""
+"""Most IMUs shown on a page, which then stays below half a megabyte: three of an autopilot and our own."""
 
 # No script, no fetch, no form: a page contains everything inline.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 _STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
 _LEAST_K: Final = 4.0
-"""Least width of an axis: a tenth of a kelvin must not fill it."""
+"""Least width of a temperature axis, so that a tenth of a kelvin does not fill it."""
 
 _Window = tuple[float, Vector, Vector]
 
@@ -59,7 +59,7 @@ def page(title: str, now: datetime.datetime, *body: Child, source: str = "from t
 
 
 def card(kind: str, *children: Child) -> Markup:
-    """Make a box; kind "alarm", "caution", "fine" or ""."""
+    """Make a box; its kind, "alarm", "caution", "fine" or "", determines the colour."""
     return tag("div", *children, class_=f"card {kind}".strip())
 
 
@@ -75,14 +75,14 @@ def damaged(problems: Sequence[str]) -> Markup | None:
 
 
 def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tuple[str, str]:
-    """Format a figure and its sigma in a unit, to the second digit of sigma."""
+    """Format a value and its sigma, divided by `unit`, to the second significant digit of sigma."""
     shown = abs(sigma / unit)
     digits = min(max(1 - math.floor(math.log10(shown)), 0), 5) if 0 < shown < 1e9 else 1
     return f"{value / unit:{sign}.{digits}f}", f"{sigma / unit:.{digits}f}"
 
 
 class PlotPoint(msgspec.Struct, frozen=True):
-    """One triad of one IMU in one calibration of the history; SI units."""
+    """Bias of one gyro or accelerometer, x y z, in one calibration; rad/s or m/s^2."""
 
     number: int
     unix_s: float | None
@@ -103,7 +103,7 @@ def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> li
 
 
 def unix_s(moment: str) -> float | None:
-    """Convert an ISO 8601 time (default zone: UTC) to s since 1970; None: invalid, or outside an axis' range."""
+    """Convert an ISO 8601 time, by default in UTC, to s since 1970; None if invalid or outside 1970 to 2199."""
     try:
         parsed = datetime.datetime.fromisoformat(moment)
         return seconds_of(parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC))
@@ -112,13 +112,13 @@ def unix_s(moment: str) -> float | None:
 
 
 def seconds_of(moment: datetime.datetime) -> float | None:
-    """Convert a time with a zone to s since 1970; None: outside the range of an axis."""
+    """Convert a time with a zone to s since 1970; return None outside 1970 to 2199, the range of a time axis."""
     seconds = moment.timestamp()
     return seconds if 0.0 <= seconds < _LATEST_S else None
 
 
 def clock_is_sound(points: Sequence[PlotPoint]) -> bool:
-    """Return whether the times ascend: a computer without a clock battery starts in the past at every boot."""
+    """Return True if all times are known and ascend; without a clock battery, each boot starts in the past."""
     known = [point.unix_s for point in points]
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 

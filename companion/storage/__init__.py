@@ -1,1 +1,1 @@
-"""Files that must survive a power cut."""
+"""Files with data that must survive a power cut."""

@@ -1,8 +1,8 @@
-"""Journal of parameter writes: saved before the first write, so that old values can be restored after an interruption.
+"""Files with old parameter values: a journal, to end an interrupted write, and the undo steps of finished writes.
 
-`journal.json` exists only during a write (if it exists at start, the daemon ended in the middle of one).
-`undo-N.json` holds the values before the last finished writes on the vehicle with system id N. A restore writes these
-values to an autopilot, so only parameters that the companion writes are accepted, within their ranges.
+`journal.json` is saved before the first parameter is written and deleted after the last. If it exists at start, the
+daemon ended in the middle of a write. `undo-N.json` holds the values from before the last writes on the vehicle with
+MAVLink system id N. Both files accept only parameters that the companion writes, within their ranges.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from companion.storage.state import BoundedList, StateFile, numbers_in, remove_d
 
 _UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
-MOST_STEPS: Final = 10  # writes that can be undone one after the other; further ones replace the oldest
+MOST_STEPS: Final = 10  # most writes that can be undone one after another; further ones replace the oldest
 AUTOMATIC: Final = "auto calibration"
 BY_TEMPERATURE: Final = "temperature"
 PREDICTION: Final = "gyro prediction"
-"""Name of gyro offsets that versions before 0.2 predicted and wrote; their files can still be read and undone."""
+"""Kind of a write of predicted gyro offsets: made by versions before 0.2 only, but can still be undone."""
 BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
-"""Kinds of writes that have no calibration record."""
+"""Kinds of writes without a calibration record: alignments, and offsets from temperature curves."""
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One parameter: its old value, its new value, and the far value between them (`Change.via`), if any.
+    """Change of one parameter: old value, new value, and the temporary large offset between them (`via`), if any.
 
-    `after` is None while the firmware's own gyro calibration, started by us, sets the parameter: any value is then
-    ours. `also` lists further values of ours that an interrupted sequence of writes may leave.
+    `after` is None while the firmware's own gyro calibration, started by us, sets the parameter: then any value counts
+    as written by us. `also` lists further values that an interrupted sequence of our writes may leave.
     """
 
     parameter: str
@@ -50,13 +50,13 @@ Moment = Annotated[str, msgspec.Meta(pattern=r"^[-+:.0-9T]{0,40}\Z")]
 
 
 class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Kind and start time of a write; empty: unknown.
+    """Kind and start time of a write to the autopilot; empty if unknown.
 
-    Times are UTC, ISO 8601, by the host's clock; `at` of a calibration is `started_at` of its record.
+    Times are UTC, ISO 8601, by the host's clock. For a calibration, `at` is `started_at` of its record.
     """
 
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
-    """Kind: "calibration", "auto calibration", or one of `BY_HAND`; empty: unknown."""
+    """Kind of the write: "calibration", "auto calibration", or one of `BY_HAND`; empty if unknown."""
     at: Moment = ""
     since: Moment = ""  # start of the first of several writes in one step; empty: a single write
 
@@ -66,7 +66,7 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Changes of one write on one vehicle."""
+    """Parameter changes of one write to one vehicle's autopilot."""
 
     system_id: int
     changes: tuple[Changed, ...]
@@ -80,9 +80,9 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         unforeseen: Mapping[str, float] | None = None,
         origin: Origin | None = None,
     ) -> ChangeSet:
-        """Make the set before the first change is written; `unforeseen`: old values that the firmware overwrites.
+        """Make the set from planned changes; `unforeseen`: old values of parameters that the firmware will overwrite.
 
-        A set for an unknown vehicle (system id 0) cannot be saved.
+        A set for an unknown vehicle gets system id 0 and cannot be saved.
         """
         found = [Changed(change.parameter, change.before, change.after, change.via) for change in changes]
         found += [Changed(name, before, None) for name, before in (unforeseen or {}).items()]
@@ -97,7 +97,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names}
 
     def after(self, older: ChangeSet) -> ChangeSet:
-        """Join this write and the `older` one to one step; its undo restores the values before both."""
+        """Join this write and the `older` one to one undo step, which restores the values from before both."""
         were = {changed.parameter: changed for changed in older.changes}
         joined = [_joined(were.pop(changed.parameter, None), changed) for changed in self.changes]
         origin = self.origin
@@ -106,7 +106,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return ChangeSet(self.system_id, (*were.values(), *joined), origin)
 
     def without(self, latest: ChangeSet) -> ChangeSet:
-        """Return the changes of this step that remain after the restore of `latest`; none after a full restore."""
+        """Return the changes of this step that remain in effect once the old values of `latest` are restored."""
         back = {changed.parameter: changed.before for changed in latest.changes}
         left = [
             msgspec.structs.replace(changed, after=back.get(changed.parameter, changed.after))
@@ -117,37 +117,37 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _joined(older: Changed | None, newer: Changed) -> Changed:
-    """Join two changes of one parameter; keep only the newer one if another value was set between them."""
+    """Join two changes of one parameter; return only the newer one if another value was set between them."""
     if older is None or older.after != newer.before:
         return newer
     via = newer.via
     if via is not None and newer.after is not None and older.via is not None:
-        # The farther of the two has the distance from all values that the firmware needs.
+        # The farther of both temporary offsets is far enough from all values for the firmware.
         via = (max if via > newer.after else min)(via, older.via)
     return msgspec.structs.replace(newer, before=older.before, via=via)
 
 
 class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The steps that can be undone on one vehicle, the latest first."""
+    """Writes that can be undone on one vehicle, the latest first."""
 
     system_id: int
     steps: tuple[ChangeSet, ...] = ()
-    changes: tuple[Changed, ...] = ()  # the only step, in files of versions that kept one
+    changes: tuple[Changed, ...] = ()  # the only step, in files of versions that stored one
 
     @property
     def all(self) -> tuple[ChangeSet, ...]:
-        """Return all steps, including the single step of earlier versions' files."""
+        """Return all undo steps, including the single one in files of earlier versions."""
         return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
 
     def and_then(self, latest: ChangeSet) -> Undoable:
-        """Return the steps with a write added; automatic calibrations in a row form one step."""
+        """Return the undo steps with a write added; automatic calibrations in a row form one step."""
         steps = self.all
         while steps and latest.origin.what == steps[0].origin.what == AUTOMATIC:
             latest, steps = latest.after(steps[0]), steps[1:]
         return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
 
     def without(self, latest: ChangeSet) -> Undoable:
-        """Return the steps without a restored write or step; unchanged if it does not belong to the latest step."""
+        """Return the undo steps left once `latest` is restored; unchanged if that is not part of the latest step."""
         steps = self.all
         if not steps or not (latest == steps[0] or (latest.origin.at and latest.origin.at == steps[0].origin.at)):
             return self
@@ -156,8 +156,6 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 class ChangeLog:
-    """Journal and undo files of one storage folder."""
-
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._allowed = {name: one for each in CALIBRATION.values() for name, one in each.items()}
@@ -178,7 +176,7 @@ class ChangeLog:
             return []  # `check_writable` has reported the error
 
     def check_writable(self) -> None:
-        """Raise StorageError if no file can be written here: at start, not at the first write."""
+        """Raise StorageError if no file can be written here; called at start, to report the fault before any write."""
         write_atomically(self._probe, b"")
         remove_durably(self._probe)
 
@@ -196,12 +194,10 @@ class ChangeLog:
                     raise msgspec.ValidationError(f"found {name} = {value:.9g}; allowed: {self._allowed[name]}")
 
 
-KEEP_INTERRUPTIONS: Final = 50  # enough for years
+KEEP_INTERRUPTIONS: Final = 50  # Most interrupted writes in the list: enough for years
 
 
 class Interruption(msgspec.Struct, frozen=True, kw_only=True):
-    """One interrupted write."""
-
     what: str  # Kind of write (see `Origin.what`)
     began_at: str  # start of the calibration or alignment that wrote, UTC, ISO 8601; empty: unknown
     ended_at: str | None  # end of the restore, UTC, ISO 8601; None: pending

@@ -1,7 +1,8 @@
-"""Store of numbered items for the fleet, by aircraft; for lack of room, old confirmed items are dropped first.
+"""Store of numbered items (results and events) for the fleet, by aircraft.
 
-One SQLite file (`fleet.sqlite` in the storage directory) holds the items and the read positions ("marks") of their
-sources. Both change in one transaction, so that a power cut neither loses nor repeats an item. Every call blocks.
+One SQLite file (`fleet.sqlite` in the storage directory) holds the items, and as "marks" the sources already read. Both
+change in one transaction, so that a power cut neither loses nor repeats an item. If the file is full, the oldest
+confirmed items are dropped first. Every call blocks.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from companion.storage.state import file_error, set_aside
 
 FILE: Final = "fleet.sqlite"
 FORMAT_VERSION: Final = 1
-MOST_BYTES: Final = 16 * 1024 * 1024  # most bytes of all items; some 2500 calibrations
-MAKE_ROOM: Final = 1 / 16  # share that is dropped at once when the file is full, so that losses are reported rarely
+MOST_BYTES: Final = 16 * 1024 * 1024  # most bytes of all items: some 2500 calibrations
+MAKE_ROOM: Final = 1 / 16  # fraction dropped at once when the file is full, so that losses are reported rarely
 CACHE_KIB: Final = 128
 LOG_PAGES: Final = 64
 
 Clock = Literal["good", "unknown"]
-Range = tuple[int, int]  # first and last sequence, both included
+Range = tuple[int, int]  # first and last item number, both included
 
 
 class Item(NamedTuple):
-    """One item for the fleet: an event or a result, as JSON."""
+    """Item for the fleet: a result or an event of an aircraft, as JSON."""
 
     kind: str
     at: str  # time of the event: UTC, ISO 8601
@@ -39,34 +40,34 @@ class Item(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """Position up to which a source has been read."""
+    """State of a source (a file, an IMU, ...) when it was last read for items."""
 
-    stamp: str  # stamp of the source's file, to notice a change quickly
+    stamp: str  # timestamp of the source's file, to notice a change quickly
     value: str
 
 
 class SourceItems(NamedTuple):
-    """Items of one read, and the new marks of their sources."""
+    """Items found by one read of a source, and the new marks of the sources, by key."""
 
     marks: dict[str, Mark]
     items: Sequence[Item] = ()
 
 
 class Kept(NamedTuple):
-    """Range and status of the items kept for one aircraft."""
+    """Item numbers stored for one aircraft, number of unconfirmed items, and time of the last confirmation."""
 
     aircraft: str
     epoch: str
-    first: int  # first kept sequence; `last` + 1: none
-    last: int  # last assigned sequence; 0: none
+    first: int  # first stored item number; `last` + 1 if no item is stored
+    last: int  # last assigned item number; 0 if there is none
     waiting: int
     confirmed_at: str | None
 
 
 class Waiting(NamedTuple):
-    """Item that is not confirmed yet."""
+    """Item that no collector has confirmed yet."""
 
-    number: int  # number over all aircraft, in order
+    number: int  # position among the items of all aircraft
     aircraft: str
     epoch: str
     sequence: int
@@ -74,7 +75,7 @@ class Waiting(NamedTuple):
 
 
 class FleetItems:
-    """Database of the items. A method that raises StorageError has changed nothing."""
+    """Database of the items for the fleet. A method that raises StorageError has changed nothing."""
 
     def __init__(self, directory: Path, *, most_bytes: int = MOST_BYTES) -> None:
         self.path = directory / FILE
@@ -83,7 +84,7 @@ class FleetItems:
         self._lock = threading.Lock()
 
     def close(self) -> None:
-        """Close the file until the next call; wait for the end of a call under way."""
+        """Close the file after the end of a call in another thread; the next call opens it again."""
         with self._lock:
             self._drop()
 
@@ -94,7 +95,7 @@ class FleetItems:
                 connection.close()
 
     def add(self, aircraft: str, entries: Iterable[SourceItems], now: str) -> None:
-        """Number and save the items, and save the marks. If older items are dropped for room, add an event."""
+        """Save items with new numbers, and the marks. If unconfirmed items must be dropped for room, add an event."""
         with self._transaction() as db:
             for entry in entries:
                 for item in entry.items:
@@ -130,7 +131,7 @@ class FleetItems:
             return [Waiting(number, of, epoch, sequence, Item(*told)) for number, of, epoch, sequence, *told in found]
 
     def confirm(self, aircraft: str, epoch: str, ranges: Iterable[Range], now: str | None) -> bool:
-        """Mark items as confirmed, or as missing in the fleet (`now`: None); return False for another epoch."""
+        """Mark items as confirmed or, if `now` is None, unconfirmed; return False if `epoch` is not the present one."""
         with self._transaction() as db:
             if db.execute("SELECT 1 FROM aircraft WHERE (id, epoch) = (?, ?)", (aircraft, epoch)).fetchone() is None:
                 return False
@@ -201,7 +202,7 @@ class FleetItems:
         os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600))
         db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=1.0)
         try:
-            # Exclusive, so the log needs no shared memory; intact after a power cut; small in memory.
+            # Exclusive locking: the log needs no shared memory. The other settings: safe at a power cut, small cache.
             db.execute("PRAGMA locking_mode = EXCLUSIVE")
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = FULL")
@@ -232,7 +233,7 @@ class FleetItems:
         return db
 
     def _begin_anew(self) -> str:
-        """Set a damaged file aside; delete its log, which would damage the next file."""
+        """Set a damaged database file aside, and delete its log, which would damage the next file."""
         words = set_aside(self.path)
         for end in ("-wal", "-shm", "-journal"):
             with contextlib.suppress(OSError):

@@ -30,16 +30,16 @@ _FILE: Final = re.compile(rf"({_NAME.pattern})\.json")
 
 
 class ProfileSource(msgspec.Struct, frozen=True, kw_only=True):
-    """One recording from which a profile was learned."""
+    """One recording from which a noise profile was learned."""
 
     file: str
     began_at: str | None  # UTC; None: not in the recording
     still_s: float
-    temperature_degc: tuple[float, float] | None  # lowest and highest
+    temperature_degc: tuple[float, float] | None  # lowest and highest; None: unknown
 
 
 class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
-    """Content of a profile's file."""
+    """Content of the file of a noise profile."""
 
     format_version: int
     name: str
@@ -47,12 +47,12 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     imu: str
     gyro: AllanModel
     accel: AllanModel
-    kept_from: str  # profile that supplied the figures in `kept`
-    kept: tuple[str, ...]  # figures that could not be estimated: the recordings were too short
+    kept_from: str  # profile from which the figures listed in `kept` were copied
+    kept: tuple[str, ...]  # figures that could not be estimated, because the recordings were too short
     sources: tuple[ProfileSource, ...]
     notes: tuple[str, ...] = ()
     warm_up: tuple[float, float] | None = None
-    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; null: unknown."""
+    """Two-sigma bias change during warm-up, of gyro (rad/s) and accelerometer (m/s^2); None: unknown."""
 
     @property
     def profile(self) -> NoiseProfile:
@@ -63,7 +63,7 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check_name(name: str) -> None:
-    """Raise StorageError for a name of the catalogue and for one that is not allowed as a file name."""
+    """Raise StorageError if a new profile's name is in the built-in catalogue or not allowed as a file name."""
     if _plain(name) in CATALOGUE or not _NAME.fullmatch(name):
         raise StorageError(message("profile_name_not_allowed", name=repr(name)))
 
@@ -73,8 +73,6 @@ def _plain(name: str) -> str:
 
 
 class ProfileStore:
-    """The folder `profiles` of a storage directory."""
-
     def __init__(self, directory: Path) -> None:
         self._folder = directory / "profiles"
 
@@ -82,11 +80,11 @@ class ProfileStore:
         return self._folder / f"{name}.json"
 
     def names(self) -> list[str]:
-        """List all profiles, unreadable ones too; raises StorageError."""
+        """List the names of all saved profiles, including unreadable ones; raises StorageError."""
         return named_in(self._folder, _FILE)
 
     def read(self, name: str) -> SavedProfile:
-        """Read one profile; raises StorageError in one line."""
+        """Read one saved profile; raises StorageError in one line."""
         path = self.path(name)
         found = read_profile(path)
         if found.name != name:
@@ -119,9 +117,9 @@ def read_profile(path: Path) -> SavedProfile:
 
 
 def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> NoiseProfile:
-    """Read one profile for the configuration.
+    """Read the saved profile that the configuration names.
 
-    `forgiving`, for the daemon: replace an unusable profile by the figures of the worst common parts, with a warning.
+    `forgiving`, for the daemon: replace an unusable profile by the noise of the worst common IMUs, with a warning.
     Raises ConfigError if there is no such profile, StorageError if it cannot be read.
     """
     store = ProfileStore(directory)
@@ -139,9 +137,10 @@ def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> N
 
 
 def given_profile(wanted: str, directory: Callable[[], Path]) -> str | NoiseProfile:
-    """Find a part of the catalogue, a saved profile, or a profile's file (with a slash or .json).
+    """Find a noise profile by name: of an IMU in the catalogue, a saved profile, or a file (with / or .json).
 
-    Calls `directory` only for a saved profile. Raises ConfigError if there is none, StorageError for a damaged file.
+    `directory` is called only for a saved profile. Raises ConfigError if there is no such profile, StorageError for a
+    damaged file.
     """
     if (plain := _plain(wanted)) in CATALOGUE:
         return plain

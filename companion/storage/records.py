@@ -1,6 +1,7 @@
-"""Files of results: records of calibrations and flights, and the data from which later calibrations learn.
+"""Files of results: records of calibrations and flights, and bias histories that later calibrations use.
 
-Numbered files are in `records` and `flights`; other files hold alignments, armings, biases by IMU, signature time.
+Numbered files are in the folders `records` and `flights`. Other files hold alignments, armings, biases by IMU, and the
+time of the last MAVLink signature.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ T = TypeVar("T")
 
 
 class NumberedFiles(Generic[T]):
-    """Files `000001.json`, ... in a folder, numbered because the wall clock may be wrong in the field.
+    """Folder of files `000001.json`, ..., numbered because the wall clock may be wrong in the field.
 
     Methods raise StorageError; no file is left half written.
     """
@@ -37,7 +38,7 @@ class NumberedFiles(Generic[T]):
     name: ClassVar[str]  # Name of the folder
     kind: ClassVar[Any]
     newest_format: ClassVar[int]
-    keep: ClassVar[int]  # most files; new ones replace the oldest
+    keep: ClassVar[int]  # most files in the folder; new ones replace the oldest
     mode: ClassVar[int] = 0o600
 
     def __init__(self, directory: Path) -> None:
@@ -51,7 +52,7 @@ class NumberedFiles(Generic[T]):
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
-        """Add a file; return its number. Raises StorageError; no file is left half written."""
+        """Save a value as the next file and return its number; delete the oldest files. Raises StorageError."""
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 1
         self.file(number).write(value)
@@ -63,7 +64,7 @@ class NumberedFiles(Generic[T]):
         return number
 
     def latest(self) -> Iterator[tuple[int, T]]:
-        """Yield numbers and contents of the readable files, the newest first."""
+        """Yield number and content of each readable file, the newest first."""
         for number in reversed(self.numbers()):
             try:
                 found = self.file(number).read()
@@ -78,7 +79,7 @@ class NumberedFiles(Generic[T]):
 
 
 class RecordStore(NumberedFiles[Record]):
-    """Records of calibrations: some 6 kB each, the whole history below 6 MB."""
+    """Folder of calibration records: some 6 kB each, at most 1000."""
 
     name, kind, newest_format, keep = "records", Record, record.FORMAT_VERSION, 1000
 
@@ -86,7 +87,7 @@ class RecordStore(NumberedFiles[Record]):
         return list(self.newest(limit).values())
 
     def mark_undone(self, step: ChangeSet, undone_at: str) -> list[str]:
-        """Mark the records of an undone step; return their `started_at`."""
+        """Mark the records of an undone write as undone, at time `undone_at`; return their `started_at`."""
         found: dict[int, Record] = {}
         for number, each in self.latest():
             if each.undone_at or each.state != "done" or each.system_id != step.system_id:
@@ -109,13 +110,13 @@ class RecordStore(NumberedFiles[Record]):
 
 
 class FlightStore(NumberedFiles[KeptFlight]):
-    """Flights read from logs: some 10 kB for each IMU."""
+    """Folder of results of flights, read from the autopilot's logs: some 10 kB for each IMU."""
 
     name, kind, newest_format, keep = "flights", KeptFlight, flight_record.FORMAT_VERSION, 100
     mode = 0o644  # root reads the logs and writes flights; the service, under its own account, reads them
 
     def save(self, value: KeptFlight) -> int:
-        """Add a flight, or replace it if its log was read before; return its number."""
+        """Save a flight, in place of an earlier result from the same log if there is one; return its number."""
         for number, one in self.latest():
             if one.flight.key == value.flight.key:
                 self.file(number).write(value)
@@ -134,7 +135,7 @@ def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of one alignment."""
+    """Outcome of one alignment, for which somebody placed or turned the aircraft."""
 
     what: str  # "zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1
     state: str  # "done", "failed", or "predicted" of version 0.1
@@ -146,7 +147,7 @@ class Done(msgspec.Struct, frozen=True, kw_only=True):
 
 
 KEEP_DONE: Final = 50
-KEEP_ARMINGS: Final = 200  # a season of flying, below 100 kB at some 400 bytes each
+KEEP_ARMINGS: Final = 200  # Most armings stored: a season of flying, 80 kB at some 400 bytes each
 
 
 def alignments_in(directory: Path) -> BoundedList[Done]:
@@ -162,8 +163,6 @@ KEEP_IMUS: Final = 8
 
 
 class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
-    """Identity and bias history of one IMU."""
-
     identity: dict[str, str]
     points: tuple[history.Point, ...] = ()  # oldest first
 
@@ -180,12 +179,12 @@ class BiasStore:
         self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=BIASES_VERSION)
 
     def read(self) -> dict[str, KnownImu]:
-        """Read the IMUs; an unusable file is set aside and counts as empty."""
+        """Read the bias histories of all IMUs; an unusable file is set aside and counts as empty."""
         found = self._file.load()
         return {} if found is None else found.imus
 
     def all(self) -> dict[str, KnownImu]:
-        """Read the IMUs; raises StorageError for an unusable file."""
+        """Read the bias histories of all IMUs; raises StorageError for an unusable file."""
         found = self._file.read()
         return {} if found is None else found.imus
 
@@ -200,11 +199,11 @@ _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 class SigningTime(msgspec.Struct, frozen=True):
-    """Latest time used in our signatures. Ticks are 10 us since 2015."""
+    """Latest time used in our MAVLink signatures, in ticks of 10 us since 1 January 2015."""
 
     ticks: int
     reserved: int  # largest tick that may have been used before the next write
-    uptime_s: float  # Uptime of the board at the write
+    uptime_s: float  # Uptime of the board when this file was written
     boot_id: str  # id of the board's boot; empty: unknown
 
 

@@ -1,8 +1,8 @@
 """State files: written atomically, with a checksum, validated when read, and set aside if they are unusable.
 
-No content of a state file may end or block the daemon, or be accepted in part. A FIFO, a device or a folder in its
-place is not even opened. The checksum is the last key of the JSON object: the SHA-256 of the bytes before it. A file of
-a version without checksums is accepted if its content is valid.
+No content of a state file may end or block the daemon, or be accepted in part. A FIFO, a device or a folder in place
+of a file is not even opened. The checksum, the last key of the JSON object, is the SHA-256 of the bytes before it. A
+file without a checksum, from an earlier version, is accepted if its content is valid.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from companion.messages import message
 
 
 def file_error(path: Path, done: str, reason: OSError | Exception | str) -> StorageError:
-    """Make the one-line error for a file or folder that cannot be `done` ("read", "written", "used", ...)."""
+    """Make the one-line error for a file or folder; `done` is what failed: "read", "written", "used", ..."""
     words = getattr(reason, "strerror", None) or reason
     return StorageError(message("file_not_usable", path=path, done=done, reason=words))
 
@@ -80,13 +80,13 @@ def sync_folder(folder: Path) -> None:
 logger = logging.getLogger(__name__)
 
 MOST_BYTES: Final = 2_000_000
-"""Largest accepted state file. The largest written one, with the bias history of eight IMUs, has 1.7 MB at most."""
+"""Largest accepted state file. The largest that we write, the bias history of eight IMUs, has up to 1.7 MB."""
 
 ASIDE: Final = ".unusable"
-MOST_ASIDE: Final = 3  # Most set-aside files of each name; further ones replace the last
+MOST_ASIDE: Final = 3  # Most unusable files stored of each name; a further one replaces the last
 
 UNREADABLE: Final = (ValueError, RecursionError, OverflowError, msgspec.MsgspecError)
-"""Exceptions that may be raised when arbitrary bytes are decoded as JSON of a type."""
+"""Exceptions that may occur when arbitrary bytes are decoded as JSON of a given type."""
 
 _SEAL: Final = re.compile(rb',\s*"sha256":\s*"([0-9a-f]{64})"\s*\}\s*\Z')
 _SEAL_BYTES: Final = 120
@@ -107,7 +107,7 @@ def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
-    """Return the first group of the file names that match, sorted; empty without a folder; raises StorageError."""
+    """List the first regex group of matching file names, sorted; [] without the folder. Raises StorageError."""
     try:
         names = [entry.name for entry in folder.iterdir()]
     except FileNotFoundError:
@@ -118,7 +118,7 @@ def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
 
 
 def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
-    """Return the numbers in the file names that match, ascending; raises StorageError."""
+    """List the numbers in all file names that match `kind`, ascending; raises StorageError."""
     return sorted(map(int, named_in(folder, kind)))
 
 
@@ -134,7 +134,7 @@ def sealed(data: bytes) -> bytes:
 
 
 def unsealed(data: bytes) -> bytes:
-    """Return the JSON without its checksum, if it has one; raise msgspec.ValidationError for a wrong checksum."""
+    """Return JSON without its checksum, if it has one; raise msgspec.ValidationError if the checksum is wrong."""
     seal = _SEAL.search(data, max(0, len(data) - _SEAL_BYTES))
     if seal is None:
         return data
@@ -145,7 +145,7 @@ def unsealed(data: bytes) -> bytes:
 
 
 class StateFile(Generic[T]):
-    """One state file; `check` raises msgspec.ValidationError for impossible content, on reading and on writing."""
+    """One state file. `check` raises msgspec.ValidationError for impossible content, on reading and on writing."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class StateFile(Generic[T]):
         return found
 
     def load(self) -> T | None:
-        """Read the file for the daemon: an unusable file is set aside and logged, and None is returned."""
+        """Read the file; if it is unusable, log that, rename it so that it is not read again, and return None."""
         self.unusable = None
         try:
             return self.read()
@@ -191,7 +191,7 @@ class StateFile(Generic[T]):
         """Replace the content; after a StorageError the old content remains."""
         try:
             data = sealed(msgspec.json.encode(value))
-            # Never replace a readable file by an unreadable one.
+            # Check first: never replace a readable file by an unreadable one.
             self._of(data)
         except UNREADABLE as error:
             raise StorageError(f"{error} ({self.path.name})") from error
@@ -203,7 +203,7 @@ class StateFile(Generic[T]):
 
 
 def set_aside(path: Path) -> str:
-    """Rename an unusable file, so that it is neither read again nor lost; return the result as text."""
+    """Rename an unusable file, so that it is neither read again nor lost; return a text about the result."""
     names = [f"{path.name}{ASIDE}", *(f"{path.name}{ASIDE}-{number}" for number in range(2, MOST_ASIDE + 1))]
     name = next((name for name in names if not os.path.lexists(path.with_name(name))), names[-1])
     with contextlib.suppress(OSError):
@@ -217,7 +217,7 @@ class _Entries(msgspec.Struct, Generic[T], frozen=True):
 
 
 class BoundedList(Generic[T]):
-    """List of the latest `keep` entries in a file, oldest first. Methods but `read` raise StorageError."""
+    """File with the latest `keep` entries of a list, oldest first. All methods but `read` raise StorageError."""
 
     def __init__(self, path: Path, kind: type[T], keep: int) -> None:
         # Files of versions without checksums hold only the list.
@@ -229,15 +229,13 @@ class BoundedList(Generic[T]):
         return _listed(self._file.load())[-self._keep :]
 
     def all(self) -> list[T]:
-        """Return all entries; raises for an unusable file."""
+        """Return all entries; raises StorageError for an unusable file."""
         return _listed(self._file.read())
 
     def append(self, entry: T) -> None:
-        """Add an entry; raises StorageError."""
         self.write([*self.read(), entry][-self._keep :])
 
     def write(self, entries: list[T]) -> None:
-        """Replace the entries; raises StorageError."""
         self._file.write(_Entries(entries))
 
 
@@ -247,11 +245,11 @@ def _listed(found: _Entries[T] | list[T] | None) -> list[T]:
 
 @contextlib.contextmanager
 def only_daemon(directory: Path) -> Iterator[None]:
-    """Lock a storage directory for this process; the kernel unlocks it however the process ends.
+    """Lock a storage directory for this process; the kernel unlocks it when the process ends for any reason.
 
     Two daemons would read each other's journal as an interrupted write. The directory itself is locked, so that no
     lock file is needed. If it cannot be created or locked (network file system), the daemon continues without a lock.
-    Raises StorageError if another daemon has locked it.
+    Raises StorageError if another daemon has locked the directory.
     """
     try:
         directory.mkdir(exist_ok=True)

@@ -1,1 +1,1 @@
-"""Writes to the autopilot: plan, journal, check of the effect, recovery and undo, and other writers."""
+"""Offsets written to the autopilot: plan, journal, check of the effect, recovery, undo, and other writers."""

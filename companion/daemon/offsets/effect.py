@@ -1,6 +1,7 @@
-"""Check of a write's effect: compares the telemetry before and after it with the step that the new offsets must make.
+"""Check of new offsets by telemetry: the IMU output must change by the step that the offset changes predict.
 
-The windows' sigmas include the rounding of integer telemetry; only the short check of far values uses plain means.
+The sigma of each window's mean includes the rounding of integer telemetry. Only the check of PX4's temporary large
+offsets (px4_writes.py), which is short, uses plain means.
 """
 
 from __future__ import annotations
@@ -31,36 +32,36 @@ from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
 
-VERIFY_MAX_S: Final = 60.0  # Longest wait for stillness after the write before its effect counts as not seen
+VERIFY_MAX_S: Final = 60.0  # Longest wait for stillness after a write; then its effect counts as not seen
 VERIFY_ON_DECK_S: Final = 180.0
-"""Longest wait on a deck, where a step takes most of a minute to show."""
+"""Longest wait for a write's effect on a ship or boat, whose motion hides the step for most of a minute."""
 LOOK_S: Final = 10.0
-"""Still time that shows a step, also if a calibration needs a longer one."""
+"""Time without movement after a write that suffices to see its step, even if a calibration needs more."""
 LOOK_LONGER_S: Final = 30.0
-"""Longest observation of a change that a few seconds do not show; beyond it flicker outweighs more averaging."""
+"""Longest observation of a step that noise hides at first: after this time, flicker noise makes averaging useless."""
 TELEMETRY_S: Final = 2.0
-"""Time after a write in which the telemetry may seem to be missing."""
+"""Time after a write during which missing telemetry is no fault: samples during the write were left out."""
 TELEMETRY: Final = "waiting for the telemetry"
-"""Progress text until the write has settled and `TELEMETRY_S` has passed; until then a step looks like movement."""
+"""Progress text shortly after a write, while its own step in the IMU output still looks like movement."""
 UNWATCHED: Final = "this IMU is not in the telemetry"
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[EffectVerdict]]  # Verdicts by IMU
 
-# Flicker assumed of an unknown part between two windows of some ten seconds: an ordinary part's (floors of 8 deg/h and
-# 50 micro-g). With the worst part's, as in sigma_use over minutes, no step could ever be seen.
+# Flicker noise assumed for an unknown IMU model between two windows of some ten seconds: floors of 8 deg/h and 50
+# micro-g, as of an ordinary model. The worst model's flicker, used for sigma_use over minutes, would hide every step.
 ORDINARY_FLICKER: Final[Mapping[Triad, float]] = {"gyro": 8.0 / 0.664 * DEG_H, "accel": 0.05 / 0.664 * MG}
 TOLERANCE_SIGMAS: Final = 2.0
-"""Residual allowed in addition to noise, in sigma_use of the bias."""
+"""Allowed difference from the expected output in addition to noise, as a multiple of sigma_use of the bias."""
 
 
 async def watch_effect(
     core: Core, px4: Px4Writes, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
 ) -> tuple[Verdicts | None, str]:
-    """Wait for still telemetry after a write and judge it; observe longer if a step is nearly visible.
+    """Wait until the aircraft is still after a write, then judge the step; observe longer if it is nearly visible.
 
-    `go_on` is called regularly with a progress text, and ends the wait by raising. `boots`: restarts of the autopilot
-    before the write. Returns verdicts by IMU, and the reason if there are none or they are not final.
+    `go_on` is called regularly with a progress text and may raise to end the wait. `boots`: number of autopilot
+    restarts seen before the write. Returns verdicts by IMU, and the reason if there are none or they are not final.
     """
     watched = [target for target in plan.targets if target.watched]
     if not watched:
@@ -100,7 +101,7 @@ def _in_the_way(core: Core, looked_s: float) -> str:
     status = core.collector.status(now_s)
     words = status.waiting_for or ""
     if words and status.still_s > 0.0:
-        # A step may show in less time than a calibration must be still for.
+        # A step may be visible in less time without movement than a calibration needs.
         moves = core.collector.glance(now_s).obstacle
         words = "" if moves is None else moves.words
         look_s = min(LOOK_S, core.config.calibration.min_still_s)
@@ -120,7 +121,7 @@ def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: W
 
 def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
     found = [verdict for each in verdicts.values() for verdict in each]
-    # Two seconds of scatter do not show the error of their mean: too little for the verdict that a write is wrong.
+    # The scatter of two seconds does not show the error of their mean, so it cannot prove that a write is wrong.
     hasty = looked_s < LOOK_S and not all(verdict.ok for verdict in found)
     # Longer observation can reveal a hidden step that already has at least 3 of the 8 sigmas it needs.
     nearly = any(
@@ -139,10 +140,10 @@ def judge_vectors(
     *,
     apart_s: float = 0.0,
 ) -> list[EffectVerdict]:
-    """Judge the written vectors (accelerometers, gyros, or both) by the telemetry before and after.
+    """Judge the written offset vectors of one IMU (accelerometer, gyro, or both) by the windows before and after.
 
-    If the output followed a far value and then returned from it as expected, the new value is in use, however small the
-    change as a whole. `apart_s`: time between the middles of both windows.
+    On PX4 a small change is in use if the output followed the temporary large offset and then the step to the new one.
+    `apart_s`: time between the middles of both windows.
     """
     gyro_step, accel_step = output_step(target.calibration, target.changes, first.accel_m_s2)
     names, noise = target.calibration.parameters, noise_profile(profile)
@@ -160,7 +161,7 @@ def judge_vectors(
         mean_after, sigma_after, _ = _read(second, triad)
         before, after, warmed = _as_at_end(triad, (first.warming, second.warming), apart_s, mean, mean_after)
         model = noise.of(triad)
-        # Bias drift between the windows (method 2.2, V without its white part).
+        # Bias drift between the windows: docs/reference/method.md section 2.2, V without its white part.
         drift = np.sqrt(floor_variance(min(model.flicker, flicker.get(triad, math.inf)), model.walk, *spans_s))
         observation = Observation(
             parameters=parameters,
@@ -199,7 +200,7 @@ def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
 def _as_at_end(
     triad: Triad, warming: tuple[Warming | None, Warming | None], apart_s: float, before: Vector, after: Vector
 ) -> tuple[Vector, Vector, Array]:
-    """Convert both means to the temperature at the end of the first window; also return that step's sigma, (3,)."""
+    """Correct two windows' means for warm-up to the end of the first; also return the correction's sigma, x y z."""
     first, second = warming
     if first is None:
         return before, after, np.zeros(3)
@@ -214,11 +215,11 @@ def _as_at_end(
 
 
 def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
-    """Limit the sigmas of the later mean from below by the noise before the write.
+    """Raise the sigmas of the mean after a write to at least those expected from the noise before the write.
 
     A write does not change the noise, but the scatter of a few seconds can by chance be a tenth of the true one. If the
-    time before was short too, the limit uses all three axes. Simulated refusals of good writes, 2 s against 2 s: 2 %
-    with a limit for each axis, 0.1 % with the triad's. With 5 s or more before the write: 0.2 % for each axis.
+    window before the write was short too, one limit for all axes is used. In simulations of good writes, windows of 2 s
+    refused 2 % with a limit per axis, 0.1 % with one limit. Windows of 5 s or more before the write refused 0.2 %.
     """
     longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
     triad = float(np.sqrt(np.mean(np.square(before)))) if spans_s[0] < MIN_BATCHES else 0.0

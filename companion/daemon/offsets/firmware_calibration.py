@@ -1,17 +1,15 @@
-"""The firmware's own gyro calibration between the two halves of a write, so that its EKF is right afterwards.
+"""ArduPilot's own gyro calibration as a step of a write: nothing else resets the gyro bias in ArduPilot's EKF.
 
-The order that leaves ArduPilot's EKF right (autopilots 9.3.1): accelerometer offsets; the firmware's gyro calibration,
-which alone resets the EKF's gyro bias; then our fine gyro offsets over its coarse ones. The fine offsets are also
-written before the calibration: a refusal shows while all can still be restored, and if the one command is lost, only
-the reset is missing.
+The best order (docs/reference/autopilots.md section 9.3.1) is accelerometer offsets, then the firmware's coarse gyro
+calibration, then our fine gyro offsets. We write the fine offsets also before the firmware's calibration. If the
+autopilot refuses them, all can still be restored. If the calibration command is lost, only the reset is missing.
 
-The fine offsets are known beforehand: per sample the output is R (raw - offset), so the whole bias in board axes,
-offset + R^-1 residual, does not depend on the present offset. With a temperature calibration it would, as the gyro
-calibration also sets CALTEMP and so changes the correction of `raw`. Then the gyro calibration is left out, and the EKF
-settles by itself.
+The fine offsets are known in advance. The output is R (raw - offset), R from board to vehicle axes. So the whole bias,
+offset + R^-1 residual in board axes, does not depend on the present offset. With ArduPilot's temperature calibration it
+does: the gyro calibration sets CALTEMP and so changes `raw`. We then skip it, and the EKF settles by itself.
 
-The calibration also overwrites gyro offsets that are not part of the plan. All of them are saved before, and restored
-by every roll-back and undo.
+The firmware's calibration also overwrites gyro offsets that are not part of the plan. All of them are saved before it,
+and restored by every roll-back and undo.
 """
 
 from __future__ import annotations
@@ -41,17 +39,17 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 WORTH_RAD_S: Final = 20.0 * DEG_H
-"""Step on any axis above which the calibration is worth rewriting the flash of all instances. A stale EKF bias turns
-the heading by the step times 17 to 25 s (autopilots 9.3.1), here 0.14 deg."""
+"""Gyro offset change, on any axis, above which the firmware's calibration is worth the wear of the flash. A stale EKF
+bias turns the heading by the change times 17 to 25 s (docs/reference/autopilots.md section 9.3.1), here 0.14 deg."""
 SETTLE_RESET_S: Final = 60.0
-"""Longest wait for the EKF after the reset: while the tilt error of the old accelerometer offsets fades, the EKF takes
-part of it for gyro bias. After a step of 30 mg: up to 850 deg/h, settled after 26 s on the real firmware."""
+"""Longest wait for the EKF after the reset of its gyro bias. While the tilt error of the old accelerometer offsets
+fades, the EKF mistakes it for gyro bias: after a step of 30 mg up to 850 deg/h, gone after 26 s on real firmware."""
 SETTLE_ALONE_S: Final = 150.0
-"""Longest wait for the EKF without a reset: EKF3 takes about two minutes (autopilots 9.3.1: 140 s)."""
+"""Longest wait for the EKF without a reset. EKF3 needs about 140 s (docs/reference/autopilots.md section 9.3.1)."""
 
 
 class FirmwareCalibration:
-    """Decides whether a write needs the firmware's gyro calibration, and writes offsets before and after it."""
+    """Write of offsets with the firmware's own gyro calibration in between, if the EKF needs it."""
 
     def __init__(self, core: Core, writer: ParameterWriter, ledger: Ledger) -> None:
         self._vehicle, self._parameters = core.vehicle, core.parameters
@@ -59,9 +57,12 @@ class FirmwareCalibration:
         self._writer, self._ledger, self._ekf = writer, ledger, EkfWatch(core.vehicle)
 
     async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> dict[str, float] | None:
-        """Read the values that the calibration would overwrite; None: leave it out (`warn` is called if TCAL is on)."""
+        """Read the values that the firmware's gyro calibration would overwrite; return None if we do not start it.
+
+        `warn` is called if the reason is that ArduPilot's temperature calibration (TCAL) is on.
+        """
         if not self._vehicle.kind.gyro_calibration_resets_ekf or not gyros or self._on_deck:
-            # On a deck, the firmware's mean of half a second is the deck's rate: wrong offsets for all gyros.
+            # On a deck, the firmware would average half a second of the deck's motion into all gyro offsets.
             return None
         step = max(abs(change.after - change.before) for change in gyros)
         if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:
@@ -74,10 +75,10 @@ class FirmwareCalibration:
         return before
 
     async def write(self, plan: Plan, before: Mapping[str, float], log: WriteLog, go_on: Callable[[str], None]) -> Plan:
-        """Write all offsets, calibrate, write the gyro offsets again; after a failure restore all old values.
+        """Write all offsets, start the firmware's gyro calibration, and write our gyro offsets again over its result.
 
-        Runs in a transaction, which also covers the firmware's further changes. Returns the plan with those changes and
-        the outcome of the calibration; raises the errors of `ParameterWriter.apply`.
+        A failure restores all old values and raises an error of `ParameterWriter.apply`. Call it in a transaction of
+        the write journal. The returned plan includes the firmware's own changes and the outcome of its calibration.
         """
         boots, changes, system_id = self._vehicle.boots, plan.changes, self._vehicle.system_id
         written = await self._writer.apply(changes)
@@ -117,7 +118,7 @@ class FirmwareCalibration:
     async def _restore(
         self, changes: Sequence[Change], before: Mapping[str, float], boots: int, error: CompanionError
     ) -> None:
-        """Restore our old values and all that the firmware may have changed; always raises a WriteFailedError."""
+        """Restore the values that we or the firmware changed, then raise `error` as a WriteFailedError."""
         logger.warning("%s", message("restoring_old_values", reason=error))
         reason = error.reason if isinstance(error, WriteFailedError) else str(error)
         back = [change for change in changes if change.parameter not in before]

@@ -1,7 +1,7 @@
-"""Journal of writes to the autopilot, kept in memory and on disk; recovery of interrupted writes, and undo.
+"""Journal of writes to the autopilot, in memory and on disk; recovery of interrupted writes, and undo of finished ones.
 
-Open: a write is in progress. Orphaned: a write was interrupted (the daemon died, or not all old values could be
-restored), and the recovery has to end it. Undoable: the last finished writes on each vehicle.
+A write is "open" while it is in progress. It is "orphaned" if it was interrupted: the daemon died, or not all old
+values could be restored. `Recovery` ends an orphaned write. The last finished writes on each vehicle are "undoable".
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ POLL_S: Final = 0.2
 
 
 class Ledger:
-    """Journal and undo steps of one storage folder."""
+    """Write journal and undo steps of one storage folder."""
 
     def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
         self._log, self._offload, self.why_yield = log, offload, why_yield
-        """Function that returns the reason not to write because another companion does; None: no reason."""
+        """`why_yield` returns the reason not to write while another companion writes on the same link, or None."""
         self.fault: str | None = None
-        """Reason why old values cannot be saved, so nothing may be written; None: no fault."""
+        """Reason why no old value can be saved on disk, so that no parameter may be written; None: no fault."""
         self._open: ChangeSet | None = None
         self._orphaned = asyncio.Event()
         self._undoable: dict[int, Undoable] = {}
@@ -53,7 +53,7 @@ class Ledger:
         return self._orphaned.is_set()
 
     def load(self) -> None:
-        """Load the files, set damaged ones aside, and check that files can be written. Blocking."""
+        """Load journal and undo files, set damaged ones aside, and check that files can be written; blocks."""
         try:
             self._log.check_writable()
         except StorageError as error:
@@ -90,16 +90,16 @@ class Ledger:
 
     @contextlib.asynccontextmanager
     async def transaction(self, changes: ChangeSet) -> AsyncIterator[None]:
-        """Enclose a write, so that an unfinished one is always handled; this is the only place that does so.
+        """Enclose a write to the autopilot, so that its old values are restored if it does not finish.
 
-        The old values are on disk before the block begins. The block reports its end by `done` or `undone`. A writer's
-        error with nothing left changed means that the autopilot is as before the block. After anything else (a value
-        left changed, a cancellation, a fault of the program, no report) the state is unknown: `Recovery` checks it.
-        `changes`: the changes of the block, if known beforehand; `update_pending` replaces them.
+        The old values are on disk before the block begins. The block calls `done` or `undone` at its end. If it raises
+        an error of the writer that left no parameter changed, the autopilot is as before. After any other end (a value
+        left changed, a cancellation, a program error, neither call), `Recovery` checks and restores the parameters.
+        `changes`: the changes planned in the block; `update_pending` replaces them.
 
         Raises:
-            AutopilotError: an earlier write is still open, or another companion writes here; do not write.
-            StorageError: the changes cannot be saved, or have a name or value that is never written; do not write.
+            AutopilotError: an earlier write is still open, or another companion writes; the block does not run.
+            StorageError: the changes cannot be saved, or include a forbidden name or value; the block does not run.
         """
         if self._open is not None:
             raise AutopilotError(message("restoring_old_values", reason="an earlier write is still open"))
@@ -117,25 +117,25 @@ class Ledger:
             self._leave_to_recovery()
 
     def _leave_to_recovery(self) -> None:
-        """Mark a journal that is still open for `Recovery`, which restores its values once disarmed."""
+        """Leave a write that is still open to `Recovery`, which restores its old values once disarmed."""
         if self._open is not None:
             self._orphaned.set()
 
     async def update_pending(self, changes: ChangeSet) -> None:
-        """Replace the saved changes, before any new change is made; a StorageError leaves the earlier ones saved."""
+        """Save the changes of a write before they are made; after a StorageError the earlier file content remains."""
         if self._open is not None:
             changes = msgspec.structs.replace(changes, origin=self._open.origin)
         await self._offload(self._log.journal.write, changes)
         self._open = changes
 
     async def done(self, changes: ChangeSet) -> None:
-        """End a transaction whose write stays and can be undone from now on. After a StorageError it stays open."""
+        """End a transaction whose new values stay, and save its undo step. A StorageError leaves it open."""
         kept = self._undoable.get(changes.system_id, Undoable(changes.system_id))
         await self._keep(kept.and_then(changes))
         await self.unchanged()
 
     async def undone(self) -> None:
-        """End a write or an undo after which the old values are active. After a StorageError it stays open."""
+        """End a transaction after which the old values are active again. A StorageError leaves it open."""
         if self._open is not None and (kept := self._undoable.get(self._open.system_id)) is not None:
             # The open entry is an undo, or a finished write whose journal was not cleared: drop its undo step.
             left = kept.without(self._open)
@@ -149,14 +149,14 @@ class Ledger:
         self._undoable[undoable.system_id] = undoable
 
     async def unchanged(self) -> None:
-        """End a transaction without effect on the undo steps. After a StorageError it stays open."""
+        """End a transaction and leave the undo steps unchanged. A StorageError leaves it open."""
         await self._offload(self._log.journal.clear)
         self._open = None
         self._orphaned.clear()
 
 
 class Recovery:
-    """Restores interrupted writes, and undoes finished ones."""
+    """Recovery of interrupted writes, and undo of finished ones: both write old values back to the autopilot."""
 
     def __init__(
         self,
@@ -170,10 +170,10 @@ class Recovery:
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self._offload, self._interruptions = core.offload, interruptions_in(core.config.storage.path)
         self.on_recovered: Callable[..., Awaitable[object]] | None = None
-        """Called with a restored write, a text about it, and whether that undid a step (keyword `undone`)."""
+        """Callback after a recovery: changes of the write, text for people, and `undone` if it used up an undo step."""
 
     def interruptions(self) -> list[Object]:
-        """List interrupted writes, the latest first; blocking."""
+        """List interrupted writes, the latest first; reads the disk and blocks."""
         pending = [] if self.ledger.orphaned is None else [Interruption.of(self.ledger.orphaned)]
         return [msgspec.to_builtins(each) for each in (*pending, *reversed(self._interruptions.read()))]
 
@@ -235,11 +235,11 @@ class Recovery:
             logger.warning("%s", message("history_not_kept", what="interrupted write", reason=error))
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
-        """Restore the values from before the last step, all or none; return the step and the restored parameters.
+        """Restore the values from before the last write, all or none; return its changes and the restored parameters.
 
-        `force`: leave values that somebody else has changed since, and restore the rest. Without it such values raise
-        an AutopilotError that lists each with the present value, ours and the old one. After another AutopilotError or
-        a StorageError the new values stay; if some could not be rewritten, `Recovery` ends the undo once disarmed.
+        If somebody else has changed some of these values since, an AutopilotError lists each with the present value,
+        ours and the old one. With `force`, those values stay and the others are restored. After another AutopilotError
+        or a StorageError the newer values stay; if some do not, `Recovery` ends the undo once disarmed.
         """
         if (why := self.why_no_undo()) is not None:
             raise AutopilotError(why)
@@ -268,7 +268,7 @@ class Recovery:
         return step, written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:
-        """Split into changes that are still ours, and texts about values that others have replaced."""
+        """Split changes into those still active in the autopilot, and texts about values that others have replaced."""
         ours: list[Change] = []
         foreign: list[str] = []
         found = await self._read(changes.names)
@@ -289,7 +289,7 @@ class Recovery:
         return ours, foreign
 
     async def _read(self, names: Sequence[str]) -> dict[str, float]:
-        """Read parameters, leaving out those that the autopilot refuses; raises if it does not answer."""
+        """Read parameters, except those that the autopilot refuses; raise AutopilotError if it does not answer."""
         with contextlib.suppress(ParameterRefusedError):
             return await self._parameters.read_many(names)
         found: dict[str, float] = {}

@@ -1,11 +1,11 @@
-"""Other writers of our parameters: companions on the same link, and the autopilot's own calibrations (rivals).
+"""Other writers of the parameters that we write: further companions, and the autopilot's own calibrations ("rivals").
 
-Two companions would write the same parameters and save each other's values as "old" ones, so that no order of undos
-restores the values from before both. Therefore each announces itself, and all but one refuse to write. Companions
-usually share system and component id, and routers do not forward a heartbeat to links where its ids were heard. So each
-announces a random instance number in NAMED_VALUE_INT, which ArduPilot and PX4 forward. The rank uses announced
-constants only, no clocks, so that both agree: a companion that has found itself alone precedes a new one, then the
-lower number precedes the higher.
+Two companions would save each other's values as "old" ones, so that no order of undos restores the values from before
+both. Therefore each companion announces itself, and all but one refuse to write. A heartbeat cannot announce it:
+companions usually share their MAVLink ids, and routers do not forward a heartbeat to links where its ids were heard.
+Each announces a random instance number in NAMED_VALUE_INT, which ArduPilot and PX4 forward. The rank depends on
+announced constants and on no clock, so that all companions agree. A companion that has run alone precedes a new one;
+otherwise the lower number precedes the higher.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ logger = logging.getLogger(__name__)
 NAME: Final = "CMP_INST"
 BEAT_S: Final = 1.0
 SETTLE_S: Final = 6.0
-"""Time after the start within which an already running companion is heard."""
+"""Time after our start within which the announcement of an already running companion must arrive."""
 CONFIRM_S: Final = 0.5
-"""Least time between a companion's first and latest announcement: queued messages of an ended one arrive together."""
+"""Least time over which announcements must arrive: those queued by a companion that has ended arrive together."""
 EXPIRE_S: Final = 12.0
-"""Silence after which a companion is gone: it announces itself every second, and some messages are lost."""
+"""Silence after which another companion counts as gone: it announces itself every second, but messages may be lost."""
 MOST: Final = 8
-"""Most companions remembered, as instance numbers can be forged."""
+"""Most other companions stored: a limit, because messages with forged instance numbers can be sent in any number."""
 INSTANCE_BITS: Final = 30
 
 
@@ -64,7 +64,7 @@ class _Other(msgspec.Struct):
 
 
 class OtherCompanions:
-    """Announces this companion and listens for others; `run` is its task."""
+    """Detection of other companions: announces this one once a second and receives their announcements."""
 
     def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
         self._link, self._say, self._writes = link, say, writes
@@ -101,7 +101,7 @@ class OtherCompanions:
             self._told = words
 
     def _other(self) -> _Other | None:
-        """Return the highest-ranking other companion; None: there is none, or this companion writes nothing."""
+        """Return the highest-ranking other companion; None if there is none, or if this companion never writes."""
         if not self._writes():
             return None
         now_s = asyncio.get_running_loop().time()
@@ -113,25 +113,25 @@ class OtherCompanions:
             return
         instance, is_new, boot_ms = message.value >> 1, bool(message.value & 1), message.time_boot_ms
         if instance == self._instance:
-            return  # an echo of our own
+            return  # our own announcement, sent back
         known = self._others.get(instance)
         if known is None or t_s - known.latest_s >= EXPIRE_S:
             self._others = {number: each for number, each in self._others.items() if t_s - each.latest_s < EXPIRE_S}
             if len(self._others) < MOST:
                 ids = message.get_srcSystem(), message.get_srcComponent()
                 self._others[instance] = _Other(*ids, is_new, instance, boot_ms, t_s, t_s)
-        elif boot_ms != known.boot_ms:  # a copy is no sign of life: routers in a loop repeat messages for ever
+        elif boot_ms != known.boot_ms:  # ignore copies: routers in a loop repeat messages for ever
             known.is_new, known.boot_ms, known.latest_s = is_new, boot_ms, t_s
 
 
 class Rivalry:
-    """Warns of rivals that will overwrite or have overwritten our offsets; switches them off if so configured."""
+    """Warnings about the autopilot's calibrations that overwrite our offsets; disables them if so configured."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._imus, self._say = imus, core.say
-        self.stop_rivals = core.config.push.stop_rivals  # True: the next write switches rivals off
+        self.stop_rivals = core.config.push.stop_rivals  # True: the next write disables these calibrations
         self._told: set[str] = set()
-        """Rivals that were reported to the ground stations since the rivals were switched on; the status lists all."""
+        """Names of active autopilot calibrations ("rivals") that the ground stations were already warned about."""
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 
@@ -147,7 +147,7 @@ class Rivalry:
         return stop(tuple(rivals.values()))
 
     def left_of(self, calibration: ImuCalibration) -> list[str]:
-        """Return the warnings about a calibration, without those of rivals that the next write switches off."""
+        """Return an IMU's warnings without those about autopilot calibrations that the next write will disable."""
         stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
         return [warning for warning in calibration.warnings if warning not in stopped]
 

@@ -1,4 +1,4 @@
-"""Planned parameter changes of one write, and the log of their outcomes."""
+"""Planned parameter changes of one write of offsets, and the log of their outcomes."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from companion.physics.units import MG
 from companion.samples import TRIADS, Triad, rows_of
 
 COARSE_ACCEL_MG: Final = 5.0
-"""Error of the autopilots' own calibrations on a level table; offsets with a larger sigma cause a warning."""
+"""Sigma above which new accelerometer offsets cause a warning: the autopilots' own level calibration is that good."""
 
 AS_GOOD: Final = 1.5
-"""Ratio of expected errors, old to new, up to which old offsets stay: a write would only wear the flash."""
+"""Multiple of the new offsets' expected error up to which old offsets are left: a write would only wear the flash."""
 
 
 @dataclasses.dataclass(slots=True)
 class WriteLog:
-    """Parameters written (by IMU and name) and warnings of one run; after a failure, those up to then."""
+    """Log of one run: parameters written, by IMU and name, and warnings; after a failure, those up to the failure."""
 
     started_at: datetime.datetime = dataclasses.field(default_factory=lambda: datetime.datetime.now(tz=datetime.UTC))
     written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
     warnings: list[str] = dataclasses.field(default_factory=list)
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
-    notes: list[str] = dataclasses.field(default_factory=list)  # Texts added to the result
+    notes: list[str] = dataclasses.field(default_factory=list)  # Texts added to the result of the run
 
     @property
     def started(self) -> str:
@@ -56,21 +56,19 @@ class WriteLog:
 
 
 Residual = tuple[Array | None, Array | None]
-"""Output minus truth, which a write removes: gyro (rad/s) and accelerometer (m/s^2), vehicle FRD; None: not written."""
+"""IMU output error that a write removes: gyro (rad/s), accelerometer (m/s^2); x y z, vehicle FRD; None: not written."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuPlan:
-    """New offsets of one autopilot IMU."""
-
     name: str
     calibration: ImuCalibration
     changes: tuple[Change, ...]
     residual: Residual
     watched: bool
-    """True: telemetry shows this IMU's output, so the effect can be checked."""
+    """True if the telemetry contains this IMU's output, so that the effect of the write can be checked."""
     unseen: tuple[Change, ...] = ()
-    """Changes that together do not change the output."""
+    """Changes that together leave the IMU's output unchanged, so that telemetry cannot show them."""
 
     @property
     def all(self) -> tuple[Change, ...]:
@@ -79,13 +77,11 @@ class ImuPlan:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Plan:
-    """Changes of one write."""
-
     targets: tuple[ImuPlan, ...]
     boots: int
-    """Restarts of the autopilot seen when the plan was made."""
+    """Number of autopilot restarts seen when the plan was made; a later one shows as a larger number."""
     collateral: tuple[Change, ...] = ()
-    """Further changes by the firmware's own gyro calibration: offsets, temperatures and ids of other gyros."""
+    """Changes made by the firmware's own gyro calibration: offsets, temperatures and ids of gyros outside the plan."""
     firmware: GyroOutcome | None = None  # Outcome of the firmware's gyro calibration; None: not used
 
     @property
@@ -122,7 +118,7 @@ def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
 
 
 def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
-    """Raise AutopilotError, and forget the learned slots, if two IMUs seem to share one of PX4's parameter slots."""
+    """Raise AutopilotError if two IMUs seem to use the same PX4 parameters, and forget the learned assignment."""
     owners: dict[str, str] = {}
     for target in targets:
         for name in (*target.calibration.parameters.gyro_offset, *target.calibration.parameters.accel_offset):
@@ -136,10 +132,10 @@ def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
 def as_good(
     calibration: ImuCalibration, found: ImuSolution, shared: Shared, before: ImuRecord | None
 ) -> frozenset[Triad]:
-    """Find the triads whose offsets are as good as new ones, so that a write would only add noise.
+    """Find the sensors (gyro, accelerometer) whose old offsets are as good as new ones: a write would only add noise.
 
-    Such offsets were written by the last calibration and leave a small residual: within the errors of both estimates,
-    or small compared with the drift of the next minutes, which affects old and new offsets alike.
+    Old offsets are as good if the last calibration wrote them and the residual is small: within the errors of both
+    estimates, or small compared with the drift of the next minutes, which affects old and new offsets alike.
     """
     if before is None:
         return frozenset()
@@ -173,7 +169,7 @@ def without(found: ImuSolution, triads: Collection[Triad]) -> ImuSolution:
 
 
 def residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> Residual:
-    """Compute the residual in an autopilot that uses our own IMU, from the IMU's whole bias."""
+    """Compute the output error of our own IMU in an autopilot that uses it, with the present offsets, from the bias."""
     rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
     gyro = accel = None
     if found.gyro_rad_s is not None:

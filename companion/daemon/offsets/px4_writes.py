@@ -1,8 +1,8 @@
-"""Far steps of a write to PX4: they show which IMU's output each offset moves, and which offsets are in use.
+"""Temporary large offsets ("far values") in a write to PX4, which ignores small offset changes.
 
-The slot of each SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in use and its step shows in the
-telemetry of all IMUs. A far step is large compared with noise and truncation, and only one sensor makes one at a time.
-The small change itself would often be invisible.
+Each far value also shows which IMU's output an offset moves. PX4's calibration parameters are numbered by slot, and
+which slot belongs to which SCALED_IMU message is a guess (autopilot/firmware/px4.py) until telemetry of all IMUs shows
+the step. The step is large compared with noise and truncation, and only one sensor makes one at a time.
 """
 
 from __future__ import annotations
@@ -41,35 +41,35 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 RATE_HZ: Final = 50.0
-"""Rate requested for IMUs whose messages are not sent otherwise."""
+"""Message rate requested for IMUs that PX4 does not already stream."""
 HEAR_S: Final = 0.4
 BEFORE_S: Final = 1.0
-"""Time span of telemetry before a far value, for comparison with the telemetry after it."""
+"""Span of telemetry averaged before a temporary large offset, for comparison with the output after it."""
 MEAN_S: Final = 0.4
-"""Time span of telemetry that shows the far value in use, without samples from before it."""
+"""Span of telemetry averaged while a temporary large offset is in use, without samples from before it."""
 PATIENCE_S: Final = 2.5
-"""Longest wait for an effect: if somebody else writes too, PX4 applies our value up to 1 s later."""
+"""Longest wait for the step in the telemetry. If somebody else writes too, PX4 applies our value up to 1 s later."""
 KEPT_S: Final = 4.0
 LEAST_SAMPLES: Final = 5
 MATCH: Final = 0.2
-"""Tolerance of the output's step, as a fraction of the expected one, in addition to steps that PX4 ignores."""
+"""Tolerance of the observed step, as a fraction of the expected one, in addition to changes that PX4 ignores."""
 CHECK_S: Final = 0.1
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ExpectedStep:
-    """Expected step of one IMU's output when PX4 applies a far value in the slot of one of its sensors."""
+    """Expected step of one IMU's output when PX4 applies a temporary large offset ("far value") of one sensor."""
 
     instance: int
     sensor: Triad
     device_id: int
     slot: str
     step: Array
-    """(3,), rad/s or m/s^2, vehicle FRD."""
+    """Expected step of the output, x y z in vehicle FRD; rad/s for a gyro, m/s^2 for an accelerometer."""
     rest: Array
-    """Further step from the far value to all new values, in the same units and frame."""
+    """Expected step from the temporary large offset to all new offsets, x y z, in units and frame of `step`."""
     unknown: float
-    """Fraction of the step by which the offsets in use may have differed from the parameters."""
+    """Uncertainty of the expected step, as a fraction: PX4 may use offsets that differ a little from its parameters."""
 
     def moved(self, made: Array) -> bool:
         return bool(np.linalg.norm(made - self.step) < (self.unknown + MATCH) * np.linalg.norm(self.step))
@@ -79,13 +79,13 @@ class ExpectedStep:
 
 
 Mean = tuple[Array, Array]
-"""Mean of an output and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
+"""Mean of an IMU output and its sigma, each x y z in vehicle FRD, in rad/s or m/s^2."""
 OnTheWay = Mapping[Triad, tuple[Mean, Array]]
-"""Mean output under far values, from integer messages, and the step from there to the new values."""
+"""Mean output under the temporary large offset, in integer messages, and the step to the new offsets, by sensor."""
 
 
 class Px4Writes:
-    """Observes the telemetry during a write with far values, and learns the slots; only PX4 needs far values."""
+    """Observer of the telemetry while temporary large offsets are written to PX4; learns which IMU each one moves."""
 
     def __init__(
         self, link: MavlinkLink, vehicle: Vehicle, writer: ParameterWriter, ledger: Ledger, memory: SlotMemory, say: Say
@@ -94,8 +94,8 @@ class Px4Writes:
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
         self.on_the_way: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
-        """`OnTheWay` of the latest write, by instance, for outputs that moved as expected."""
-        self._learned = False  # True: this write has corrected the slot of a sensor
+        """Means under temporary large offsets in the latest write, by IMU, if the output moved as expected."""
+        self._learned = False  # True: this write has found the true parameter slot of a sensor
         self._boots = 0
         self._samples: defaultdict[int, deque[ImuSample]] = defaultdict(deque)
         self._before: dict[int, Mean | None] = {}
@@ -105,7 +105,10 @@ class Px4Writes:
     async def standing_by(
         self, targets: Sequence[ImuPlan], before: Mapping[str, Vector]
     ) -> AsyncIterator[FarProbe | None]:
-        """Observe a write; yield the probe of far values, or None without any. `before`: accelerometer outputs."""
+        """Observe telemetry during a write; yield the check of temporary large offsets, or None if it needs none.
+
+        `before`: accelerometer outputs before the write, by IMU name.
+        """
         self._learned, self._steps = False, {}
         self.on_the_way.clear()
         for target in targets:
@@ -115,11 +118,11 @@ class Px4Writes:
                 yield self.watch if self._steps else None
         except WriteFailedError as error:
             if self._vehicle.arm_state is ArmState.ARMED:
-                # A far value may be left in place, and while the aircraft is armed nothing may be written.
+                # A temporary large offset may be left, and nothing may be written while the aircraft is armed.
                 for name in self._writer.left_far:
                     self._say(Severity.CRITICAL, _danger(self._steps[name]), Weight.RESULT)
             if error.kind == "wrong slot, orientation or scale" and not self._learned:
-                # The slot was not corrected, so another attempt would use the same one: report it differently.
+                # No other slot was learned, so another attempt would fail too: report a different error.
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
             raise
         # Reached only after a successful write.
@@ -130,9 +133,9 @@ class Px4Writes:
                 self._memory.brought_into_use(names, accel_offset_with(calibration, target.all), self._vehicle.boots)
 
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
-        """Make PX4 apply stored offsets that it may not use, without changing them; return whether there were any.
+        """Make PX4 apply stored offsets that it may not use, and leave their values; return True if there were any.
 
-        After an AutopilotError `Recovery` restores values left changed; after a StorageError nothing was written.
+        After an AutopilotError, `Recovery` restores values left changed. After a StorageError nothing was written.
         """
         unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
         targets = [
@@ -151,13 +154,13 @@ class Px4Writes:
         except WriteFailedError as error:
             if error.kind != "wrong slot, orientation or scale" or error.left_changed:
                 raise
-            # The slot was corrected: the caller reads the offsets again, from another slot.
+            # The true slot was learned: the caller reads the offsets again from there.
         return True
 
     # --- the probe
 
     def watch(self, parameter: str) -> Callable[[], Awaitable[str | None]]:
-        """Store the means before a far value; return the check of its effect (this method is a `FarProbe`)."""
+        """Store mean outputs before a temporary large offset is written; return the function that checks its effect."""
         step = self._steps.get(parameter)
         if step is not None:
             now_s = asyncio.get_running_loop().time()
@@ -166,7 +169,7 @@ class Px4Writes:
         return functools.partial(self._verify, step)
 
     async def _verify(self, step: ExpectedStep | None) -> str | None:
-        """Find the IMU whose output moved, and learn its slot; return the fault if it is not the expected one."""
+        """Find the IMU whose output moved, and learn its parameter slot; return a fault unless it moved as expected."""
         if step is None:
             return None
         since, loop = VehicleTimer(self._vehicle), asyncio.get_running_loop()
@@ -285,13 +288,13 @@ class Px4Writes:
 
 
 def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> dict[str, ExpectedStep]:
-    """Return the expected step for each far value, by parameter; `accel_m_s2`: accelerometer output before."""
+    """Return the expected step of each temporary large offset, by parameter; `accel_m_s2`: output before the write."""
     names, found = calibration.parameters, dict[str, ExpectedStep]()
     new = {change.parameter: change.after for change in changes}
     in_use = {change.parameter: change.before for change in changes}
 
     def output(values: Mapping[str, float], triad: Triad) -> Array:
-        """Return the output minus that before all changes, (3,)."""
+        """Return the change of the output, x y z, when these parameter values replace those before the write."""
         there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
         return np.array(output_step(calibration, there, accel_m_s2)[0 if triad == "gyro" else 1])
 
@@ -309,7 +312,7 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
             found[change.parameter] = ExpectedStep(
                 calibration.instance, triad, device_id, slot, step, output(new, triad) - far, unknown
             )
-        # PX4 uses the whole new vector before the next far value is written.
+        # PX4 uses the whole new vector before the next temporary large offset is written.
         for vector in (names.gyro_offset, names.accel_offset, names.accel_scale):
             if change.parameter in vector:
                 in_use |= {one: new[one] for one in vector if one in new}

@@ -1,8 +1,8 @@
-"""Restarts of the autopilot after a write: on request, and required ("owed") for PX4 while its EKF2 keeps an old tilt.
+"""Restarts of the autopilot after a write: on request, or required because PX4's EKF2 still uses an old tilt.
 
-The tilt is saved across the companion's own restarts. A restart of PX4 while the companion was off shows in PX4's time
-since boot: it is less than at the write, or, if the board has kept running, PX4's boot is later than the write. Without
-either sign, a restart still counts as required: one too many costs a minute.
+A required restart is saved on disk. If PX4 restarted while the companion was off, PX4's time since boot is shorter than
+at the write. If the companion's board kept running, it also shows that PX4 booted after the write. Without either sign
+the restart stays required: one restart too many costs a minute.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from companion.storage.state import StateFile
 logger = logging.getLogger(__name__)
 
 CLOCK_STEP_S: Final = 0.5
-"""Largest apparent step back of the autopilot's clock that late packets cause."""
+"""Tolerance for the autopilot's time since boot: late packets make it seem to step back by up to this much."""
 OWED_POLL_S: Final = 1.0
 POLL_S: Final = 0.2
 STORED_AFTER_S: Final = 3.0
-"""Time for saving: PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots 8)."""
+"""Wait for the autopilot to save parameters: PX4 needs up to 2 s (docs/reference/autopilots.md section 8)."""
 ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
 
 
 class NotRebootedError(AutopilotError):
-    """The autopilot was not restarted; the written values are active nevertheless."""
+    """Error: the autopilot was not restarted; the written values are active nevertheless."""
 
 
 def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -> str | None:
-    """Return the reason why a restart would replace the new offsets; None: it would not."""
+    """Return the reason why the autopilot would replace the new offsets at a restart; None if it would not."""
     after = {change.parameter: change.after for change in changes}
     gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
     for rival in (rival for calibration in calibrations for rival in calibration.rivals):
@@ -57,7 +57,7 @@ def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Cha
 
 
 async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
-    """Restart the disarmed autopilot once its parameters are stored, and wait until it is back.
+    """Restart the disarmed autopilot once its parameters are stored, and wait until it is back and disarmed.
 
     Raises NotRebootedError if it was not restarted, another AutopilotError if it did not come back.
     """
@@ -89,7 +89,7 @@ async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
 
 
 class _Owed(msgspec.Struct, frozen=True):
-    """Tilt kept by PX4's EKF2, with the time of the write; `host`: id of our board's boot (empty: unknown)."""
+    """Required restart of PX4: tilt error of its EKF2 and time of the write; `host`: our board's boot id, or empty."""
 
     system_id: int
     tilt_deg: float
@@ -103,18 +103,17 @@ def owed_in(directory: Path) -> StateFile[_Owed]:
 
 
 class RebootOwed:
-    """Remembers that PX4 must be restarted; `run` forgets it after the restart."""
+    """Memory, also on disk, that PX4 must be restarted before flight; `run` clears it after the restart."""
 
     def __init__(self, core: Core) -> None:
         self._vehicle, self._offload, self._core = core.vehicle, core.offload, core
         self._file, self._host = owed_in(core.config.storage.path), this_boot()
         self._owed: _Owed | None = None
         self._boots = 0
-        """Number of restarts seen when the restart became required, or was loaded from the file."""
+        """Number of autopilot restarts seen when another became required; 0 if that was in an earlier run."""
         self._from_earlier_run = False
 
     def load(self) -> None:
-        """Load the file; blocking."""
         self._owed = self._file.load()
         self._from_earlier_run = True
 
@@ -130,11 +129,11 @@ class RebootOwed:
             self._core.say(Severity.WARNING, f"Before flight: {words}", Weight.RESULT)
 
     async def after(self, changes: Sequence[Change]) -> None:
-        """Decide whether written changes require a restart; raise StorageError if that cannot be saved."""
+        """Note that PX4 must be restarted if these changes require it; raise StorageError if that cannot be saved."""
         stale_deg = self._vehicle.kind.stale_tilt_deg(changes)
         if stale_deg == 0.0:
             return
-        # After a large step, a small one does not reduce the tilt that the EKF keeps.
+        # A small offset change does not reduce the tilt error that an earlier, larger one left in the EKF.
         left_deg = self._owed.tilt_deg if self._owed is not None and self.words is not None else 0.0
         tilt_deg = max(left_deg, stale_deg)
         now_s, (boot_s, _) = asyncio.get_running_loop().time(), self._vehicle.boot.latest or (0.0, 0.0)

@@ -1,7 +1,7 @@
-"""Writing to the autopilot: journal, write with read-back, check of the effect; a failure restores the old values.
+"""Writes to the autopilot: saved in a journal, read back, and checked in the telemetry; a failure restores old values.
 
-Calibrations, alignments and temperature curves write through `Offsets`. An undo, and `Px4Writes.make_sure`, use only
-the journal's transaction.
+Calibrations, alignments and temperature curves write through `Offsets`. An undo, and `Px4Writes.make_sure`, write
+directly, but inside a transaction of the journal.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ from companion.storage.changes import ChangeLog, ChangeSet, Origin
 logger = logging.getLogger(__name__)
 
 DISARMED_WITHIN_S: Final = 10.0
-"""Longest wait for a heartbeat if none was heard just before the write."""
+"""Longest wait for a heartbeat before a write, if it is not known whether the aircraft is armed."""
 WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 CONCLUDING_PERCENT: Final = 95.0
 READ_ATTEMPTS: Final = 3
 
 Note = Callable[[Mapping[str, WrittenParameter], Collection[str]], None]
-"""Callback that gets restored parameters with their outcomes, and the names of those not restored."""
+"""Callback after a roll-back: restored parameters with their outcomes, and names of those that were not restored."""
 
 
 class Offsets(Subsystem):
-    """Writes plans, each as a whole or not at all; wires journal, recovery, restarts and checks for other writers."""
+    """Writer of offset plans, each as a whole or not at all; it owns journal, recovery, restarts and related checks."""
 
     def __init__(self, core: Core, devices: Devices) -> None:
         vehicle, imus = core.vehicle, devices.imus
@@ -99,7 +99,7 @@ class Offsets(Subsystem):
         ]
 
     async def offsets_still_hold(self) -> bool:
-        """Read the offsets again; return False if they may differ from those during the measurement (`make_sure`)."""
+        """Read the offsets again; return False if those in use during the measurement may have been different."""
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()
@@ -108,7 +108,7 @@ class Offsets(Subsystem):
     # --- any write
 
     async def begin(self, job: Job, parameters: int) -> None:
-        """Announce a write of `parameters` values; raise NotDisarmedError unless the autopilot is surely disarmed."""
+        """Report the start of a write of `parameters` values; raise NotDisarmedError if armed or not connected."""
         job.check_cancelled()
         self._machine.on(Event.WRITE)
         job.progress(MEASURED_PERCENT, message("write_in_progress", count=parameters, what="parameters"))
@@ -123,12 +123,12 @@ class Offsets(Subsystem):
         verify: Callable[[], Awaitable[None]],
         note: Note = lambda _written, _failed: None,
     ) -> None:
-        """Write in a journal transaction; keep the values only if `verify` passes and the undo step is saved.
+        """Write in a journal transaction; roll back unless `verify` passes and the undo step can be saved.
 
-        The old values are on disk before `apply` starts. `apply` returns all changes in order, including the firmware's
-        own. `verify` raises if the new values must not stay. `imus`: those whose output changes. `note` gets restored
-        parameters. Raises CompanionError, or the JobCancelledError of `verify`; the text has the cause and the outcome
-        of the roll-back.
+        The old values are on disk before `apply` starts. `apply` writes, and returns all changes in order, including
+        the firmware's own. `verify` raises if the new values must not stay. `imus`: those whose output changes. `note`
+        is called with the parameters that a roll-back restored. Raises CompanionError, or the JobCancelledError of
+        `verify`; the text has the cause and the outcome of the roll-back.
         """
         system_id = self._vehicle.system_id
         async with self.ledger.transaction(ChangeSet.of(system_id, changes, origin=origin)):
@@ -144,7 +144,7 @@ class Offsets(Subsystem):
                 raise AutopilotError(await self._roll_back(made, imus, str(error), note)) from error
 
     async def _roll_back(self, made: Sequence[Change], imus: Collection[AutopilotImu], reason: str, note: Note) -> str:
-        """Restore the old values; return a text with the reason and the outcome."""
+        """Restore the old values of the changes `made`; return a text with the reason and the outcome."""
         left: Sequence[str] = ()
         outlook = "restored once disarmed"
         with contextlib.suppress(NotDisarmedError):
@@ -182,10 +182,10 @@ class Offsets(Subsystem):
     # --- a write of offsets
 
     async def write(self, job: Job, plan: Plan, before: Window, log: WriteLog, go_on: GoOn | None = None) -> Plan:
-        """Write offsets, read them back, and check that the telemetry makes the expected step.
+        """Write offsets, read them back, and check that the IMU output makes the expected step.
 
-        `before`: the window measured under the old offsets. `log` receives the outcomes. `go_on` replaces the job's
-        progress during the check. Returns the plan with the firmware's own changes; raises the errors of `commit`.
+        `before`: window measured under the old offsets. Outcomes are added to `log`. `go_on` replaces the job's own
+        progress report. Returns the plan with the firmware's own changes; raises the errors of `commit`.
         """
         await self.begin(job, len(plan.changes))
         gyros = await self._firmware.prepare(plan.gyros, log.warnings.append)
@@ -256,7 +256,7 @@ class Offsets(Subsystem):
     # --- after a write that stays
 
     async def settle(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> None:
-        """Restart the autopilot if requested; otherwise wait until its EKF agrees with the new offsets.
+        """Restart the autopilot if the job requests it; otherwise wait until its EKF agrees with the new offsets.
 
         Raises AutopilotError if the autopilot does not come back, or comes back with other values.
         """
@@ -291,7 +291,7 @@ class Offsets(Subsystem):
             raise AutopilotError(message("wrong_after_restart", problems=f"{', '.join(changed)} replaced"))
 
     async def _restart(self, job: Job, plan: Plan, before: Window, log: WriteLog) -> str:
-        """Restart the autopilot and check that the new offsets are active; return why it was not restarted, or ""."""
+        """Restart the autopilot and check the new offsets; return the reason if it was not restarted, otherwise ""."""
         go_on = job.going_on(CONCLUDING_PERCENT, "watching the telemetry after the reboot")
         self._machine.on(Event.REBOOT)
         try:
@@ -321,13 +321,13 @@ class Offsets(Subsystem):
 
 
 def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict], log: WriteLog) -> list[str]:
-    """Log the outcomes of one IMU's parameters; return the faults as texts."""
+    """Log the outcomes of one IMU's parameters by the verdicts of the check; return the faults as texts."""
     hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
     if hidden:
         log.warn(target.name, message("change_too_small_to_see", parameters=", ".join(hidden)))
     for verdict in verdicts:
         log.warn(target.name, *verdict.problems)
-        # A vector is in use if its step as a whole was seen: an axis that hardly changed cannot show more.
+        # Three offsets are in use if their step as a whole was seen: an axis that hardly changed shows no step.
         seen = verdict.ok and not verdict.hidden
         for name in verdict.axes:
             plan.mark(log, [name], "verified" if seen else verdict.outcome(name))
