@@ -1,1 +1,1 @@
-"""Byte transport: serial ports, sockets and the MAVLink codec; every link reconnects by itself after a loss."""
+"""Byte transport: serial ports, sockets and MAVLink; every link reconnects by itself after a loss."""

@@ -1,4 +1,4 @@
-"""Detection of a port's device by its bytes: a sensor, an autopilot, or something else.
+"""Detection of a port's device from its bytes: a sensor, an autopilot, or something else.
 
 Every decoder of the registry reads the bytes; the decoder that accepts the most frames wins.
 """
@@ -38,7 +38,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A protocol that may have produced the bytes."""
+    """Protocol that may have produced the received bytes, with its counts of frames."""
 
     protocol: str
     kinds: tuple[Kind, ...]
@@ -82,7 +82,7 @@ def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
 
 
 def strangers(data: bytes) -> str | None:
-    """Name a device that is no sensor: a login console, a program that sends modem commands, an autopilot."""
+    """Describe a device that is no sensor: a login console, a program that sends modem commands, an autopilot."""
     if _CONSOLE.search(data):
         return "a login console or kernel messages"
     if _MODEM.search(data):
@@ -97,7 +97,7 @@ def plain_share(data: bytes) -> float:
 
 
 def is_mavlink(data: bytes) -> bool:
-    """Return whether the bytes hold several MAVLink packets in a row without a gap."""
+    """Return whether the bytes hold `_MAVLINK_RUN` MAVLink packets in a row without a gap."""
     for start in range(len(data)):
         at = start
         for _ in range(_MAVLINK_RUN):
@@ -148,7 +148,7 @@ class Heartbeat:
 
 
 def heartbeats(data: bytes) -> list[Heartbeat]:
-    """List the senders of whole HEARTBEATs, autopilots first, each once.
+    """List the senders of complete HEARTBEATs, autopilots first, each once.
 
     One HEARTBEAT confirms the baud rate. Its last byte is never zero, so MAVLink 2 never truncates its nine bytes.
     """

@@ -1,4 +1,4 @@
-"""Protocols by their names in the configuration, and their devices' default line settings.
+"""Protocols by their names in the configuration, and default line settings of their devices.
 
 A decoder returns the tilt of a frame once, as `TiltSample` or in its `CompassSample`; `part_for` splits it by role.
 """
@@ -35,9 +35,9 @@ Kind = Literal["imu", "gradienter", "compass"]
 
 @dataclass(frozen=True, slots=True)
 class ProtocolInfo:
-    """One protocol for one kind of device: its decoder, and the factory setting of its line.
+    """Protocol as used by one kind of device: its decoder, and the factory setting of the serial line.
 
-    `sigma_deg` (of tilt, or of a level heading) and `tilted_sigma_deg` apply unless the configuration sets them.
+    The configuration may set `sigma_deg` (of tilt, or of a level heading) and `tilted_sigma_deg` to other values.
     """
 
     name: str
@@ -91,7 +91,7 @@ DEVICES: Final[dict[ProtocolInfo, dict[Kind, dict[str, Any]]]] = {
     # No default law: the compass' frame would have "euler", the inclinometer's frame probably "axis".
     ProtocolInfo("rion", 9600, RionDecoder, RionDialogue): {"gradienter": {}, "compass": {}},
 }
-"""One device of each protocol, with the settings that differ by the kind for which it is used."""
+"""Devices, one per protocol, each with the kinds that it can be used as and the settings that differ by kind."""
 
 _KINDS: Final[tuple[Kind, ...]] = ("imu", "gradienter", "compass")
 PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {
@@ -103,7 +103,7 @@ PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {
 
 
 def main_kind(name: str) -> Kind:
-    """Return the main use of a device; raise ConfigError for an unknown protocol."""
+    """Return the main kind of a protocol's device; raise ConfigError for an unknown protocol."""
     kinds: tuple[Kind, ...] = ("compass", "imu", "gradienter")
     for kind in kinds:
         if name in PROTOCOLS[kind]:
@@ -112,7 +112,7 @@ def main_kind(name: str) -> Kind:
 
 
 def part_for(role: Kind, sample: Sample) -> Sample | None:
-    """Return the part of a sample that a role uses; None: there is none."""
+    """Return the part of a sample that a device in this role provides; None: no such part."""
     match sample:
         case ImuSample():
             return sample if role == "imu" else None

@@ -20,9 +20,9 @@ SPAN_S: Final = 2.0
 GUESS_EVERY_S: Final = 5.0
 STUCK_S: Final = 1.0
 STUCK_SAMPLES: Final = 20
-"""Equal IMU readings in a row that prove a fault: one of six channels always changes. A gradienter may repeat one."""
+"""Equal IMU readings in a row that prove a fault: one of six channels always changes. A tilt sensor may repeat one."""
 NEAR_DEG: Final = 0.5
-"""Largest angle within which readings count as unchanged for `near_since_s`: motion itself may have caused a hang."""
+"""Largest difference of readings that counts as unchanged (`near_since_s`): the motion itself may cause a hang."""
 
 _HARMLESS: Final = frozenset(
     {
@@ -47,7 +47,7 @@ _MOST_DAMAGE_NAMED: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """A fault: its key for counters, and one line for people."""
+    """Fault of a stream: its key for counters, and one line of text for people."""
 
     key: str
     words: str
@@ -58,7 +58,7 @@ _Counts = tuple[int, Counter[str]]  # frames accepted, and rejected by reason
 
 
 class StreamHealth:
-    """Monitor of one stream; `protocol`: its name in the configuration."""
+    """Monitor of the bytes and samples of one sensor; `protocol`: its name in the configuration."""
 
     def __init__(self, protocol: str, decoder: Decoder) -> None:
         self._protocol, self._decoder = protocol, decoder

@@ -1,10 +1,11 @@
-"""ArduPilot: parameters of IMUs, temperature, level, heading, gate and ports, and their peculiarities.
+"""ArduPilot: names, ranges and peculiarities of the parameters that the companion reads or writes.
 
-R is the board orientation, AHRS_ORIENTATION (autopilots 1.2). AHRS_TRIM rotates the reported attitude only, not IMU
-data. A calibration does not change `CALTEMP`, so that new = old + residual holds (recipe (a) of autopilots 1.6).
+R, the rotation from the IMU's axes to the vehicle's, comes from AHRS_ORIENTATION (docs/reference/autopilots 1.2).
+AHRS_TRIM rotates the reported attitude only, not IMU data. A calibration leaves CALTEMP unchanged, so a new offset is
+the old offset plus the residual (recipe (a) of docs/reference/autopilots 1.6).
 
-INS_TCALn_* (AP_InertialSensor_tempcal.cpp, autopilots 10.1) corrects a reading in the IMU's axes. Here d is the
-temperature minus 35 degC, and both temperatures are limited to TMIN and TMAX:
+The temperature calibration INS_TCALn_* (AP_InertialSensor_tempcal.cpp, docs/reference/autopilots 10.1) corrects a
+reading in the IMU's axes. Here d is the temperature minus 35 degC, and both temperatures are limited to TMIN and TMAX:
 
     raw - (P(d) - P(d at CALTEMP)) - offset,    P(d) = (c1 d + c2 d^2 + c3 d^3) 1e-6
 
@@ -45,7 +46,7 @@ from companion.rotations import ROTATION_NAMES
 from companion.samples import Vector
 
 INSTANCES: Final = (1, 2, 3, 4, 5)
-"""IMU instances; 4 and 5 exist from 4.4 on boards with auxiliary IMUs, and no message carries their samples."""
+"""Numbers of IMUs; 4 and 5 exist since ArduPilot 4.4 for auxiliary IMUs. No message carries their samples."""
 
 AT_START: Final = "INS_GYR_CAL"  # 1: the gyros are calibrated at every start
 
@@ -55,7 +56,7 @@ _TCAL_ON: Final = 1
 _TCAL_LEARNING: Final = 2
 
 TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
-"""Roll and pitch of the board relative to the aircraft, rad; they correct the attitude, not IMU data."""
+"""Parameters for roll and pitch of the board in the aircraft, rad; they correct the attitude, not IMU data."""
 _TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")  # ArduPilot's own limits
 _TCAL_RANGE: Final = Range(-1e6, 1e6)  # millionths of rad/s or m/s^2 per K, K^2 or K^3
 
@@ -72,10 +73,10 @@ _CUSTOM_NAMES: Final = {
 
 
 class ArduPilotParameters(ImuParameters):
-    """Parameter names of one IMU, numbered from 1; the patterns of 1, and of 4 and 5, differ (autopilots 1.1)."""
+    """Parameter names of IMU 1 to 5; the names of IMU 1, 4 and 5 are irregular (docs/reference/autopilots 1.1)."""
 
     def __init__(self, instance: int) -> None:
-        """Make the names; raise AutopilotError if there is no such instance."""
+        """Make the names; raise AutopilotError if ArduPilot has no IMU with this number."""
         if instance not in INSTANCES:
             reason = f"allowed are {', '.join(map(str, INSTANCES))}"
             raise AutopilotError(message("autopilot_has_no_imu", imu=instance, reason=reason))
@@ -92,14 +93,14 @@ class ArduPilotParameters(ImuParameters):
         )
         self.use = f"{ins}USE{n}"
         self.gyro_caltemp, self.accel_caltemp = caltemp.format("GYR"), caltemp.format("ACC")
-        """Temperature at which the correction is zero, deg C; -300: unknown, which ArduPilot limits to TMIN."""
+        """Temperature at which the temperature correction is zero, deg C; -300: unknown, and ArduPilot uses TMIN."""
         self.tcal_enable, self.tcal_low, self.tcal_high = f"{tcal}ENABLE", f"{tcal}TMIN", f"{tcal}TMAX"
-        """Names of ENABLE (0 off, 1 on, 2 learning until the next boot), TMIN and TMAX."""
+        """Switch of the correction (0 off, 1 on, 2 learning until the next boot), lowest and highest temperature."""
         self.tcal_gyro = [_xyz(f"{tcal}GYR{power}_") for power in (1, 2, 3)]  # Coefficients by power of the temperature
         self.tcal_accel = [_xyz(f"{tcal}ACC{power}_") for power in (1, 2, 3)]
         coefficients = (name for names in (*self.tcal_accel, *self.tcal_gyro) for name in names)
         self.tcal = (self.tcal_low, self.tcal_high, *coefficients, self.tcal_enable)
-        """All names except the CALTEMPs, which the firmware's own calibrations set; the switch is the last."""
+        """Parameters of the temperature correction, the switch last; without CALTEMP, which ArduPilot sets itself."""
 
 
 def _xyz(stem: str) -> Names:
@@ -117,12 +118,12 @@ def _ranges() -> dict[str, Range]:
 
 
 class ArduPilot(Firmware):
-    """Copter, Plane and Rover with EKF3."""
+    """ArduPilot's Copter, Plane and Rover with the estimator EKF3."""
 
     name: FirmwareName = "ardupilot"
     words = "ArduPilot"
     mav_autopilot = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-    heartbeat_rate_hz = 5.0  # at 1 Hz an arming would show too late (autopilots 5.1)
+    heartbeat_rate_hz = 5.0  # at 1 Hz an arming would show too late (docs/reference/autopilots 5.1)
     integers_bytewise = False
     settle_s = 1.0  # new offsets show within 60 ms (20 Hz filter); the rest is for slower links
     write_s = 5.0  # 4 s, including its own gyro calibration
@@ -141,7 +142,7 @@ class ArduPilot(Firmware):
         (0x31, 0x31): "adis16470",
         (0x34, 0x34): "icm42688p",
     }
-    """Parts by device types, from AP_InertialSensor_Backend.h, DevTypes."""
+    """IMU models by the device types of gyro and accelerometer (AP_InertialSensor_Backend.h, DevTypes)."""
 
     def compass_ratio(self, message: Any) -> float:
         fit = message.flags & mavlink.EKF_ATTITUDE and not message.flags & mavlink.EKF_UNINITIALIZED
@@ -189,10 +190,10 @@ class ArduPilot(Firmware):
         accel: Polynomial | None,
         degc: float,
     ) -> list[Change]:
-        """Plan curves with reference 35 degC; from then on the offsets apply at `degc`.
+        """Plan the changes that write temperature curves (reference 35 degC) and make the offsets hold at `degc`.
 
-        Without a new curve for the accelerometers, an active one stays, limited to the new span. An inactive one is
-        cleared, as ENABLE would activate it together with the gyros'.
+        Without a new accelerometer curve, an active old curve stays, limited to the new temperature span. An inactive
+        old curve is cleared, because ENABLE would switch it on together with the gyros' curve.
         """
         assert gyro.reference_degc == REFERENCE_DEGC
         names, thermal = ArduPilotParameters(calibration.instance), calibration.thermal
@@ -255,7 +256,7 @@ class ArduPilot(Firmware):
         return found.get("EK3_SRC1_YAW") == _EXTNAV
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
-        """Check that EKF3's yaw comes from its compass: while it waits for our heading it reports 0 deg as good."""
+        """Check that EKF3's yaw comes from its compass. While EKF3 waits for our heading, it reports 0 deg as good."""
         return await parameters.read_optional("EK3_SRC1_YAW") in (None, _COMPASS)
 
     # --- arming
@@ -285,7 +286,7 @@ class ArduPilot(Firmware):
 
 
 async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
-    """Read the temperature calibration of one IMU; if switched off, or not built in, its correction is zero."""
+    """Read one IMU's temperature calibration; if switched off or not built in, the correction is zero."""
     names = ArduPilotParameters(instance)
     enable = await parameters.read_integer(names.tcal_enable)
     if enable is None:
@@ -315,7 +316,7 @@ async def _read_thermal(parameters: Parameters, instance: int) -> Thermal:
 
 
 async def _read_board_rotation(parameters: Parameters) -> Matrix:
-    """Read the matrix from the board's axes to the vehicle's FRD.
+    """Read the rotation matrix, (3, 3), from the board's axes to the vehicle's FRD axes.
 
     Raises:
         AutopilotError: an unknown orientation, a custom one that is not active, or an error of `Parameters.read`.

@@ -2,8 +2,8 @@
 
 A new firmware is a subclass of `Firmware` in a file of its own, and an entry in `firmwares.FIRMWARES`.
 
-A plain `Firmware` stands for an autopilot not heard yet, `OtherFirmware` for an unsupported one. Their answers are "no"
-or a reason as text; nothing is measured or written there.
+A plain `Firmware` represents an autopilot without a heartbeat yet, `OtherFirmware` an unsupported one. Their methods
+return "no" or refuse with a reason, so that the companion measures and writes nothing.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from companion.samples import Triad, Vector
 
 
 class Firmware:
-    """One firmware. Methods that read parameters raise AutopilotError if one cannot be read."""
+    """Properties of one firmware. Methods that read parameters raise AutopilotError if one cannot be read."""
 
     name: FirmwareName | None = None
     words = "autopilot"
@@ -43,7 +43,7 @@ class Firmware:
     faster_log = ""
 
     def compass_ratio(self, message: Any) -> float:
-        """Return the compass innovation divided by its gate, from an `estimator_message`; 0: not compared."""
+        """Return the compass innovation divided by its gate, from an `estimator_message`; 0: nothing compared."""
         return 0.0
 
     # --- calibration of an IMU, and its write
@@ -51,7 +51,7 @@ class Firmware:
     ranges: Mapping[str, Range] = {}  # allowed values of every parameter that a calibration or its undo writes
     rivals: tuple[Rival, ...] = ()
     parts: Mapping[tuple[int, int], Profile] = {}
-    """Catalogue names by the device types of gyro and accelerometer, which each firmware numbers differently."""
+    """IMU models by the device types of gyro and accelerometer; each firmware numbers device types its own way."""
     settle_s = 2.0  # time after a write in which the telemetry may still show the old offsets
     write_s = 5.0
     gyro_calibration_resets_ekf = False  # its own gyro calibration resets the EKF's gyro bias, which AHRS shows
@@ -60,11 +60,11 @@ class Firmware:
     level_turns_imus = False  # the level rotates the IMUs' data, not only the reported attitude
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
-        """Read the autopilot's corrections of one of its IMUs (1 to 3); see `firmwares.read_calibration`."""
+        """Read offsets, scales and other corrections that the autopilot applies to IMU `instance` (1 to 3)."""
         raise AutopilotError(message("firmware_not_supported", what="calibration"))
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
-        """Return the tilt that the EKF may keep from before these changes until a restart; 0: no restart needed."""
+        """Return the tilt error that the EKF may keep after these changes until a restart; 0: no restart needed."""
         return 0.0
 
     async def thermal_changes(
@@ -75,13 +75,13 @@ class Firmware:
         accel: Polynomial | None,
         degc: float,
     ) -> list[Change]:
-        """Plan curves over temperature that do not change the output at the temperature `degc`."""
+        """Plan the changes that write curves over temperature; the IMU's output at `degc` stays unchanged."""
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
     ) -> tuple[list[Change], Matrix]:
-        """Plan the level for a board's tilt; also return the resulting rotation of up, (3, 3), vehicle axes."""
+        """Plan the level for a measured tilt; also return the rotation that it adds, (3, 3), in vehicle axes."""
         raise AutopilotError(message("firmware_not_supported", what="level"))
 
     # --- heading from outside; `found`: values of `heading_names`
@@ -97,7 +97,7 @@ class Firmware:
         return False
 
     def missing_compass(self, found: Mapping[str, float]) -> str | None:
-        """Return the parameter that disables a compass which the firmware needs, or None."""
+        """Return the parameter that switches off a compass which the firmware needs; None: the compass is on."""
         return None
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
@@ -111,31 +111,31 @@ class Firmware:
     async def find_gate_problem(
         self, parameters: Parameters, system_id: int | None, script_starts_s: float
     ) -> str | None:
-        """Return the settings missing for the gate (the autopilot asks before it arms), as text; None: none.
+        """Return the settings still missing for the autopilot to ask us before it arms, as text; None: none missing.
 
-        `script_starts_s`: time to wait for a script that does not run yet.
+        `script_starts_s`: wait before a second check if the script on the autopilot does not run yet.
         """
         return message("no_arm_authorisation")
 
     # --- the port, and ground stations behind it
 
     def port_needs(self, baud: int) -> str | None:
-        """Return the settings that the autopilot's end of a serial line needs; None: unknown."""
+        """Return the parameters that the autopilot needs for its end of our serial line, as text; None: unknown."""
         return None
 
     async def read_closed_links(self, parameters: Parameters) -> list[str]:
         return []
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
-        """Return whether it is no fault that no ground station is heard, and a text with cause and remedy."""
+        """Explain why no ground station is received: return True if that is no fault, and cause and remedy as text."""
         return True, message("no_ground_station_heard", why="none connected?")
 
     # --- derived from the values above
 
     async def read_rivals(self, parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
-        """Read the rivals that are switched on, and those switched off that act until the next boot.
+        """Read the active parameters that overwrite our offsets, also those switched off that act until the next boot.
 
-        `seen` is kept between calls: the number of the boot in which each parameter was last seen switched on.
+        `seen` is stored between calls: the number of the boot in which each parameter was last found switched on.
         """
         found: list[Rival] = []
         seen = {} if seen is None else seen
@@ -150,10 +150,10 @@ class Firmware:
         return tuple(found)
 
     def heading_names(self) -> list[str]:
-        """List the parameters that the checks and plans for the heading need.
+        """List the parameters that decide whether the firmware uses our heading.
 
         Raises:
-            AutopilotError: no autopilot heard yet, or an unsupported firmware.
+            AutopilotError: no heartbeat of the autopilot yet, or an unsupported firmware.
         """
         if self.name is None:
             raise AutopilotError(message("no_heartbeat_of_the_autopilot"))
@@ -182,8 +182,6 @@ class Firmware:
 
 
 class OtherFirmware(Firmware):
-    """An autopilot with an unsupported firmware."""
-
     name = "other"
 
 
@@ -191,8 +189,8 @@ class OtherFirmware(Firmware):
 class HeadingSetting:
     """One parameter that the firmware needs to use our heading, and the reason.
 
-    `bits`: set the bits of `value` and leave the others. `like`: another parameter, whose value is wanted; if that does
-    not exist, `value` is wanted.
+    `bits`: set the bits of `value` and leave the other bits. `like`: another parameter, whose value is wanted; if that
+    parameter does not exist, `value` is wanted.
     """
 
     parameter: str
@@ -208,7 +206,7 @@ class HeadingSetting:
 
 
 Net = Literal["script", "command", "autopilot", "none"]
-"""Party that switches to another heading when ours ends; "command": the companion, by a command."""
+"""Party that switches the autopilot to another heading source when our heading ends; "command" means the companion."""
 
 NETS: Final[dict[Net, str]] = {
     "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
@@ -221,7 +219,7 @@ NO_IMU: Final = 0
 
 
 class SlotMemory:
-    """Facts learned from writes: the IMU of each device and, since the last restart, offsets in use and rivals."""
+    """Memory of each device id's IMU and, since the last restart, of offsets in use and of what overwrites them."""
 
     def __init__(self) -> None:
         self._instance_of: dict[tuple[Triad, int], int] = {}
@@ -230,25 +228,25 @@ class SlotMemory:
         self.rivals: dict[str, int] = {}
 
     def learn(self, sensor: Triad, device_id: int, instance: int) -> None:
-        """Note that the offsets in this device's slot act on this IMU's telemetry (NO_IMU: on none)."""
+        """Note that the offsets of this device change the telemetry of IMU `instance` (NO_IMU: of no IMU)."""
         for other in [key for key, known in self._instance_of.items() if key[0] == sensor and known == instance]:
             if instance != NO_IMU:
                 del self._instance_of[other]
         self._instance_of[sensor, device_id] = instance
 
     def known(self, sensor: Triad, device_id: int) -> int | None:
-        """Return the IMU learned for a device; NO_IMU: none in the telemetry; None: not learned."""
+        """Return the IMU learned for a device; NO_IMU: it changes no telemetry; None: not learned yet."""
         return self._instance_of.get((sensor, device_id))
 
     def holds_strangers(self, sensor: Triad, imus: int) -> bool:
-        """Return whether there are more slots in use than IMUs: one may belong to an absent sensor."""
+        """Check for more parameter slots in use than IMUs: a slot may then belong to a sensor that was removed."""
         return self.enabled.get(sensor, 0) > imus
 
     def forget(self) -> None:
         self._instance_of.clear()
 
     def brought_into_use(self, names: Names, vector: Vector, boots: int) -> None:
-        """Note that a vector of offsets was written with a far step, so the firmware uses it until a restart."""
+        """Note that the firmware uses these offsets until a restart, because they were written with a large step."""
         self._in_use[names] = (boots, vector)
 
     def in_use(self, names: Names, vector: Vector, boots: int) -> bool:

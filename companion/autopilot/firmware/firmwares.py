@@ -27,12 +27,12 @@ UNHEARD: Final = Firmware()
 OTHER: Final = OtherFirmware()
 
 CALIBRATION: Final[Mapping[str, Mapping[str, Range]]] = {str(one.name): one.ranges for one in FIRMWARES}
-"""Every parameter that a calibration or its undo may write, by firmware; no other is saved, or accepted from a
-file."""
+"""Range of every parameter that a calibration or its undo may write, by firmware and name. No other parameter is saved,
+or accepted from a file."""
 
 
 def firmware_named(name: FirmwareName | None) -> Firmware:
-    """Return the firmware of a name; None: not heard yet."""
+    """Return the firmware with this name; None: no heartbeat of the autopilot yet."""
     return UNHEARD if name is None else next((one for one in FIRMWARES if one.name == name), OTHER)
 
 
@@ -41,10 +41,10 @@ def firmware_with(mav_autopilot: int) -> Firmware:
 
 
 async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory | None = None) -> ImuCalibration:
-    """Read the autopilot's corrections of one of its IMUs (1 to 3).
+    """Read offsets, scales and other corrections that the autopilot applies to IMU `instance` (1 to 3).
 
     Raises:
-        AutopilotError: no such IMU, an implausible value, no answer, or a restart meanwhile.
+        AutopilotError: no such IMU, an implausible value, no answer, or the autopilot restarted meanwhile.
     """
     boots, firmware, memory = parameters.boots, firmware_named(parameters.firmware), memory or SlotMemory()
     found = await firmware.read_calibration(parameters, instance, memory)
@@ -72,14 +72,14 @@ def outcomes_of(triad: Triad, written: Mapping[str, WrittenParameter]) -> set[Ou
 
 
 def part_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int | None) -> Profile | None:
-    """Return the catalogue name of the part with these device ids of gyro and accelerometer; None: unknown."""
+    """Return our catalogue's name of the IMU with these device ids of gyro and accelerometer; None: unknown."""
     if gyro_id is None or accel_id is None:
         return None
     return firmware_named(firmware).parts.get((_type_in(gyro_id), _type_in(accel_id)))
 
 
 def model_of(firmware: FirmwareName | None, gyro_id: int | None, accel_id: int | None) -> str | None:
-    """Return the model of an IMU: the catalogue name, otherwise firmware and types in hex; None: unknown."""
+    """Return an IMU's model: its name in our catalogue, otherwise firmware and device types in hex; None: unknown."""
     if not gyro_id or not accel_id or firmware is None:
         return None
     types = f"{_type_in(gyro_id):#04x}-{_type_in(accel_id):#04x}"

@@ -1,12 +1,12 @@
-"""Corrections of one IMU inside an autopilot, and the algebra of its offsets; the same for every firmware.
+"""Corrections that an autopilot applies to one IMU, and the algebra of its offsets, common to all firmwares.
 
-Per sample a firmware computes, with R its rotation from the IMU's axes to the vehicle's (autopilots 1.2, 4.1):
+Firmware computes samples with R, the rotation from IMU to vehicle axes (docs/reference/autopilots 1.2, 4.1):
 
     gyro  = R (raw - gyro_offset)
     accel = R diag(accel_scale) (raw - accel_offset)
 
-so offsets are in the IMU's own axes, before scale and rotation. A temperature calibration, if active (`Thermal`),
-corrects `raw` first. Names, R and the use of a value are specific to each firmware.
+Offsets are therefore in the IMU's own axes, before scale and rotation. An active temperature calibration (`Thermal`)
+corrects `raw` first. Parameter names, R and the use of a value are specific to each firmware.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from companion.samples import Triad, Vector
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rival:
-    """A parameter that makes the autopilot overwrite our gyro offsets, at any value but 0.
+    """Parameter that makes the autopilot overwrite our gyro offsets, unless it is 0.
 
-    `at_start`: acts only at a start of the autopilot. `from_boot`: read only at a boot, so switching it off has no
-    effect before the next one. `value`: as read; 0: switched off, but acts until the next boot. `accelerometers`: also
-    overwrites their offsets.
+    `at_start`: overwrites only at a start of the autopilot. `from_boot`: read only at a boot, so switching it off has
+    no effect before the next boot. `value`: as read; 0: switched off, but active until the next boot. `accelerometers`:
+    also overwrites accelerometer offsets.
     """
 
     parameter: str
@@ -62,12 +62,13 @@ def stop(rivals: Sequence[Rival]) -> list[Change]:
 
 
 MAX_GYRO_RESIDUAL_RAD_S: Final = 5.0 * DEG
-"""Largest gyro residual that can be a bias; more means a moving aircraft or a broken sensor. ArduPilot regards 5 deg/s
+"""Largest gyro residual accepted as a bias; more means a moving aircraft or a broken sensor. ArduPilot regards 5 deg/s
 between two gyros as a fault ("Gyros inconsistent"), and current MEMS gyros start within 1 deg/s."""
 
 MAX_ACCEL_RESIDUAL_M_S2: Final = 1.0
-"""Largest accelerometer residual. The worst accelerometers in use are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical
-axis); ArduPilot refuses to arm at 0.75 m/s^2 between two. A wrong mounting or gradienter law soon exceeds the limit."""
+"""Largest accelerometer residual accepted as a bias. The worst accelerometers in use are specified at 80 mg (0.8 m/s^2,
+MPU-6000, vertical axis). ArduPilot refuses to arm if two differ by 0.75 m/s^2. A wrong mounting, or a wrong setting of
+a tilt sensor, soon exceeds the limit."""
 
 MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG  # the loosest zero-rate specification of gyros in use (MPU-6000)
 
@@ -76,12 +77,12 @@ MAX_ACCEL_OFFSET_M_S2: Final = 3.5  # documented range of ArduPilot's INS_ACCOFF
 ACCEL_SCALE_RANGE: Final = (0.8, 1.2)  # documented range of ArduPilot's INS_ACCSCAL, which ArduPilot does not enforce
 
 FAR_GYRO_RAD_S: Final = 0.022
-"""Step of a far value, 1.3 deg/s: more than twice the step that PX4 ignores, and 22 digits of SCALED_IMU.
+"""Step that makes PX4 use new gyro offsets, 1.3 deg/s: over twice the step it ignores, and 22 digits of SCALED_IMU.
 
-PX4 ignores a vector that differs by no more than 0.01 (rad/s, m/s^2) from the one in use (autopilots 4.2), and may read
-the parameters between any two writes. So the value in use may differ by 0.01 from the stored one, and a step of twice
-that on one axis makes PX4 use the whole vector. The axis is the one nearest to the vehicle's vertical: a wrong value
-there turns the heading, but does not tilt.
+PX4 ignores a vector that differs by at most 0.01 (rad/s, m/s^2) from the one in use (docs/reference/autopilots 4.2).
+PX4 may read the parameters between any two writes, so the value in use may differ by 0.01 from the stored one. A step
+of more than twice that on one axis makes PX4 use the whole vector. The axis is the one nearest to the vehicle's
+vertical: a wrong value there turns the heading, but does not tilt.
 """
 FAR_ACCEL_M_S2: Final = 0.09  # 9 digits of SCALED_IMU: the least step that `parameters.verify` can detect
 FAR_SCALE: Final = 0.022
@@ -110,7 +111,7 @@ class Range:
 
 # The ranges include any value that an autopilot may have had before, as an undo restores it, but no nonsense.
 _GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
-"""Largest offset that a calibration can still turn into a plausible one, and a far step beyond it."""
+"""Largest gyro offset that a calibration can still make plausible, plus the step to an intermediate value."""
 _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
@@ -122,7 +123,7 @@ SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
 
 @dataclasses.dataclass(kw_only=True)
 class ImuParameters:
-    """Names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2; id 0: no device."""
+    """Names of the parameters that correct one IMU: X, Y, Z in rad/s and m/s^2, and device ids (0: no device)."""
 
     gyro_offset: Names
     accel_offset: Names
@@ -141,7 +142,7 @@ def offset_ranges(names: ImuParameters) -> dict[str, Range]:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Thermal:
-    """Temperature calibration of one IMU: the correction subtracted from its readings, in the IMU's axes."""
+    """Temperature calibration of one IMU: curves that the firmware subtracts from its readings, in the IMU's axes."""
 
     enabled_by: str = ""  # parameter that has switched it on; empty: not active
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -149,13 +150,13 @@ class Thermal:
     accel: Polynomial = NOTHING
 
     def taken_off(self, degc: float | None) -> tuple[Array, Array]:
-        """Return the corrections of gyro and accelerometer, rad/s and m/s^2, (3,); zero if `degc` is unknown."""
+        """Return the corrections of gyro and accelerometer, (3,) each, rad/s and m/s^2; zero if `degc` is unknown."""
         return (np.zeros(3), np.zeros(3)) if degc is None else (self.gyro.at(degc), self.accel.at(degc))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ImuCalibration:
-    """Corrections of one IMU in the autopilot, as read."""
+    """Corrections that the autopilot applies to one IMU, as read from its parameters."""
 
     instance: int  # 1 to 3: the IMU whose telemetry they affect
     parameters: ImuParameters
@@ -167,7 +168,7 @@ class ImuCalibration:
     orientation: Matrix  # 3x3, the IMU's axes to the vehicle's FRD: R
     thermal: Thermal = Thermal()
     zero_is_uncalibrated: bool = False  # three accelerometer offsets of exactly zero mean "not calibrated"
-    far_axis: int | None = None  # axis of the far value that makes the firmware use small changes; None: not needed
+    far_axis: int | None = None  # axis with an intermediate value, so that small changes are used; None: not needed
     scale_unused_within: float = 0.0  # after a start, the firmware does not use scales within this distance of 1
     accel_offset_may_be_unused: bool = False  # the firmware may use other offsets than its parameters hold
     rivals: tuple[Rival, ...] = ()
@@ -186,12 +187,12 @@ class ImuCalibration:
         return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
 
     def in_use(self, accel_scale: Vector | None = None) -> Array:
-        """Return the scales that the firmware uses, (3,), if its parameters hold these (default: those read)."""
+        """Return the scales, (3,), that the firmware uses if `accel_scale` (default: as read) is in its parameters."""
         scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)
         return np.ones(3) if np.linalg.norm(scale - 1.0) <= self.scale_unused_within else scale
 
     def output(self, gyro_rad_s: Vector, accel_m_s2: Vector, degc: float | None) -> Array:
-        """Return the firmware's output for a raw reading, both in vehicle FRD: (6,), rad/s and m/s^2."""
+        """Convert a raw reading to the firmware's output, (6,), rad/s and m/s^2; both are in vehicle FRD."""
         rotation, (thermal_gyro, thermal_accel) = self.orientation, self.thermal.taken_off(degc)
         gyro = np.asarray(gyro_rad_s) - rotation @ (thermal_gyro + self.gyro_offset_rad_s)
         board = rotation.T @ np.asarray(accel_m_s2) - thermal_accel - self.accel_offset_m_s2
@@ -200,14 +201,14 @@ class ImuCalibration:
     def subtracted(self, degc: float | None) -> Array:
         """Return the bias that offsets and temperature calibration remove from the output, (6,), vehicle FRD.
 
-        It is R (gyro_offset + gyro_thermal) and R diag(accel_scale) (accel_offset + accel_thermal) at `degc`.
+        Formulas: R (gyro_offset + gyro_thermal) and R diag(accel_scale) (accel_offset + accel_thermal) at `degc`.
         """
         rotation, (gyro, accel) = self.orientation, self.thermal.taken_off(degc)
         force = np.asarray(self.accel_scale) * (accel + self.accel_offset_m_s2)
         return np.concatenate((rotation @ (gyro + self.gyro_offset_rad_s), rotation @ force))
 
     def thermal_change(self, triad: Triad, degc: float, then_degc: float) -> Array:
-        """Return the change of one triad's temperature correction between two temperatures, (3,), vehicle FRD."""
+        """Return the change of a triad's temperature correction from `degc` to `then_degc`, (3,), vehicle FRD."""
         half = 0 if triad == "gyro" else 1
         change = self.thermal.taken_off(then_degc)[half] - self.thermal.taken_off(degc)[half]
         return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
@@ -226,7 +227,7 @@ class ImuCalibration:
 
 
 def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Vector:
-    """Return the offset that removes a residual (output minus truth, FRD): gyro_offset + R^-1 residual, float32."""
+    """Return the offset that removes a residual (output - true value, FRD): gyro_offset + R^-1 residual, float32."""
     _require_plausible(calibration, "gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S)
     step = calibration.orientation.T @ np.asarray(residual_rad_s)
     after = _vector(np.asarray(calibration.gyro_offset_rad_s) + step)
@@ -235,7 +236,7 @@ def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Ve
 
 
 def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Vector:
-    """Return accel_offset + diag(1/accel_scale) R^-1 residual, float32; never the three zeros of "uncalibrated"."""
+    """Return the offset accel_offset + diag(1/accel_scale) R^-1 residual, float32; never 0, 0, 0 ("uncalibrated")."""
     _require_plausible(calibration, "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2)
     step = (calibration.orientation.T @ np.asarray(residual_m_s2)) / np.asarray(calibration.accel_scale)
     after = _vector(np.asarray(calibration.accel_offset_m_s2) + step)
@@ -248,7 +249,7 @@ def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Ve
 def changes_for(
     calibration: ImuCalibration, gyro_residual_rad_s: Vector | None, accel_residual_m_s2: Vector | None
 ) -> list[Change]:
-    """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None keeps a triad's own.
+    """Plan new offsets, accelerometers first (docs/reference/autopilots 9.3); residual None: leave those offsets.
 
     Raises:
         CalibrationRefusedError: a value beyond the limits at the top of this file.
@@ -267,7 +268,7 @@ def changes_for(
 def vector_changes(
     names: Names, before: Vector, after: Vector, far_axis: int | None = None, step: float = 0.0
 ) -> list[Change]:
-    """Plan the changes of one vector; `far_axis` gets a far value, `step` above the larger of old and new."""
+    """Plan the changes of one vector; axis `far_axis` first goes to `step` above the larger of old and new value."""
     vias = [
         max(b, a) + step if axis == far_axis else None for axis, (b, a) in enumerate(zip(before, after, strict=True))
     ]
@@ -275,10 +276,11 @@ def vector_changes(
 
 
 def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: Vector) -> list[Change]:
-    """Plan offsets and scales that remove a bias and a scale error from the output, in the IMU's axes.
+    """Plan accelerometer offsets and scales that remove a bias and a scale error, both in the IMU's axes.
 
-    With output = (1 + scale) truth + bias, they are offset + bias / accel_scale, and accel_scale / (1 + scale). If the
-    firmware would not use such scales after a start, they become 1, and the offsets are right for a level aircraft.
+    If the output is (1 + scale) true value + bias, new offsets are offset + bias / accel_scale, and new scales are
+    accel_scale / (1 + scale). If the firmware would not use the new scales after a start, they become 1, with offsets
+    right for a level aircraft.
 
     Raises:
         CalibrationRefusedError: a value beyond the limits at the top of this file.
@@ -304,7 +306,7 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
 def output_step(
     calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
 ) -> tuple[Vector, Vector]:
-    """Return the step of the output that the changes must cause: rad/s and m/s^2, vehicle FRD.
+    """Return the step of the IMU's output that the changes must cause: rad/s and m/s^2, vehicle FRD.
 
     `accel_m_s2`: accelerometer output before the changes, which a change of scale multiplies.
     """

@@ -1,4 +1,4 @@
-"""IMU messages of both autopilots, and samples made from them (units, resolution, IMU: autopilots 2, 4.5)."""
+"""IMU messages of both autopilots, and samples made from them (units: docs/reference/autopilots 2, 4.5)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,12 @@ MRAD: Final = 1e-3
 
 
 def all_zero(sample: ImuSample) -> bool:
-    """Return whether every reading is zero, as of an absent IMU: no real accelerometer reads exactly zero."""
+    """Check that all readings are zero, as of an absent IMU: a real accelerometer never reads exactly zero."""
     return not any(sample.gyro_rad_s) and not any(sample.accel_m_s2)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ImuMessage:
-    """A message that may carry an IMU's samples."""
-
     name: str
     message: type[Message]
     decode: Callable[[Message, float], ImuSample | str]  # returns the sample in a message, or why there is none
@@ -101,7 +99,7 @@ SCRIPT: Final = {
     )
     for instance in (1, 2, 3)
 }
-"""Messages of ArduPilot's script: means of four readings, calibrated and filtered, about eleven a second."""
+"""Messages of our script on ArduPilot, by IMU: means of four calibrated, filtered readings, about eleven a second."""
 
 PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias", lacks_bias=True)
 """HIGHRES_IMU of the IMU that PX4 uses for flight. PX4 subtracts EKF2's estimate of the bias, so at rest the message
@@ -110,14 +108,14 @@ shows no bias until that estimate is read and added again (`telemetry.px4_consol
 TEMPERATURE_AGE_S: Final = 5.0  # HIGHRES_IMU lacks the IMU's temperature, which the integer messages carry
 _LATE_S: Final = 0.5  # a device time that goes back by less means a late message; by more, a restart
 _WALK: Final = np.repeat([2.4e-6, 3e-5], 3)
-"""Random walk of the EKF's bias estimate in one second at rest, rad/s and m/s^2: 0.5 deg/h and 3 micro-g (real PX4: 0.2
-to 0.5 deg/h)."""
+"""Random walk of EKF2's bias estimate in one second at rest, (6,), rad/s and m/s^2: 0.5 deg/h and 3 micro-g. A real PX4
+has 0.2 to 0.5 deg/h."""
 
 Six = tuple[float, float, float, float, float, float]
 
 
 class EkfBiasReading(msgspec.Struct, frozen=True):
-    """Bias that PX4's EKF subtracts in HIGHRES_IMU, as read at its console."""
+    """Bias that PX4's EKF2 subtracts in HIGHRES_IMU, as read at PX4's console."""
 
     bias: Six  # gyro in rad/s, accelerometer in m/s^2
     variance: Six
@@ -132,14 +130,14 @@ class EkfBiasReading(msgspec.Struct, frozen=True):
 
 
 class ImuSamples:
-    """Completes the samples of one IMU's messages. It reads no clock: messages carry the time."""
+    """Adds temperature and bias to the samples of one IMU's messages. It reads no clock: messages carry the time."""
 
     def __init__(self) -> None:
         self.temperature: tuple[float, float] | None = None  # deg C and its time; None: no value since the restart
         self._device_s: dict[str, float] = {}
 
     def accept(self, message: str, sample: ImuSample) -> bool:
-        """Note the sample's temperature; return False if the message is repeated or late."""
+        """Store the sample's temperature; return False if the message is repeated or late."""
         device_s = sample.t_device_s or 0.0
         if -_LATE_S < device_s - self._device_s.get(message, -math.inf) <= 0.0:
             return False

@@ -1,15 +1,16 @@
-"""PX4: parameters of IMUs, level, heading, gate and ports, and PX4's use of their values (autopilots 4).
+"""PX4: names, ranges and peculiarities of the parameters that the companion uses (docs/reference/autopilots 4).
 
     R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT)    of an internal sensor
     R = R(SENS_BOARD_X/Y/Z_OFF) R(CAL_*_ROT)         of an external one
 
-so the level adjustment, unlike ArduPilot's trim, rotates IMU data. Thermal compensation, TC_* (autopilots 10.2), is
-neither read nor written: common boards are built without it. If active, it counts as a part of the sensor.
+R rotates the sensor's axes to the vehicle's, so the level adjustment, unlike ArduPilot's trim, rotates IMU data.
+Thermal compensation, TC_* (docs/reference/autopilots 10.2), is neither read nor written: common boards are built
+without it. If active, it counts as a part of the sensor.
 
-A sensor's offsets are in the slot with its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3 show the pairs
-of gyro and accelerometer in the order in which their drivers started, and no message has a device id (autopilots 4.1,
-4.5). PX4 prefers the slot of the same number, so the order of the slots is a good guess. The telemetry after a write
-shows whether it was right, and `SlotMemory` keeps that by device id.
+A sensor's offsets are in the slot with its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, SCALED_IMU2 and
+SCALED_IMU3 show the pairs of gyro and accelerometer in the order in which their drivers started. No message has a
+device id (docs/reference/autopilots 4.1, 4.5). PX4 prefers the slot of the same number, so the order of the slots is a
+good guess. The telemetry after a write shows whether it was right, and `SlotMemory` stores that by device id.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ _LEVEL_RANGE: Final = Range(-45.0, 45.0, unit="deg")
 _TC_RANGE: Final = Range(-10.0, 10.0)  # rad/s, and rad/s per K, K^2 or K^3
 
 IGNORED_STEP: Final = 0.01
-"""Largest change of a vector of offsets (rad/s, m/s^2) that PX4 ignores (autopilots 4.2), also of a vector of scales:
-`set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. At a start PX4 begins with scales of 1."""
+"""Largest change of an offset vector (rad/s, m/s^2) that PX4 ignores (docs/reference/autopilots 4.2), also of a scale
+vector: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. At a start PX4 begins with scales of 1."""
 MARGIN: Final = 1.05  # factor on `IGNORED_STEP`, as both sides round to 32 bits
 GATED_TILT_DEG: Final = 0.3
-"""Least tilt kept by EKF2 from before a write that requires a restart; the biases of an uncalibrated sensor cause
-smaller ones (autopilots 9.3)."""
+"""Least tilt error that requires a restart if EKF2 keeps it after a write. Biases of an uncalibrated sensor cause
+smaller ones (docs/reference/autopilots 9.3)."""
 
 _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
@@ -110,15 +111,13 @@ def _ranges() -> dict[str, Range]:
 
 
 class PX4(Firmware):
-    """PX4 with EKF2."""
-
     name: FirmwareName = "px4"
     words = "PX4"
     mav_autopilot = mavlink.MAV_AUTOPILOT_PX4
     late_heartbeat_on_request = True  # heartbeats come once a second: a lost one leaves the arm state unknown
     integers_bytewise = True
     takes_nan_position = True
-    settle_s = 2.0  # PX4 reads its parameters at most once a second (autopilots 9.2)
+    settle_s = 2.0  # PX4 reads its parameters at most once a second (docs/reference/autopilots 9.2)
     write_s = 8.0  # vectors are written one after another: 7 s for one IMU
     imu_messages = {1: (PX4_FLOATS, SCALED), 2: (PX4_FLOATS, SCALED2), 3: (PX4_FLOATS, SCALED3)}
     tells_ekf_bias = True
@@ -156,7 +155,7 @@ class PX4(Firmware):
         )
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
-        """Return the tilt error that remains in EKF2, which learns a step of level or accelerometers very slowly."""
+        """Return the tilt error left in EKF2, which learns a step of level or accelerometers very slowly."""
         turned_deg = math.hypot(*(change.after - change.before for change in changes if change.parameter in LEVEL))
         step: dict[str, float] = {}
         for change in changes:
@@ -257,13 +256,13 @@ def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tu
 
 
 def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
-    """Return whether PX4 will not use this vector after a start: it ignores small differences from zero then."""
+    """Check that PX4 will not use this vector after a start, because it ignores small differences from zero."""
     return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Slot:
-    """One slot that holds a device id."""
+    """Parameter slot (CAL_GYROn or CAL_ACCn) that holds a device id."""
 
     number: int
     device_id: int
@@ -275,7 +274,7 @@ class Slot:
 
 
 async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
-    """Read all slots with a device id, in order. Raises the errors of `Parameters.read_optional`."""
+    """Read all parameter slots with a device id, in order. Raises the errors of `Parameters.read_optional`."""
     found: list[Slot] = []
     for number in range(SLOTS):
         device_id = await parameters.read_integer(f"{PREFIX[sensor]}{number}_ID")
@@ -288,7 +287,7 @@ async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
 def choose_slot(
     memory: SlotMemory, sensor: Triad, instance: int, slots: Sequence[Slot], like: int | None = None
 ) -> Slot:
-    """Choose the slot of an IMU (1 to 3) among the slots with a device id: the known one, otherwise the best guess.
+    """Choose an IMU's slot (1 to 3) among the slots with a device id: the learned one, otherwise the best guess.
 
     `like`: device id of the IMU's other sensor, equal if one chip has both. Raises AutopilotError if there is no slot.
     """
@@ -325,7 +324,7 @@ async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Mat
 
 
 async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:
-    """Read the rotation from a sensor's axes to the vehicle's, without the level adjustment."""
+    """Read the rotation, (3, 3), from a sensor's axes to the vehicle's, without the level adjustment."""
     own = await parameters.read_integer(f"{PREFIX[sensor]}{slot.number}_ROT")
     internal = slot.bus == _SIMULATION_BUS or (slot.bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
     number = await parameters.read_integer("SENS_BOARD_ROT") if internal else own

@@ -1,1 +1,1 @@
-"""The autopilot's parameters: reads, writes one by one while disarmed, and the check of a write's effect."""
+"""Interface to the autopilot's parameters, planned changes of them, and the check of a write's effect."""

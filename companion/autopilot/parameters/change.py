@@ -1,6 +1,6 @@
-"""Parameters as firmwares read them, their values as 32 bit floats, and changes of them.
+"""Interface to the autopilot's parameters, their values as 32 bit floats, and planned changes of them.
 
-PX4 ignores a small change of a vector of offsets, unless one of them makes a far step first (`Change.via`).
+PX4 ignores a small change of a vector of offsets, unless one axis first makes a large step (`Change.via`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def implausible(name: str, value: str, wanted: str) -> AutopilotError:
 
 
 class Parameters(abc.ABC):
-    """Parameters read by name, from an autopilot or from a log; `ParameterClient` documents the errors.
+    """Interface to read parameters from an autopilot or from a log; `ParameterClient` documents the errors.
 
     `boots` counts the restarts of the autopilot seen so far; `firmware` is None before the first heartbeat.
     """
@@ -74,10 +74,10 @@ class Parameters(abc.ABC):
 
     @abc.abstractmethod
     async def ensure_same_boot(self, boots: int, doing: str) -> None:
-        """Request the time since boot; raise AutopilotRebootedError if the autopilot restarted during `doing`."""
+        """Request the time since boot; raise AutopilotRebootedError (with `doing`) if it restarted since `boots`."""
 
     async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
-        """Read three numbers within limits, such as `SCALES`; raise AutopilotError if one is outside."""
+        """Read three numbers, each from `low` to `high`; raise AutopilotError if one is outside."""
         x, y, z = [await self.read(name) for name in names]
         for name, value in zip(names, (x, y, z), strict=True):
             if not math.isfinite(value) or not low <= value <= high:
@@ -107,7 +107,7 @@ FailureKind = Literal[
 
 
 POLL_S: Final = 1.1
-"""Time after which every module of PX4 has read a new value: they read at most once a second (autopilots 9.2). If
+"""Time after which every module of PX4 has read a new value: at most once a second (docs/reference/autopilots 9.2). If
 nothing was written for twice this time, each module reads the next value at once."""
 
 _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
@@ -117,8 +117,8 @@ _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
 class Change:
     """Old and new value of one parameter, rounded to float32.
 
-    `via` is a far value, for firmware that ignores a small change of a vector of parameters. The far value is written
-    first; once the firmware uses it, the new value follows. A restore goes through the far value too.
+    `via`: intermediate value, far enough away for firmware that ignores a small change of a vector. It is written
+    first, and the new value once the firmware uses it. A restore goes through the intermediate value too.
     """
 
     parameter: str
@@ -164,10 +164,10 @@ class NothingWrittenError(NotDisarmedError):
 
 
 class WriteFailedError(AutopilotError):
-    """Write of a set of parameters that did not succeed as a whole.
+    """Write of several parameters that failed; the old values were restored as far as possible.
 
-    `written` has every parameter of the set: "rolled_back" (restored) or "failed" (never written, or not restored; then
-    `read_back` is the present value, if known). `left_changed` names those whose old value may not be restored.
+    `written` has every parameter: "rolled_back" (restored) or "failed" (never written, or not restored; then
+    `read_back` is the present value, if known). `left_changed` names parameters that may still be changed.
     """
 
     def __init__(
@@ -182,17 +182,15 @@ class WriteFailedError(AutopilotError):
 
 
 FarProbe = Callable[[str], Callable[[], Awaitable[str | None]]]
-"""Callback with the name of a parameter, just before its far value (`Change.via`) is written; returns a verification.
+"""Callback that gets a parameter's name just before its intermediate value (`Change.via`) is written.
 
-The verification compares the telemetry after the far value with that before. It returns the reason to restore the old
-values, or None.
+The callback returns a verification, which compares the telemetry before and after that write. The verification returns
+the reason to restore the old values, or None.
 """
 
 
 @dataclasses.dataclass(slots=True)
 class PendingChange:
-    """State of one parameter during a write."""
-
     change: Change
     sent: bool = False  # a PARAM_SET was sent: the autopilot may have the new value
     confirmed: bool = False  # the autopilot confirmed a value of ours: a different one found later is somebody else's
@@ -202,11 +200,11 @@ class PendingChange:
     left: bool = False  # True: the old value may not be restored
 
 
-PendingVector = tuple[PendingChange, list[PendingChange]]  # the axis with a far value, and the others
+PendingVector = tuple[PendingChange, list[PendingChange]]  # the axis with an intermediate value, and the others
 
 
 def by_vector(items: Sequence[PendingChange]) -> tuple[list[PendingChange], list[PendingVector]]:
-    """Split into parameters that need no far value, and vectors that need one; keep the order."""
+    """Split into parameters without an intermediate value, and vectors with one; the order stays."""
     vectors: dict[str, PendingVector] = {
         _AXIS.sub("", item.change.parameter): (item, []) for item in items if item.change.via is not None
     }

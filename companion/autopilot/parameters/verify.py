@@ -1,13 +1,13 @@
 """Effect of written offsets, judged from the telemetry before and after.
 
-A correct read-back proves nothing about the value in use: PX4 stores a small change and still uses the old value, and a
-wrong orientation or sign moves the wrong axis (autopilots 4.2, 8.6). So the step of the output is compared with the
-expected one in the axes of the parameters (the board's), so that a verdict names a parameter. The remaining residual is
-judged in the vehicle's axes.
+A correct read-back proves nothing about the value in use. PX4 stores a small change and still uses the old value, and a
+wrong orientation or sign moves the wrong axis (docs/reference/autopilots 4.2, 8.6). So the step of the output is
+compared with the expected one in the axes of the parameters (the board's), and a verdict names a parameter. The
+remaining residual is judged in the vehicle's axes.
 
-An axis can distinguish "the whole step" from "no step" if the expected step is at least 8 sigma, 4 for each hypothesis;
-a correct axis is called wrong once in 16000. A matched filter over the three axes estimates the fraction of the step
-that was made; it can detect a step that is too small on each axis alone.
+On an axis, "the whole step" differs clearly from "no step" if the expected step is at least 8 sigma, 4 for each. A
+correct axis is called wrong once in 16000. A matched filter over the three axes estimates the fraction of the step that
+was made, also if the step is too small to see on each single axis.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _REFUTED: Final = ("not seen", "wrong")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Observation:
-    """One vector (rate or specific force) of one IMU before and after a write.
+    """Mean rate or specific force of one IMU before and after a write.
 
-    Means and sigmas are in the vehicle's FRD. Each sigma is that of the mean and includes the drift of the sensor
-    between the two windows. `expected_step`: from `imu_calibration.output_step`.
+    Vectors are in the vehicle's FRD axes. Each sigma is that of the mean and includes the drift of the sensor between
+    the two measurements. `expected_step` comes from `imu_calibration.output_step`.
     """
 
     parameters: Names
@@ -57,7 +57,7 @@ class Observation:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class EffectVerdict:
-    """Verdict on one vector."""
+    """Verdict on the effect of a write on one vector (rate or specific force)."""
 
     axes: Mapping[str, AxisWord]
     fraction_sigma: float | None  # sigma of the fraction of the expected step; None: no step expected
@@ -66,7 +66,7 @@ class EffectVerdict:
 
     @property
     def ok(self) -> bool:
-        """Return True unless something contradicts the write; a step too small to see is no contradiction."""
+        """Return True if nothing contradicts the write; a step too small to see is no contradiction."""
         return not self.problems
 
     def outcome(self, parameter: str) -> Literal["verified", "stored", "failed"]:

@@ -1,11 +1,12 @@
-"""Our attitude as MAVLink messages, in the form that each firmware uses (autopilots 6).
+"""Our attitude as MAVLink messages, in the form that each firmware uses (docs/reference/autopilots 6).
 
 The message is VISION_POSITION_ESTIMATE rather than ODOMETRY. For an attitude without a position, PX4 treats ODOMETRY as
-relative to a frame of its own instead of north, and ArduPilot requires such a frame. Also, Euler angles have no norm
-that could deviate by more than the 1e-5 that PX4 allows. Neither firmware fuses roll and pitch.
+relative to a local frame instead of north, and ArduPilot accepts ODOMETRY only in a local frame. Also, PX4 rejects a
+quaternion whose norm deviates by more than 1e-5; Euler angles have no norm. Neither firmware fuses roll and pitch.
 
-PX4 uses our time stamps only after 500 exchanges of TIMESYNC (50 s at its 10 Hz) of less than 10 ms each; until then it
-treats a message as measured on arrival (autopilots 4.5). ArduPilot sends a request every 10 s, for its log.
+PX4 uses our time stamps only after 500 exchanges of TIMESYNC (50 s at its 10 Hz) of less than 10 ms each. Until then a
+message counts as measured on arrival (docs/reference/autopilots 4.5). ArduPilot sends TIMESYNC every 10 s, only for its
+log.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _U32: Final = 2**32
 
 
 def microseconds(t_s: float) -> int:
-    """Return a time of our clock as sent in all our messages: one clock for one link."""
+    """Convert a time of our clock to the time stamp in all our messages: one clock for one link."""
     return round(t_s * 1e6)
 
 
@@ -37,8 +38,8 @@ def vision_position_estimate(
 ) -> mavlink.MAVLink_vision_position_estimate_message:
     """Make the message with the attitude in NED (true north) and without a position.
 
-    ArduPilot discards the whole message if the position is not a number. It computes the sigma of yaw as the root of
-    the sum of all three angles' variances, so those of roll and pitch are left out. PX4 must not get a position.
+    ArduPilot discards the whole message if the position is not a number. ArduPilot computes the sigma of yaw as the
+    root of the sum of all three angles' variances, so we leave out the others. PX4 must not get a position.
     """
     sigma_roll, sigma_pitch, sigma_yaw = attitude.sigma_rad
     covariance = [0.0] * 21
@@ -76,7 +77,7 @@ def attitude_messages(
 
 
 class TimesyncResponder:
-    """Answers TIMESYNC requests of the latched autopilot with the clock of our messages' time stamps."""
+    """Answers the autopilot's TIMESYNC requests with the clock that stamps our messages."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0

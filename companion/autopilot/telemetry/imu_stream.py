@@ -1,7 +1,7 @@
-"""The samples of one of the autopilot's IMUs, from the best message that it will send.
+"""Samples of one of the autopilot's IMUs, from the best message that the autopilot is ready to send.
 
-A request is lost at every restart of the autopilot, and may be refused, answered late or never. So only messages that
-arrive count: the answer to a request only saves time.
+A request is lost at every restart of the autopilot, and may be refused, answered late or never. So a request counts as
+successful only when messages arrive; an answer to the request only saves time.
 """
 
 from __future__ import annotations
@@ -67,11 +67,11 @@ _RESTARTED: Final = "the autopilot restarted"
 
 
 class ImuStream:
-    """Requests one IMU's messages (1, 2 or 3), keeps them coming and passes on their samples in vehicle FRD.
+    """Requests the messages of one IMU (1, 2 or 3) as often as needed, and passes on its samples in vehicle FRD.
 
-    The rate is below `rate_hz` if the autopilot denies that. `may_be_slow`: the eleven samples a second of ArduPilot's
-    script suffice. `on_kind_change` is called before the first sample of another message (and with None when samples
-    end), so that no mean mixes two resolutions.
+    The rate is below `rate_hz` if the autopilot denies `rate_hz`. `may_be_slow` returns True if the eleven samples a
+    second of ArduPilot's script suffice. `on_kind_change` is called before the first sample of another message, and
+    with None when samples end, so that no mean mixes two resolutions.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ImuStream:
 
     @property
     def wants_script(self) -> bool:
-        """Return True if the script's floats are the current source, or better than it."""
+        """Return True if the floats of ArduPilot's script are the current source, or better than it."""
         for source in self._sources:
             if source.message.from_script and self._usable(source):
                 return True
@@ -117,7 +117,7 @@ class ImuStream:
 
     @property
     def decided(self) -> bool:
-        """Return True once samples arrive, or every message that could carry them was requested in vain."""
+        """Return True once samples arrive, or once every message that could carry them was requested in vain."""
         return self.problem not in (self._starting, _NO_HEARTBEAT, _RESTARTED)
 
     @property
@@ -218,7 +218,7 @@ class ImuStream:
         return False
 
     async def _keep(self, source: _Source) -> _Source | None:
-        """Use a source until it stays silent, the autopilot is lost, or a better source sends; return the latter."""
+        """Use a source until it fails or the autopilot is lost (return None), or a better one sends (return that)."""
         loop = asyncio.get_running_loop()
         self._switch(source)
         silent_asks = 0
@@ -267,7 +267,7 @@ class ImuStream:
         return found
 
     async def _ask_for_better(self, source: _Source, asked_s: float) -> float:
-        """Request better messages every `_BETTER_AGAIN_S`, at once if a source becomes usable; return the time."""
+        """Request better messages every `_BETTER_AGAIN_S` or when one becomes usable; return the last request time."""
         if not all(map(self._usable, self._sources)):
             return -math.inf
         now_s = asyncio.get_running_loop().time()
@@ -279,7 +279,7 @@ class ImuStream:
         return now_s
 
     async def _ask_for_temperature(self, source: _Source) -> None:
-        """Request an integer message for the IMU's temperature: HIGHRES_IMU carries the barometer's."""
+        """Request an integer message that carries the IMU's temperature; HIGHRES_IMU carries the barometer's."""
         if source.message.message is imu_messages.HIGHRES.message:
             rate_hz = _TEMPERATURE_RATE_HZ if source.message is imu_messages.HIGHRES else _SEEN_BY_RATE_HZ
             for each in (each for each in self._sources[1:] if not each.message.from_script):
@@ -288,13 +288,13 @@ class ImuStream:
                     return
 
     def _usable(self, source: _Source) -> bool:
-        """Return whether a source is usable: the EKF bias that it lacks is known; the script's only while disarmed."""
+        """Return True for the script while disarmed, for another source if the EKF bias that it lacks is known."""
         if source.message.from_script:
             return self._vehicle.arm_state is ArmState.DISARMED
         return not source.message.lacks_bias or self._ekf_bias.known_of(self._instance)
 
     async def _pause(self, seconds: float) -> bool:
-        """Wait, at most until the autopilot is lost or restarts; return whether it did."""
+        """Wait `seconds` and return False; return True at once if the autopilot is lost or restarts."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + seconds
         while not self._restart.is_set():

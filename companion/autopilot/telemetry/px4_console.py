@@ -1,14 +1,15 @@
 """Floats of PX4's IMUs, read at its console over MAVLink (SERIAL_CONTROL), as by a ground station's "MAVLink console".
 
-HIGHRES_IMU has the readings of the IMU used for flight, as floats, minus the bias of its EKF, which no message carries:
-`EkfBias` reads it. PX4 publishes it once a second and after a change by 0.001 rad/s or m/s^2; it wanders slowly.
+HIGHRES_IMU carries floats of the IMU used for flight, minus the bias estimate of its EKF. No message carries that
+estimate, so `EkfBias` reads it at the console. PX4 publishes it once a second and after a change by 0.001 rad/s or
+m/s^2; it wanders slowly.
 
-`ImuStatus` prints `vehicle_imu_status` of the other IMUs: means over 0.1 s of an IMU's raw readings, in the vehicle's
-axes, without any correction (`VehicleIMU.cpp`). A few of them a second show the bias that the integers of SCALED_IMU
-hide. The integers show whether the aircraft was still in between.
+`ImuStatus` reads `vehicle_imu_status` of the other IMUs: means over 0.1 s of raw readings, in the vehicle's axes,
+without any correction (`VehicleIMU.cpp`). A few means a second show a bias below the resolution of SCALED_IMU's
+integers. The integers show whether the aircraft stood still in between.
 
-The command `listener` prints published topics with five decimals: 2 deg/h, 1 micro-g. No other command is typed there,
-and none unless the autopilot is known to be disarmed. Each MAVLink port of PX4 has its own console (autopilots 10.3).
+The command `listener` prints topics with five decimals, which resolve 2 deg/h and 1 micro-g. No other command is sent,
+and only while surely disarmed. Each MAVLink port has its own console (docs/reference/autopilots 10.3).
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _PROMPT: Final = re.compile("(nsh|pxh)> ")
 
 
 class Px4Console:
-    """Makes the console print topics."""
+    """Sends `listener` commands to PX4's console and collects the printed text."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.text = ""
@@ -53,7 +54,7 @@ class Px4Console:
         link.subscribe(mavlink.MAVLink_serial_control_message, self._on_text)
 
     async def listener(self, topic: str, pattern: re.Pattern[str], *which: str) -> re.Match[str] | None:
-        """Print a topic and match it to `pattern`; None: no answer in time, or another text."""
+        """Print a topic and match its text to `pattern`; None: no answer in time, or no match."""
         async with self._lock:
             self.text, self._asked = "", topic
             self._answered.clear()
@@ -82,8 +83,8 @@ _AGAIN_S: Final = 60.0  # pause after `MISSES` answers in a row that were missin
 _TURN_S: Final = 0.5
 _OLD_S: Final = 45.0
 _CALM_S: Final = 60.0
-"""Wait after new offsets, which reset the estimate for some seconds. On a deck the integers show their effect for 40 s,
-and floats that came back earlier would restart that check."""
+"""Wait after new offsets, which disturb the EKF's bias estimate for some seconds. On a ship's deck, integer messages
+show the effect of new offsets for 40 s, and floats that return earlier would restart that check."""
 _UNITS: Final = np.repeat([1e-3, 1e-2], 3)
 _JUMP: Final = 0.5 * _UNITS  # largest change between two reads of a bias in use: 100 deg/h, 0.5 mg
 _STEADY: Final = 0.02 * _UNITS  # largest change within a second before the bias is used: 4 deg/h, 0.02 mg
@@ -102,7 +103,7 @@ _IMU: Final = re.compile(
 
 
 class EkfBias:
-    """Reads the EKF's bias repeatedly; `run` is its task."""
+    """Reads the bias estimate of PX4's EKF repeatedly at the console; `run` is its task."""
 
     def __init__(self, console: Px4Console, vehicle: Vehicle) -> None:
         self.instance: int | None = None  # IMU (1..) that HIGHRES_IMU shows; None while its bias is not known
@@ -118,7 +119,7 @@ class EkfBias:
         self._at_bias = False
 
     def known_of(self, instance: int) -> bool:
-        """Check that HIGHRES_IMU shows this IMU (1..) and that `reading` restores its readings."""
+        """Check that HIGHRES_IMU shows IMU `instance` (1 to 3), and that the EKF bias to add to it is known."""
         return self.instance == instance and not self._age_s > _OLD_S
 
     def forget(self) -> None:
@@ -126,7 +127,7 @@ class EkfBias:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Suspend reading during a write of offsets and for some time after it, as the bias steps then."""
+        """Suspend reads of the EKF bias in a write of offsets and for `_CALM_S` after it, as the bias steps then."""
         self._held += 1
         self.forget()
         try:
@@ -136,7 +137,7 @@ class EkfBias:
             self.step()
 
     def step(self) -> None:
-        """Forget the bias, and wait until the EKF has estimated it again under other offsets."""
+        """Discard the bias and pause for `_CALM_S`, until the EKF has estimated it again with new offsets."""
         self.forget()
         self._from_s = asyncio.get_running_loop().time() + _CALM_S
 
@@ -178,7 +179,7 @@ class EkfBias:
         return _AT_FIRST_S if self._at_bias else 0.0
 
     async def _read(self) -> bool:
-        """Read which EKF is in use, or its bias, in turn; return False if the console did not print it."""
+        """Read alternately which EKF is in use, and its bias; return False if the console did not print it."""
         self._at_bias = self._primary is not None and (self.instance is None or not self._at_bias)
         if not self._at_bias:
             found = await self._console.listener("estimator_selector_status", _PRIMARY)
@@ -238,7 +239,7 @@ _STATUS: Final = re.compile(
 
 
 class ImuStatus:
-    """Makes the console print the status of the wanted IMUs, one after another; `run` is its task."""
+    """Reads raw means of the wanted IMUs at PX4's console, one IMU after another; `run` is its task."""
 
     def __init__(
         self,
@@ -249,9 +250,9 @@ class ImuStatus:
         *,
         slow: bool,
     ) -> None:
-        """Prepare the reader; `wanted` returns the instances (1 to 3) whose telemetry is integers.
+        """Store the callbacks; `wanted` returns the IMUs (1 to 3) whose telemetry is integers.
 
-        `tell` gets the instance, the device ids of gyro and accelerometer, and the mean of 0.1 s of raw readings.
+        `tell` is called with the IMU, the device ids of gyro and accelerometer, and the mean of 0.1 s of raw readings.
         """
         self._console, self._ekf_bias, self._wanted, self._tell = console, ekf_bias, wanted, tell
         self._pause_s = SLOW_PAUSE_S if slow else PAUSE_S

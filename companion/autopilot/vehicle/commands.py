@@ -1,8 +1,8 @@
 """Commands to the autopilot, one at a time, and the wait for their COMMAND_ACK.
 
 An ACK names the command but not its parameters, so the ACKs of two SET_MESSAGE_INTERVAL could not be distinguished.
-Therefore each command has one request in flight, and the others queue. A missing answer gives the result None: an
-autopilot may be slow with its ACKs or never send them, and no caller may hang.
+Therefore each command has one request in flight, and further ones queue. A missing answer gives the result None, so
+that no caller hangs: an autopilot may send its ACKs late or never.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _settle(answer: _Answer, result: int | None) -> None:
 
 
 class Commands:
-    """Sends COMMAND_LONG to one autopilot; `target` returns its ids, None while unknown."""
+    """Sends COMMAND_LONG to one autopilot; `target` returns its system and component id, None while unknown."""
 
     def __init__(self, link: MavlinkLink, target: Callable[[], tuple[int, int] | None]) -> None:
         self.results: Counter[str] = Counter()  # counts by name of the result, "no answer" or "dropped" (never sent)
@@ -45,14 +45,14 @@ class Commands:
         self._queues: dict[int, deque[_Request]] = {}
         self._in_flight: dict[int, _Request] = {}
         self._timers: dict[int, asyncio.TimerHandle] = {}
-        """Timeout of the request in flight, or end of the pause after a refusal, by command."""
+        """Timers by command: timeout of the request in flight, or end of the pause after a refusal."""
         self._last_ack = (0, 0, 0, -math.inf)
         link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 
     def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> _Answer:
         """Queue a request; the future gets the MAV_RESULT, or None after the timeout.
 
-        The timeout runs from the sending; IN_PROGRESS restarts it. The future never gets an exception, so it may be
+        The timeout runs from the sending; IN_PROGRESS restarts it. The future never gets an exception and may be
         ignored.
         """
         answer: _Answer = asyncio.get_running_loop().create_future()
@@ -160,7 +160,7 @@ class StandingRequests:
         self._wanted: list[_Wanted] = []
 
     def add(self, message: type[Message], rate_hz: float | None, of: FirmwareName | None = None) -> None:
-        """Request a message from now on (`of` one firmware or any); without a rate, once after each `forget_asking`."""
+        """Request a message from now on, from firmware `of` or any; without a rate only once, again after a restart."""
         self._wanted.append(_Wanted(message, rate_hz, of))
 
     def heard(self, message: Message, t_s: float) -> None:
@@ -169,7 +169,7 @@ class StandingRequests:
                 wanted.heard_s, wanted.pause_s = t_s, FIRST_PAUSE_S
 
     def forget_asking(self) -> None:
-        """Make all requests due again: a restart during the loss of the autopilot ends its streams."""
+        """Make all requests due again, because an autopilot that restarted while it was lost has ended its streams."""
         for wanted in self._wanted:
             wanted.asked_s, wanted.pause_s = -math.inf, FIRST_PAUSE_S
             if wanted.rate_hz is None:

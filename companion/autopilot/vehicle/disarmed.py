@@ -1,13 +1,13 @@
-"""Proof that the autopilot is disarmed, by a question and its answer; the only place that decides this.
+"""Proof that the autopilot is disarmed, by a question and its answer; the only module that decides this.
 
 A heartbeat may be old: it may have waited in a radio, in the kernel, or here while our process was stopped. So the
-question is a TIMESYNC with a random number. Both firmwares return the number at once, armed or not (autopilots 2, 4.5).
-A heartbeat that arrives after the answer was sent after the question. No clock is compared with another one, and no
-wall clock is read.
+question is a TIMESYNC with a random number. Both firmwares return the number at once, armed or not
+(docs/reference/autopilots 2, 4.5). A heartbeat that arrives after the answer was sent after the question. No clock is
+compared with another one, and no wall clock is read.
 
-On an unsigned link anybody who hears the question can answer it. There the proof is: some sender with the autopilot's
-ids said "disarmed" after the question, and none said "armed" within 3 s, nor within the time of the slowest recent
-answer. On a signed link the autopilot itself has said so.
+On an unsigned link anybody who receives the question can answer it. There the proof needs two things. Some sender with
+the autopilot's ids reported "disarmed" after the question. None reported "armed" within 3 s, nor within the time of the
+slowest recent answer. On a signed link the autopilot itself has reported "disarmed".
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from companion.messages import message
 PROOF_HOLDS_S: Final = 1.5  # time from the question to the write; some heartbeats come only once a second
 
 LONGEST_PAUSE_S: Final = 0.1
-"""Longest pause of our own loop; after a longer one earlier questions are void, as messages may have waited."""
+"""Longest pause of our event loop; a longer one voids earlier questions, because messages may have waited."""
 
 ASK_AGAIN_S: Final = 0.3
 GIVE_UP_S: Final = 8.0  # with a fifth of packets lost both ways, 26 questions stay unanswered once in 10^11
@@ -47,14 +47,14 @@ class DisarmedProof:
     def __init__(self) -> None:
         self._asked_s: dict[int, float] = {}
         self._answers_s: deque[float] = deque(maxlen=_REMEMBERED)
-        """Times from question to answer, also of a second answer to the same question."""
+        """Times from question to answer, s, also of a second answer to the same question."""
         self._begun_s = self._awake_s = math.inf
         self._answered_s = self._proven_s = -math.inf
-        """Times of the latest answered question, and of the latest one followed by a disarmed heartbeat."""
+        """Times of the latest answered question, and of the latest question followed by a disarmed heartbeat."""
 
     @property
     def slowest_s(self) -> float:
-        """Longest recent time to an answer; a forger may answer before the autopilot, so wait for both."""
+        """Longest recent time to an answer. A forger may answer before the autopilot, so the slower one counts."""
         return min(max(self._answers_s, default=0.0), _LONGEST_WAIT_S)
 
     def begin(self, now_s: float) -> None:
@@ -63,7 +63,7 @@ class DisarmedProof:
         self._answered_s = self._proven_s = -math.inf
 
     def awake(self, now_s: float) -> bool:
-        """Note that our own loop runs; return False after a pause, which voids all earlier questions."""
+        """Note that our event loop runs; return False after a long pause, which voids all earlier questions."""
         paused = now_s - self._awake_s > LONGEST_PAUSE_S
         if paused:
             self._asked_s.clear()
@@ -89,14 +89,14 @@ class DisarmedProof:
         self._proven_s = self._answered_s
 
     def holds(self, now_s: float) -> bool:
-        """Return whether a disarmed heartbeat followed a question, and no armed one in the time answers take."""
+        """Check that a disarmed heartbeat followed a question, and no armed one within the time that answers need."""
         return self.awake(now_s) and self.slowest_s <= now_s - self._proven_s <= PROOF_HOLDS_S
 
 
 class DisarmedCheck:
     """Asks one autopilot for its arm state before each action that requires it to be disarmed.
 
-    `state` returns the state by heartbeats, `name` the autopilot's name for messages.
+    `state` returns the arm state from heartbeats, `name` the autopilot's name for messages.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class DisarmedCheck:
                 request.cancel()  # otherwise unanswered requests would queue up before the next one
 
     def proven(self) -> bool:
-        """Return whether everything received proves the autopilot disarmed; the link calls it before it sends."""
+        """Check that all received messages prove the autopilot disarmed; the link calls this just before it sends."""
         return self._state() is ArmState.DISARMED and self._proof.holds(asyncio.get_running_loop().time())
 
     def answered(self, number: int) -> None:

@@ -1,12 +1,12 @@
-"""The autopilot's own estimator: its gyro biases, its attitude (ATTITUDE, #30), and whether its yaw is a heading.
+"""The autopilot's own estimator: its gyro biases, its attitude (ATTITUDE, #30), and whether its yaw can be trusted.
 
 ArduPilot reports its gyro biases in AHRS (#163): omegaI is minus the estimate. After a step in the offsets EKF3 keeps
-its old estimate, which is then wrong by minus the step. The heading turns by that times 17 to 25 s before EKF3 has
-learned (autopilots 1.7, 9.3.1). With right offsets the true bias is zero, so omegaI shows how far EKF3 is from settled.
+its old estimate, which is then wrong by minus the step. Meanwhile the heading turns by that error times 17 to 25 s
+(docs/reference/autopilots 1.7, 9.3.1). With right offsets the true bias is zero, so omegaI shows if EKF3 has settled.
 
 No message gives a sigma of the yaw. The yaw is a heading while the autopilot has a healthy magnetometer (SYS_STATUS)
-and its estimator finds that the yaw agrees with it (EKF_STATUS_REPORT, ESTIMATOR_STATUS). Then it is as good as a
-compass next to motors and wires.
+and its estimator reports that the yaw agrees with the magnetometer (EKF_STATUS_REPORT, ESTIMATOR_STATUS). Its accuracy
+is then that of a compass next to motors and wires.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from companion.physics.units import DEG
 
 ADJUSTING: Final = "EKF adjusting"
 SETTLED_RAD_S: Final = 0.02 * DEG
-"""Largest bias estimate of a settled EKF, per axis: 72 deg/h. After a reset it wanders up to 52 deg/h on the ground
-(autopilots 9.3.1); and 72 deg/h times 25 s turn the heading by 0.5 deg, less than a compass error."""
+"""Largest bias estimate of a settled EKF, per axis: 72 deg/h. After a reset the estimate wanders up to 52 deg/h on the
+ground (docs/reference/autopilots 9.3.1). 72 deg/h for 25 s turn the heading by 0.5 deg, less than a compass error."""
 
 _AHRS: Final[int] = mavlink.MAVLINK_MSG_ID_AHRS
 _AHRS_RATE_HZ: Final = 4.0
@@ -46,7 +46,7 @@ _AHRS_LOOK_S: Final = 0.25
 
 
 class EkfWatch:
-    """Requests AHRS while its bias is wanted, and averages the messages over 2 s."""
+    """Requests ArduPilot's AHRS message while the EKF's gyro bias is wanted, and averages the bias over 2 s."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -56,7 +56,7 @@ class EkfWatch:
         vehicle.hear(mavlink.MAVLink_ahrs_message, self._on_ahrs)
 
     async def bias_rad_s(self) -> float | None:
-        """Return the estimate's largest axis, averaged over up to 2 s; None: this autopilot does not report it."""
+        """Return the EKF's gyro bias, largest axis, averaged over up to 2 s; None: the autopilot reports none."""
         for _ in range(_ASKS):
             if (found := self._mean(0.0)) is not None:
                 return found
@@ -66,7 +66,7 @@ class EkfWatch:
         return self._mean(0.0)
 
     async def settle(self, within_s: float, go_on: Callable[[str], None]) -> str | None:
-        """Wait until the estimate has settled (None); return a warning for the pilot if that was not seen.
+        """Wait until the EKF's bias has settled and return None, or return a warning for the pilot if it has not.
 
         The wait ends early when the autopilot arms or restarts. `go_on` gets the progress; its errors end the wait.
         """
@@ -104,7 +104,7 @@ class EkfWatch:
         self._vehicle.commands.request_message_interval(_AHRS, _AHRS_RATE_HZ)
 
     def _mean(self, at_least_s: float) -> float | None:
-        """Average the last 2 s of readings, which span more time on a busy line; None: too few readings."""
+        """Average the last 2 s of readings (of more time on a busy line), largest axis; None: too few readings."""
         now_s = asyncio.get_running_loop().time()
         taken: list[tuple[float, float, float, float]] = []
         for each in reversed(self._seen):
@@ -127,7 +127,7 @@ def _words(bias_rad_s: float | None) -> str:
 
 
 HEADING_SIGMA_DEG: Final = 10.0
-"""Sigma of an autopilot's compass that agrees with its gyros; near iron, or badly calibrated, its error is larger."""
+"""Sigma of the yaw if an autopilot's compass agrees with its gyros; near iron, or badly calibrated, it is larger."""
 _RATE_HZ: Final = 1.0
 _STEADY_DEG: Final = 2.0  # largest turn of yaw in `_STEADY_S` at rest; more means that the estimator has not settled
 _STEADY_S: Final = 5.0
@@ -169,7 +169,7 @@ class OwnCompass:
 
 
 class OwnAttitude:
-    """Attitude of the latched autopilot; `wanted`: keep requesting the messages that the heading needs."""
+    """Attitude reported by the autopilot; `wanted`: keep requesting the messages that the heading needs."""
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._vehicle, self._wanted = vehicle, wanted
@@ -178,7 +178,7 @@ class OwnAttitude:
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, _RATE_HZ if wanted else None)
 
     def heading(self) -> OwnHeading | None:
-        """Return the autopilot's yaw from true north; None while it is not trustworthy."""
+        """Return the autopilot's yaw from true north; None while the yaw is not trustworthy."""
         now_s = asyncio.get_running_loop().time()
         seen = self._since(now_s - _STEADY_S)
         if len(seen) < 2 or not self._compass.agrees(now_s):
@@ -203,7 +203,7 @@ class OwnAttitude:
             commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
 
     def up(self, since_s: float) -> Array | None:
-        """Return the mean direction of up since a time, (3,), vehicle axes; None: less than a second of data."""
+        """Return the mean up vector since a time, (3,), vehicle FRD axes; None: less than a second of data."""
         seen = self._since(since_s)
         if len(seen) < _UP_LEAST or seen[-1][0] - seen[0][0] < _UP_LEAST_S:
             return None
@@ -211,7 +211,7 @@ class OwnAttitude:
         return np.asarray(np.mean(ups, axis=0))
 
     async def up_since(self, since_s: float) -> Array | None:
-        """Wait a few seconds for `up`; None: no attitude arrives."""
+        """Wait a few seconds for the result of `up`; None: too few attitude messages arrive."""
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + _OLD_S
         while (found := self.up(since_s)) is None and loop.time() < give_up_s:

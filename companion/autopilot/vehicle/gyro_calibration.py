@@ -1,9 +1,10 @@
-"""ArduPilot's own gyro calibration, by command: only this resets the EKF's gyro bias (autopilots 1.7).
+"""ArduPilot's own gyro calibration, by command: only this resets the EKF's gyro bias (docs/reference/autopilots 1.7).
 
-The calibration also measures the gyros of all instances to some 10 deg/h, with the Earth's rotation in the result
-(autopilots 1.5, 3, 9.3.1). It writes their offsets, calibration temperatures and device ids, and zeros the values of
-absent gyros. The answer comes at its end, after 0.5 to 30 s; while it runs the offsets read zero. A second command
-meanwhile gets an early answer, as if all were done. So the command is sent once, and the offsets show its end.
+The calibration also measures the gyros of all IMUs to some 10 deg/h, with the Earth's rotation in the result
+(docs/reference/autopilots 1.5, 3, 9.3.1). It writes their offsets, calibration temperatures and device ids, and zeros
+the values of absent gyros. The answer comes at its end, after 0.5 to 30 s; while it runs the offsets read zero. A
+second command meanwhile gets an early answer, as if all were done. So the command is sent once; the offsets show its
+end.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ calibration ran, but the answer was lost. "not run": the command was refused or 
 
 
 async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
-    """Read every parameter that the calibration writes, of all instances; raise AutopilotError after a restart."""
+    """Read every parameter that the calibration writes, of all IMUs; raise AutopilotError after a restart."""
     boots, every = parameters.boots, [ArduPilotParameters(instance) for instance in INSTANCES]
     found = await parameters.read_many((names.gyro_offset[0] for names in every), optional=True)
     present = [names for names in every if names.gyro_offset[0] in found]
@@ -52,7 +53,7 @@ async def read_overwritten(parameters: ParameterClient) -> dict[str, float]:
 
 
 async def read_active_tcal(parameters: ParameterClient, values: Mapping[str, float]) -> list[str]:
-    """Return the active temperature calibrations' names; a gyro calibration changes CALTEMP and so their effect."""
+    """Return the switches of active temperature calibrations; a gyro calibration changes CALTEMP, thus their effect."""
     switches = [names.tcal_enable for names in _present(values)]
     return [name for name, value in (await parameters.read_many(switches, optional=True)).items() if value]
 
@@ -110,7 +111,7 @@ async def calibrate(
 
 
 async def wait_until_over(parameters: ParameterClient, before: Mapping[str, float]) -> None:
-    """After an interruption, wait until a calibration that may have been started has ended, or did not run."""
+    """Wait, after an interruption, until a calibration that may have started has ended, or surely did not run."""
     # Old offsets or zeros prove nothing yet, as the calibration stores its result at its end.
     vehicle, loop = parameters.vehicle, asyncio.get_running_loop()
     boots, since_s = vehicle.boots, loop.time()
@@ -123,7 +124,7 @@ async def wait_until_over(parameters: ParameterClient, before: Mapping[str, floa
 
 
 async def _state(parameters: ParameterClient, before: Mapping[str, float]) -> Literal["running", "ended", "untouched"]:
-    """Find the state from the offsets of present gyros: zero while it runs, all set together at its end."""
+    """Read the calibration's state from the offsets of present gyros: zero while it runs, all set at its end."""
     vectors = [names.gyro_offset for names in _present(before) if before.get(names.gyro_id, 1.0)]
     offsets = [name for vector in vectors for name in vector]
     now = dict.fromkeys(offsets, 0.0) | await parameters.read_many(offsets, optional=True)

@@ -1,4 +1,4 @@
-"""Logic of heartbeats: which are the autopilot's, whether it is armed, whether it restarted. Times are arguments.
+"""Logic of heartbeats: choice of the autopilot, its arm state and its restarts. Times are arguments.
 
 Anybody on an unsigned link can send "disarmed" with the autopilot's ids, but the autopilot's own heartbeats arrive too.
 So "armed" outweighs "disarmed", and a sender that alternates between both is not believed at all.
@@ -21,8 +21,8 @@ _CHANGES: Final = 4
 _CHANGES_WITHIN_S: Final = 5.0  # arming and disarming twice within this time is more than pilots do
 _ONLY_ARMED_S: Final = 10.0
 _ONLY_DISARMED_S: Final = 30.0
-"""Time of only "armed", or only "disarmed", that ends a contradiction. The other sender may have been silenced; "armed"
-is believed earlier, as it permits nothing."""
+"""Time of only "disarmed" heartbeats that ends a contradiction. The second sender may have been silenced; only "armed"
+is believed earlier (`_ONLY_ARMED_S`), as it permits nothing."""
 _RESTARTS_S: Final = 1.0  # two restarts within this time mean two autopilots, whose times since boot alternate
 _TWO_HOLDS_S: Final = 5.0  # time after the last sign of a second autopilot for which neither is believed
 
@@ -43,7 +43,7 @@ class ArmState(enum.Enum):
 
 
 class ArmingWatch:
-    """Decides the arm state from the heartbeats with one vehicle's ids, of which some may be forged."""
+    """Decides the arm state from the heartbeats with one vehicle's ids; some of them may be forged."""
 
     def __init__(self) -> None:
         self._armed: bool | None = None
@@ -64,18 +64,18 @@ class ArmingWatch:
         self._armed = armed
 
     def restarted(self, t_s: float) -> None:
-        """Forget earlier "disarmed" heartbeats; "armed" still counts, as a restart can be forged."""
+        """Discard earlier "disarmed" heartbeats; "armed" still counts, as a restart can be forged."""
         self._armed = None
         if t_s - self._restarted_s < _RESTARTS_S:
             self.two_seen(t_s)
         self._restarted_s = t_s
 
     def flashed(self) -> None:
-        """Note that another firmware runs now; its restart may have been seen before its first heartbeat."""
+        """Note that another firmware was flashed: a restart just before must not count as a second autopilot."""
         self._restarted_s = -math.inf
 
     def armed(self, t_s: float) -> bool | None:
-        """Return whether the aircraft is armed; None before the first heartbeat."""
+        """Return whether the aircraft is armed; None: unknown, before the first heartbeat or after a restart."""
         if t_s - self._armed_s < ARMED_HOLDS_S:
             return True
         return self._armed
@@ -90,7 +90,7 @@ class ArmingWatch:
         return message("two_autopilots_with_one_id", system=system_id) if t_s - self._two_s < _TWO_HOLDS_S else None
 
     def contradicts_itself(self, t_s: float) -> bool:
-        """Check for alternating armed and disarmed heartbeats, of two autopilots, or of one and a forger."""
+        """Check for alternating armed and disarmed heartbeats, from two autopilots, or from one and a forger."""
         only_armed = self._armed is True and t_s - self._disarmed_s >= _ONLY_ARMED_S
         return self._contradicted and not only_armed and t_s - self._armed_s < _ONLY_DISARMED_S
 
@@ -125,7 +125,7 @@ def version_text(packed: int) -> str:
 
 
 class Latch:
-    """Decides which autopilot to latch."""
+    """Chooses the autopilot to work with, by its heartbeats."""
 
     def __init__(self, system_id: int | None) -> None:
         self._system_id = system_id
@@ -155,10 +155,11 @@ class BootClock:
     """Detects restarts from the time since boot, which many messages carry.
 
     A restart shows in one of two ways. First, the time goes back. Second, after a silence, the time has advanced by
-    less than half of the host's clock and is shorter than the silence: the autopilot restarted while the link was lost,
-    and its time since boot has overtaken the old one. Half, because a simulator may run slower than real time, on a
-    busy machine even slower than half; then a time since boot longer than the silence excludes a restart. The second
-    way must hold for another half second, as the first messages after a pause of our own process are old.
+    less than half of the host's clock and is shorter than the silence. The autopilot then restarted while the link was
+    lost, and its time since boot has overtaken the old one. The limit is half, because a simulator may run slower than
+    real time. On a busy machine it may even be slower than half; then a time since boot longer than the silence
+    excludes a restart. The second way must hold for another half second, as the first messages after a pause of our own
+    process are old.
     """
 
     def __init__(self) -> None:
@@ -167,7 +168,7 @@ class BootClock:
         self._suspected_s = 0.0
 
     def rebooted(self, boot_s: float, t_s: float) -> bool:
-        """Note a time since boot received at `t_s`; return whether the autopilot restarted since the previous one."""
+        """Note a time since boot received at `t_s`; return whether the autopilot restarted since the call before."""
         if self.latest is None:
             self.latest = (boot_s, t_s)
             return False

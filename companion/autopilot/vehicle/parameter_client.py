@@ -1,9 +1,9 @@
 """Single parameters over MAVLink: read by name, write, and listeners to every value that the autopilot sends.
 
 Every write is guarded: immediately before each PARAM_SET is sent, also a repeated one, the aircraft must be surely
-disarmed (`vehicle.disarmed`). No other guard exists, as neither autopilot refuses a PARAM_SET while armed (autopilots
-1.3, 4.4). MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm, so `parameter_writer`
-checks again at the end.
+disarmed (`vehicle.disarmed`). No other guard exists, as neither autopilot refuses a PARAM_SET while armed
+(docs/reference/autopilots 1.3, 4.4). MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may
+arm, so `parameter_writer` checks again at the end.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _REMEMBERED_TYPES: Final = 4096  # more than the parameters of any firmware; the
 _TIMEOUT_S: Final = 1.0
 _TRIES: Final = 4
 _TRIES_MORE: Final = 8
-"""Most tries while heartbeats arrive, or the line is known to lose packets. With a fifth of packets lost both ways,
-four tries fail once in sixty exchanges, which is once a calibration; eight fail once in 3500."""
+"""Most tries of one request while heartbeats arrive, or on a line known to lose packets. With a fifth of packets lost
+each way, four tries fail once in sixty requests, which is once a calibration; eight fail once in 3500."""
 _LOSSY: Final = 0.05  # fraction of repeated requests above which silence is weak evidence of a missing name
 _LOSS_MEMORY: Final = 0.1
 
@@ -58,11 +58,11 @@ _ERROR_WORDS: Final = {
 }
 """Texts for MAV_PARAM_ERROR; the generated dialect has only the first five values."""
 
-_Answer = float | str  # Value of a PARAM_VALUE, or PARAM_ERROR in words
+_Answer = float | str  # Value of a PARAM_VALUE, or PARAM_ERROR as text
 
 
 class _Inbox:
-    """Queue of the answers about one name during one exchange (PARAM_ERROR as text); when full, drops the oldest."""
+    """Queue of answers about one parameter during one request; PARAM_ERROR is text. A full queue drops the oldest."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -85,8 +85,6 @@ class _Inbox:
 
 
 class ParameterClient(Parameters):
-    """The parameters of one autopilot."""
-
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.writes = 0  # PARAM_SET messages sent, repetitions included
@@ -149,10 +147,10 @@ class ParameterClient(Parameters):
     async def read_optional(self, name: str) -> float | None:
         """Read a parameter like `read`; return None if the autopilot has no such parameter.
 
-        ArduPilot from 4.7 and PX4 from 1.17 answer with PARAM_ERROR then. Older ones are silent, and often ArduPilot
-        4.8 too, as its PARAM_ERROR may go to another link. Silence means absence only while heartbeats arrive and the
-        autopilot answers for another parameter right after. An absent name is remembered until the autopilot restarts
-        or announces it.
+        ArduPilot from 4.7 and PX4 from 1.17 answer an absent name with PARAM_ERROR. Older ones are silent, and often
+        ArduPilot 4.8 too, as its PARAM_ERROR may go to another link. Silence means absence only while heartbeats arrive
+        and the autopilot answers for another parameter right after. An absent name is remembered until the autopilot
+        restarts or announces it.
         """
         if name in self._absent:
             return None
@@ -196,7 +194,7 @@ class ParameterClient(Parameters):
         """Set a parameter and wait for the autopilot to confirm that value, within 1 ulp.
 
         The value is sent as the type that the autopilot has announced; a REAL32 is rounded to float32. A different
-        value may be the answer to somebody else's write, so the wait goes on; without a further one it is the answer.
+        value may answer another sender's write, so the wait goes on; if nothing follows, it counts as the answer.
 
         Raises:
             NotDisarmedError: armed or arm state unknown just before a PARAM_SET. If that was a repetition, the first
@@ -242,7 +240,7 @@ class ParameterClient(Parameters):
 
     @property
     def integers_bytewise(self) -> bool:
-        """Return True if integers are sent as bytes; AUTOPILOT_VERSION, maybe forged, counts for no known firmware."""
+        """Return True if integers are sent as bytes. For unknown firmware AUTOPILOT_VERSION decides, maybe forged."""
         if (known := self.vehicle.kind.integers_bytewise) is not None:
             return known
         return bool((self.vehicle.capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
@@ -263,7 +261,7 @@ class ParameterClient(Parameters):
             self._inboxes.remove(inbox)
 
     def _required_tries(self) -> Iterator[int]:
-        """Yield the numbers of the tries, 1, 2, ..., of a required request: more tries while heartbeats arrive."""
+        """Yield the numbers of the tries of a required request: 1 to 4, and up to 8 while heartbeats arrive."""
         for tries in range(1, _TRIES_MORE + 1):
             if tries > _TRIES and not self.vehicle.alive:
                 return
@@ -290,7 +288,7 @@ class ParameterClient(Parameters):
         return None, count
 
     async def _answers_at_all(self) -> bool:
-        """Request a parameter that must exist: the last one that was answered, otherwise the first of the list."""
+        """Request a parameter that surely exists: the one last answered, otherwise the first in the parameter list."""
         name, index = (self._answering, -1) if self._answering is not None else ("", 0)
         with self._exchange(name) as inbox:
             for _ in self._required_tries():
@@ -299,7 +297,7 @@ class ParameterClient(Parameters):
         return False
 
     async def _type_of(self, name: str) -> int:
-        """Return the type for writing a parameter; it matters only to firmware that sends integers as bytes."""
+        """Return a parameter's MAVLink type; it matters only to firmware that sends integers as bytes."""
         if not self.integers_bytewise:
             return _REAL32
         if name not in self._types:
@@ -345,7 +343,7 @@ def _wire_name(name: str) -> bytes:
 
 
 # ArduPilot sends every value as a number and ignores the type of a PARAM_SET. PX4 puts the bytes of an integer into the
-# float field, and refuses a PARAM_SET whose type is not the parameter's own (autopilots 7.5).
+# float field, and refuses a PARAM_SET of another type than the parameter's (docs/reference/autopilots 7.5).
 
 _INTEGER_FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_UINT8: "<B",
@@ -373,7 +371,7 @@ def _decode(message: mavlink.MAVLink_param_value_message, *, bytewise: bool) -> 
 
 
 def _encode(value: float, kind: int, *, bytewise: bool) -> float | None:
-    """Encode a value of a type as a float; None: impossible (a fraction, out of range, not a number)."""
+    """Encode a value as the float of a PARAM_SET; None: impossible (a fraction, out of range, not a number)."""
     if not bytewise or kind not in _INTEGER_FORMATS:
         return value
     form = _INTEGER_FORMATS[kind]

@@ -1,8 +1,8 @@
-"""Writes of several parameters as one: all are written, or the old values restored, or the error names the rest.
+"""Writes of several parameters as one: all are written, or the old values restored, or the error names the others.
 
-MAVLink has no transactions, so this is an approximation (autopilots 8): read each old value, write one by one, each
-guarded, read all back, and check the arm state again. After any failure restore in reverse order, guarded in the same
-way.
+MAVLink has no transactions, so this is an approximation (docs/reference/autopilots 8): read each old value, write one
+parameter after another, read all back, and check the arm state again. After any failure restore in reverse order. Each
+single write requires proof that the aircraft is disarmed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from companion.messages import message
 
 logger = logging.getLogger(__name__)
 
-TAKEN_S: Final = 1.3  # time until PX4 uses the last value; until then it uses the far one
+TAKEN_S: Final = 1.3  # time until PX4 uses the last value; until then it uses the intermediate one
 
 _LATE_ECHO_S: Final = 0.3
 """Wait for late answers to earlier writes before reading back: ArduPilot also sends old Y and Z after a write of X."""
@@ -73,7 +73,7 @@ class ParameterWriter:
     def __init__(self, parameters: ParameterClient, vehicle: Vehicle) -> None:
         self.written: dict[str, WrittenParameter] = {}  # outcome of the last operation, whatever its end
         self.left_changed: tuple[str, ...] = ()
-        self.left_far: tuple[str, ...] = ()  # parameters of `left_changed` that still have their far value
+        self.left_far: tuple[str, ...] = ()  # parameters of `left_changed` that still have their intermediate value
         self._parameters = parameters
         self._vehicle = vehicle
         self._lock = asyncio.Lock()
@@ -84,8 +84,8 @@ class ParameterWriter:
     async def apply(self, changes: Sequence[Change], probe: FarProbe | None = None) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
 
-        Vectors with a far value (`Change.via`) are written last, one at a time, each verified by `probe`. Returns every
-        parameter as "stored": read back, its effect not verified. A cancel first restores the old values.
+        Vectors with an intermediate value (`Change.via`) are written last, one at a time, each verified by `probe`.
+        Return each parameter as "stored": read back, effect not verified. A cancel first restores the old values.
 
         Raises:
             NothingWrittenError: not disarmed at the start, or the autopilot is calibrating itself.
@@ -116,10 +116,10 @@ class ParameterWriter:
     async def restore(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
         """Restore `before` of every change, last first, as far as possible; return them as "rolled_back".
 
-        A value that is none of ours and not `before` is somebody else's and stays.
+        A value that is neither `before` nor from us was written by somebody else and stays.
 
         Raises:
-            NothingWrittenError: for the reasons of `apply`; nothing was restored.
+            NothingWrittenError: not disarmed at the start, or the autopilot is calibrating itself.
             WriteFailedError: `left_changed` names the parameters that could not be restored.
         """
         async with self._lock:
@@ -170,9 +170,10 @@ class ParameterWriter:
                 raise _Failure("changed by someone else", reads_otherwise(name, now, before))
 
     async def _write_by_far(self, vectors: Sequence[PendingVector], probe: FarProbe | None) -> None:
-        """Write one vector after another: its far value and, once that is in use, all new values, the far axis last.
+        """Write each vector: first an intermediate value on one axis, later the other axes, and that axis last.
 
-        With this order, if anything ends the write, the far axis differs from its old value while any other axis does.
+        The new values follow once the autopilot uses the intermediate value. If anything ends the write, that axis
+        differs from its old value as long as any other axis does.
         """
         wrong: list[str] = []
         for far, others in vectors:
@@ -194,7 +195,7 @@ class ParameterWriter:
             raise _Failure("wrong slot, orientation or scale", "; ".join(wrong))
 
     async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
-        """Write the far value and wait until it is in use; return the reason if it is not."""
+        """Write the intermediate value and wait until the autopilot uses it; return the reason if it does not."""
         verify = None if probe is None else probe(item.change.parameter)
         await self._write(item, item.change.far)
         item.is_far = True
@@ -265,7 +266,7 @@ class ParameterWriter:
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
     async def _put_back(self, items: list[PendingChange], *, leave_foreign: bool) -> None:
-        """Restore old values in reverse order until the deadline; vectors with a far value get that value first."""
+        """Restore old values in reverse order until the deadline; vectors with an intermediate value get that first."""
         touched = [item for item in reversed(items) if item.sent]
         for item in touched:
             item.outcome, item.left, item.read_back = "failed", True, None  # until read back

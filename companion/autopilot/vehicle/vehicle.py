@@ -1,8 +1,8 @@
 """State of the autopilot as seen over the link: identity, arm state, restarts and place.
 
-`arm_state` follows the heartbeats: UNKNOWN once the last one is 2 s old, and after a restart until the next one;
-DISARMED only if no armed heartbeat with the vehicle's ids has come for 3 s, from any sender (`heartbeats`). Heartbeats
-may be old, so code that writes to the autopilot calls `disarmed.ensure` before every message.
+`arm_state` follows the heartbeats. It is UNKNOWN once the last one is 2 s old, and after a restart until the next one.
+It is DISARMED only if no armed heartbeat with the vehicle's ids has come for 3 s, from any sender (`heartbeats`).
+Heartbeats may be old, so code that writes to the autopilot calls `disarmed.ensure` before every message.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["ArmState", "Vehicle", "VehicleEvent", "VehicleTimer"]
 
 logger = logging.getLogger(__name__)
 
-HEARTBEAT_TIMEOUT_S: Final = 2.0  # age of the last heartbeat beyond which the arm state is unknown (autopilots 8)
+HEARTBEAT_TIMEOUT_S: Final = 2.0  # oldest heartbeat that shows the arm state (docs/reference/autopilots 8)
 
 _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
@@ -49,18 +49,18 @@ _SLOWEST: Final = 5.0  # longest wait for one second of the autopilot's clock, i
 _POLL_S: Final = 0.05
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
-"""Events of `Vehicle.on_event`. "found": latched, or heard again after "lost". "armed" and "disarmed": the state in the
-heartbeat differs from the one before; the very first heartbeat causes "found" and one of them. "disarmed" comes when
-that is believed: 3 s after the last armed heartbeat."""
+"""Events of `Vehicle.on_event`. "found": first heartbeat, or first one after "lost". "armed" and "disarmed": the arm
+state has changed; the first heartbeat causes "found" and one of these. "disarmed" comes after 3 s without an armed
+heartbeat."""
 
 
 class Vehicle:
-    """The autopilot to calibrate: that of the given system id, otherwise the first real one heard.
+    """Autopilot to calibrate: the one with the given system id, otherwise the first real one with a heartbeat.
 
-    The choice is final ("latched"), and the link's system id follows it. `is_carried`: see `TimeAndPlace`.
+    The choice is final, and the link adopts the autopilot's system id. `is_carried`: see `TimeAndPlace`.
 
     A real autopilot sends heartbeats with a known autopilot type and the type of a vehicle; those of ground stations,
-    gimbals, ADS-B receivers and the like are ignored. Component 1 is latched at once, another component only if it is
+    gimbals, ADS-B receivers and the like are ignored. Component 1 is chosen at once, another component only if it is
     ArduPilot or PX4 and component 1 stays silent for 2 s.
     """
 
@@ -120,9 +120,9 @@ class Vehicle:
 
     @property
     def arm_state(self) -> ArmState:
-        """ARMED or DISARMED while the latched autopilot's last heartbeat is younger than 2 s, otherwise UNKNOWN.
+        """Arm state: ARMED or DISARMED while the autopilot's last heartbeat is younger than 2 s, otherwise UNKNOWN.
 
-        ARMED for 3 s after any armed heartbeat; UNKNOWN while there is a `conflict`.
+        Any armed heartbeat means ARMED for 3 s. A `conflict` means UNKNOWN.
         """
         now_s = asyncio.get_running_loop().time()
         armed = self._arming.armed(now_s)
@@ -156,7 +156,7 @@ class Vehicle:
 
     @property
     def why_silent(self) -> str:
-        """Possible cause if the autopilot is heard but does not answer, to append to a message; may be empty."""
+        """Possible cause if an autopilot with heartbeats does not answer, to append to a message; may be empty."""
         return "; the autopilot signs its messages: does it refuse unsigned ones?" if self.signs else ""
 
     def sent(self, message: Message) -> bool:
@@ -166,7 +166,7 @@ class Vehicle:
     def hear(
         self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: FirmwareName | None = None
     ) -> None:
-        """Call `handler` with every such message of the latched autopilot; `rate_hz`: request it (`of` a firmware)."""
+        """Call `handler` with every such message of the autopilot; `rate_hz`: also request it (from firmware `of`)."""
         self._link.subscribe(message, self._of_ours(handler))
         if rate_hz is not None:
             self._wanted.add(message, rate_hz, of)
@@ -174,7 +174,7 @@ class Vehicle:
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
         """Request the time since boot and wait for it; afterwards `boots` counts every restart until now.
 
-        Otherwise a quick restart shows only when time messages arrive again. Returns False if none came in time.
+        Without this request, a quick restart shows only at the next time message. Return False if none came in time.
         """
         request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
@@ -236,7 +236,7 @@ class Vehicle:
             self._tell("armed" if armed else "disarmed")
 
     def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
-        """Check that a heartbeat with our vehicle's ids is from it: ArduPilot and PX4 are both system 1 by default."""
+        """Check that a heartbeat has our vehicle's firmware: ArduPilot and PX4 both have system id 1 by default."""
         kind = firmware_with(message.autopilot)
         if kind is self.kind:
             return True
@@ -254,7 +254,7 @@ class Vehicle:
         return True
 
     def _is_on_our_link(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
-        """Check that a heartbeat was signed on the link on which we hear the autopilot.
+        """Check that a heartbeat was signed for the link over which we receive the autopilot.
 
         The autopilot signs each of its links separately, so a delayed message of another link is recognised. Unsigned
         heartbeats (None) count until the first signed one.
@@ -301,7 +301,7 @@ class Vehicle:
             self._wanted.ask_for_missing(now_s, self.firmware)
 
     def _stalled(self, now_s: float) -> bool:
-        """Check whether our own loop was stopped, so that messages may have waited unread."""
+        """Return True if our event loop was stopped, so that messages may have waited unread."""
         return now_s - self._tick_due_s > _STALL_S
 
     def _ask_soon(self) -> None:
@@ -360,10 +360,10 @@ class Vehicle:
 
 
 class VehicleTimer:
-    """Timer since its creation, on our clock and on the autopilot's, which is slower in a simulator on a busy machine.
+    """Timer on our clock and on the autopilot's, which is slower in a simulator on a busy machine.
 
-    An autopilot does things "at most once a second" (autopilots 9.2) by its own clock. By our clock alone, a slow
-    simulator that had no time to use a value would seem to have ignored it.
+    An autopilot does things "at most once a second" (docs/reference/autopilots 9.2) by its own clock. By our clock
+    alone, a slow simulator that had no time to use a value would seem to have ignored it.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -371,7 +371,7 @@ class VehicleTimer:
         self._boot, self._boots = vehicle.boot.latest, vehicle.boots
 
     def has_passed(self, seconds: float) -> bool:
-        """Check that this time has passed on both clocks; on ours alone while the other is unknown."""
+        """Check that this time has passed on both clocks, or on ours while the autopilot's is unknown."""
         gone_s = asyncio.get_running_loop().time() - self._t_s
         if gone_s < seconds:
             return False

@@ -25,8 +25,8 @@ logger = logging.getLogger(__name__)
 LATEST_UNIX_TIME_S: Final = 4102444800.0  # the year 2100; a later time is a fault
 
 FAR_M: Final = 10_000.0
-"""Least distance that matters: it changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h at most; GNSS wanders
-by less."""
+"""Distance from which a place counts as another one: it changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h
+at most. GNSS wanders by less."""
 FAR_HEIGHT_M: Final = 300.0  # least height that matters: 0.1 mg of gravity, half of a usual target; GNSS wanders less
 
 CONFIRMED_AFTER_S: Final = 2.5  # time of reports before a first place is accepted: one packet is not enough
@@ -49,7 +49,7 @@ class Position:
 
 
 class TimeAndPlace:
-    """Time and place from messages; the caller must check that they are the autopilot's.
+    """Time and place from the autopilot's messages; the caller must check that the autopilot sent them.
 
     `is_carried` returns whether the aircraft moves, or may fly, so that its place may change.
     """
@@ -83,7 +83,7 @@ class TimeAndPlace:
         return message("position_in_doubt", change=change, seconds=f"{left_s:.0f}")
 
     def restarted(self) -> None:
-        """Forget the autopilot's reports, but keep the accepted place for comparison: the aircraft stands still."""
+        """Discard the autopilot's reports, but not the accepted place, as the aircraft stands still at a restart."""
         self.position = self._claim = self._unix_minus_loop_s = None
         self._heard_s = -math.inf
 

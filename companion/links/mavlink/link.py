@@ -1,7 +1,7 @@
 """MAVLink on one link: packing, parsing, sequence numbers, and subscriptions.
 
-The codec is pymavlink's dialect class; `mavutil` blocks, prints, and weighs 41 MiB. A transport hands received bytes
-to `receive` and gives `attach` a function that sends. Frames without a subscriber are skipped by `kind_at`.
+The codec is pymavlink's dialect class, because `mavutil` blocks, prints, and costs 41 MiB. A transport passes received
+bytes to `receive` and its `send` to `attach`. Frames without a subscriber are not decoded (`kind_at`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SI
 
 
 def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
-    """Return the kind and end offset of a complete, valid, unsigned MAVLink 2 frame; None for anything else."""
+    """Return the message type and end offset of a whole, valid, unsigned MAVLink 2 frame; None for anything else."""
     if len(data) - at < 12 or data[at] != mavlink.PROTOCOL_MARKER_V2 or data[at + 2]:
         return None
     end = at + 12 + data[at + 1]
@@ -64,12 +64,12 @@ class MavlinkLink:
         return self._codec.srcSystem
 
     def join(self, autopilot: Sender) -> None:
-        """Send under the system id of this autopilot from here on."""
+        """Send all later messages under the system id of this autopilot."""
         self.autopilot = autopilot
         self._codec.srcSystem = autopilot[0]
 
     def is_for_us(self, message: Any) -> bool:
-        """Check a message's target: this component, or 0 for all (older firmware answers to 0)."""
+        """Check that a message is for this component, or for all (target 0, as in answers of older firmware)."""
         return message.target_system in (0, self.system_id) and message.target_component in (0, self.component_id)
 
     @property
@@ -84,7 +84,7 @@ class MavlinkLink:
         self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
-        """Set or remove a transport's `send` (False: its buffer is full) and its `settled`."""
+        """Set or remove a transport: `transmit` sends bytes (False: buffer full), `settled` receives what waits."""
         self._transmit, self._settled = transmit, settled
         self._attached += 1
         self._forget_received()
@@ -130,9 +130,9 @@ class MavlinkLink:
             self._codec.buf_index = 0
 
     def receive_datagram(self, datagram: bytes, t_s: float, admit: Callable[[Sender], None]) -> None:
-        """Parse a datagram of whole messages; `admit` gets each sender before its message has any effect.
+        """Handle a datagram of whole messages; `admit` is called with each sender before its message has any effect.
 
-        `admit` is not called for a radio's own messages: they come without a signature.
+        `admit` is not called for a telemetry radio's own messages, because those carry no signature.
         """
         self.on_bytes.tell("in", datagram, t_s)
         frames = list(self._frames(datagram))
@@ -146,7 +146,7 @@ class MavlinkLink:
             self._dispatch(name, message, t_s)
 
     def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
-        """Yield name, sender and message of whole admitted frames; the message is None without a subscriber.
+        """Yield name, sender and message of each valid frame; the message is None if nobody has subscribed to it.
 
         From the first frame that `kind_at` does not recognise, the codec gets all remaining bytes.
         """

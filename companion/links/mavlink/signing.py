@@ -1,13 +1,13 @@
-"""MAVLink 2 signing: sign what is sent, verify what is received, refuse old messages.
+"""MAVLink 2 signing: sign each sent message, verify each received one, refuse old ones.
 
 Specification: mavlink.io, Message Signing. A signature is 13 bytes after the checksum: link id, 48 bits of time in
-units of 10 us since 2015, and the first 48 bits of SHA-256 over key, packet, link id and time. Verification is not
-pymavlink's: pymavlink 2.4.50 adopts the time of a packet before it checks the signature, so one forged packet from the
-far future would shut the true sender out. It also keeps a place for every claimed sender, and logs each.
+units of 10 us since 2015, and the first 48 bits of SHA-256 over key, packet, link id and time. This module does not use
+pymavlink's verification: pymavlink 2.4.50 adopts the time of a packet before it checks the signature. One forged packet
+from the far future would then shut the genuine sender out. pymavlink also stores and logs every claimed sender.
 
 A key file holds 32 raw bytes, 64 hexadecimal digits, or a passphrase. The key of a passphrase is SHA-256 of its UTF-8,
 as in MAVProxy 1.8.75 (`passphrase_to_key`), Mission Planner (`MAVAuthKeys.AddKey`) and QGroundControl until early 2026
-(`MAVLinkSigningKeys::addKey`); later QGroundControls use PBKDF2 and accept the 64 digits as a raw key.
+(`MAVLinkSigningKeys::addKey`). Later QGroundControls use PBKDF2 and accept the 64 digits as a raw key.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ EPOCH_S: Final = 1420070400
 TICKS_PER_S: Final = 100_000
 LAST: Final = 2**48 - 1
 LATE_TICKS: Final = 60 * TICKS_PER_S
-"""Largest lag of a sender relative to our time: the specification's minute for a sender's first message."""
+"""Largest lag of a sender's clock behind ours: one minute, as the specification allows for a sender's first message."""
 BEHIND_ITSELF_TICKS: Final = 5 * TICKS_PER_S
-"""Largest lag of a message relative to its sender's newest time on any link; an older one was delayed or replayed."""
+"""Largest lag of a message behind the newest one of its sender, on any link; older ones were delayed or replayed."""
 MAX_STREAMS: Final = 64
-"""Maximum number of remembered senders with the key, by system, component and link; later ones are refused."""
+"""Maximum number of remembered streams (system, component, link id) signed with our key; later ones are refused."""
 NEVER_SIGNED: Final = frozenset({mavlink.MAVLINK_MSG_ID_RADIO_STATUS, mavlink.MAVLINK_MSG_ID_RADIO})
-"""Messages that a telemetry radio adds by itself, without a key."""
+"""Messages that a telemetry radio inserts by itself, so they are unsigned."""
 EARLIEST_S: Final = 1577836800.0  # 2020: an earlier clock has not been set
 
 _SIGNED: Final = mavlink.MAVLINK_IFLAG_SIGNED
@@ -47,7 +47,7 @@ _TAIL: Final = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN
 _HASH: Final = 6
 
 Reason = Literal["unsigned", "other key", "old", "no key"]
-"""Cause of a refusal. "old": this message, or a much later one of its sender, was received before."""
+"""Cause of a refusal. "old": this message, or a much later one from its sender, was received before."""
 
 
 def uptime_s() -> float:
@@ -61,7 +61,7 @@ def ticks_of(unix_s: float) -> int:
 
 
 def sign(frame: bytes, crc_extra: int, key: bytes, link_id: int, ticks: int) -> bytes:
-    """Sign an unsigned MAVLink 2 packet. Its checksum is recomputed, because it covers the flag of signed packets."""
+    """Sign an unsigned MAVLink 2 packet; its checksum changes, because it covers the flag that marks signed packets."""
     head = bytearray(frame[:-2])
     head[2] |= _SIGNED
     crc = mavlink.x25crc(head[1:])
@@ -76,12 +76,12 @@ def _digest(key: bytes, packet: bytes | bytearray) -> bytes:
 
 
 class SigningClock:
-    """Signature time in ticks: strictly increasing, whatever the system's clock does.
+    """Clock of signature time in ticks of 10 us: strictly increasing, whatever the system's clock does.
 
-    The system's clock sets it once per boot. A later jump of the system's clock by more than a minute is refused.
-    Otherwise one wrong clock would stay in the stored time and in every receiver, and true senders would look old for
-    good. A board without a battery-backed clock starts in 1970: signature time then continues from `start` (ticks,
-    later than any used before) and adopts the time of the first message signed with our key.
+    The system's clock sets signature time once per boot. A later jump of the system's clock by more than a minute is
+    refused. Otherwise one wrong clock would stay in the stored time and in every receiver, and genuine senders would
+    look old for ever. A board without a battery-backed clock starts in 1970. Its signature time continues from `start`
+    (ticks, later than any used before) and adopts the time of the first message signed with our key.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class SigningClock:
 
 
 class Signing:
-    """Signing and verification of one link's messages. With `required` a refused message is dropped, else only counted.
+    """Signing and verification of one link's messages. Refused ones are dropped if `required`, else only counted.
 
     Without a key every message is refused.
     """
@@ -145,7 +145,7 @@ class Signing:
         return sign(frame, crc_extra, self.key, link_id=0, ticks=self.clock.next())
 
     def admits(self, frame: bytes | bytearray) -> bool:
-        """Verify a whole packet whose checksum is correct; return whether it may have any effect."""
+        """Verify a whole packet whose checksum is correct; return True if the packet may have any effect."""
         first = frame[0] == _MARKER_1
         if (frame[5] if first else int.from_bytes(frame[7:10], "little")) in NEVER_SIGNED:
             return True
@@ -194,7 +194,7 @@ MAX_FILE_BYTES: Final = 1024
 
 
 def read_key(path: Path) -> bytes:
-    """Read the 32 bytes of the key; raise LinkError, which never quotes the file, if it holds no key."""
+    """Read the 32 bytes of a key file; raise LinkError, which never quotes the file, if it holds no key."""
     try:
         with path.open("rb") as file:
             rights = os.fstat(file.fileno()).st_mode

@@ -1,6 +1,6 @@
 """Transports of a MAVLink link over UDP, TCP or a serial line; each reconnects by itself.
 
-The link is attached only while a peer, or at least an address to send to, is known.
+The MAVLink link has a transport only while a peer, or at least an address to send to, is known.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from companion.messages import message
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
-"""Peers that are sent to. Later ones are received but not answered; only the autopilot's address replaces a peer."""
+"""Maximum number of peers that get our messages; later ones are only received. The autopilot may replace a peer."""
 MOST_WAITING = 1024
-"""Most datagrams read in one pass, before any write; the kernel buffers some 300."""
+"""Maximum number of datagrams in one reading, before any write; the kernel buffers some 300."""
 MOST_DATAGRAM_BYTES = 65536
-"""Largest UDP datagram, and our read buffer. asyncio allocates four times as much for every datagram; getting that
-memory from the kernel page by page, and returning it, costs more than the rest of a read."""
+"""Largest UDP datagram, and size of our read buffer. asyncio allocates four times as much for every datagram. To get
+that memory from the kernel page by page, and return it, costs more than the rest of a read."""
 RESOLVE_DEADLINE_S = 5.0
 _TURN_S = 1.0
 _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\d+)")
@@ -35,7 +35,7 @@ Peer = tuple[Any, ...]
 
 
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
-    """Keep `link` connected through `url` until cancelled; raise LinkError if the url is wrong."""
+    """Keep `link` connected through `url` until cancelled; raise LinkError for an invalid url."""
     kind, where, number = parse_url(url)
     if kind in ("udpin", "udpout"):
         await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)
@@ -99,8 +99,8 @@ class _Udp(asyncio.DatagramProtocol):
         self.closed: asyncio.Future[None] = loop.create_future()
         self._failed: asyncio.Future[str] = loop.create_future()
         self._socket: socket.socket | None = None
-        """A second descriptor of the transport's socket. asyncio reads only one datagram per loop turn, and queues a
-        datagram for which the kernel has no room."""
+        """Duplicate of the transport's socket, for our own reads and writes. asyncio reads only one datagram per loop
+        turn, and queues a datagram for which the kernel has no room."""
 
     async def run(self) -> str:
         while not self._failed.done():
@@ -173,7 +173,7 @@ class _Speaker(_Udp):
 class _Listener(_Udp):
     """Transport for udpin: sends to every registered peer; without one the link counts as not connected.
 
-    A peer is registered once it has sent a message that may have an effect; other bytes do not count.
+    A peer is registered once it has sent a message that may have an effect; bytes without a message do not count.
     """
 
     def __init__(self, link: MavlinkLink) -> None:

@@ -1,1 +1,1 @@
-"""Serial ports: opening, reading, and their faults."""
+"""Serial ports: opening, reading, detection of devices, and faults."""

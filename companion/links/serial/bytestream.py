@@ -19,8 +19,8 @@ READ_BYTES = 4096  # size of a tty's buffer: one read empties the port, so one t
 QUICK_READS = 20
 QUICK_S = 0.0015  # mean interval of `QUICK_READS` reads; quicker reads are collected, as each byte would wake the loop
 COLLECT_S = 0.0205
-"""Pause before the next read of a quick stream, as a USB adapter does: a wake-up costs far more than its bytes.
-Slightly above the 20 ms within which an autopilot accepts one heading (autopilots 6)."""
+"""Pause before the next read of a port with many small reads: a wake-up costs far more than its bytes. Slightly above
+the 20 ms within which an autopilot accepts only one heading (docs/reference/autopilots 6)."""
 FULLEST_LINE = 0.9  # largest load of the line, as a share of its capacity, at which reads are collected
 OUT_BUFFER_BYTES = 16384
 LONGEST_PAUSE_S = 1.0
@@ -35,7 +35,7 @@ WORTH_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class PortSettings:
-    """A port and its line setting; baud and parity are ignored for `tcp://HOST:PORT`."""
+    """Serial port or `tcp://HOST:PORT`, with baud rate and parity, which are ignored for tcp."""
 
     url: str
     baud: int
@@ -50,13 +50,13 @@ class PortSettings:
 
     @property
     def seconds_per_byte(self) -> float:
-        """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp:// (unknown)."""
+        """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp:// means unknown."""
         if self.is_tcp:
             return 0.0
         return (10 if self.parity == "none" else 11) / self.baud
 
     def address(self) -> tuple[str, int]:
-        """Return host and port of a tcp:// url; raise LinkError if either is missing or wrong."""
+        """Return host and port of a tcp:// url; raise LinkError if host or port is missing or wrong."""
         try:
             parts = urlsplit(self.url)
             host, port = parts.hostname, parts.port
@@ -70,7 +70,7 @@ class PortSettings:
 class ByteLink:
     """Link that passes the bytes of one port to `on_bytes(data, t_s)` while `run` runs; reopens after every loss.
 
-    `on_state(connected, reason)` reports every change of state; `on_gap` reports that bytes were discarded. Callbacks
+    `on_state(connected, reason)` reports every change of state. `on_gap` reports that bytes were discarded. Callbacks
     must neither block nor raise.
     """
 
@@ -134,7 +134,7 @@ class ByteLink:
         return lost.result()
 
     def write(self, data: bytes) -> bool:
-        """Send `data` or queue it in the bounded buffer. Return False if closed or full: then nothing of it is sent."""
+        """Send `data` or queue it in the bounded buffer; return False, without sending any of it, if closed or full."""
         if self._descriptor is None or len(self._out) + len(data) > OUT_BUFFER_BYTES:
             return False
         waiting = bool(self._out)
@@ -198,7 +198,7 @@ class ByteLink:
             self._collecting = None
 
     def _fits_the_line(self, now_s: float) -> bool:
-        """Return whether the line could carry the byte rate since `_reads_since`; USB may exceed the line rate."""
+        """Check that the line could carry the bytes since `_reads_since`; over USB they may come faster than that."""
         since_s, bytes_then = self._reads_since
         carried = self.bytes_received - bytes_then
         return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)

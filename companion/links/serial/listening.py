@@ -1,6 +1,6 @@
 """Detection of a port's device: listen at one line setting after another until a decoder accepts it; send nothing.
 
-Opening raises DTR, which restarts boards like the Arduino: listen on request only, and never on a port in use.
+Opening a port raises DTR, which restarts boards like the Arduino. So listen on request only, never on a port in use.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from companion.protocols.guess import (
 )
 
 SILENT_S: Final = 3.0
-"""Wait at the first setting before a port is called silent: a device that sends shows bytes at any speed."""
+"""Wait at the first line setting before a port counts as silent: a sending device shows bytes at any speed."""
 LINE_S: Final = 1.0
 LINE_MOST_S: Final = 2.5
 FEW_BYTES: Final = 100
@@ -42,7 +42,7 @@ _LOOK_S: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Result of listening to a port."""
+    """Result of listening to a port: a sensor's protocol, an autopilot, another device, or nothing recognised."""
 
     line: Line | None
     candidate: Candidate | None
@@ -52,7 +52,7 @@ class Heard:
 
 
 def ports_to_try(found: Sequence[SerialPort]) -> list[str]:
-    """Return the best name of each port, without consoles: those carry a login, not a sensor."""
+    """Return the best name of each port, without system consoles, which carry a login and no sensor."""
     return [port.stable_name or port.device for port in found if not port.is_console]
 
 
@@ -75,7 +75,7 @@ async def listen_to_all(
 
 
 async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
-    """Try line settings, likely ones first, for half a minute at most; raise LinkError if it cannot be opened."""
+    """Try line settings, likely ones first, for half a minute at most; raise LinkError if the port cannot be opened."""
     if holders := [holder for holder in find_holders(path, root) if holder.pid != os.getpid()]:
         raise LinkError(in_use(path, holders))
     heard, plain = 0, dict[int, float]()

@@ -23,13 +23,13 @@ from companion.links.serial.ports import find_holders, in_use
 from companion.messages import message
 
 OPEN_DEADLINE_S = 5.0
-"""Timeout of an open: a healthy USB port opens in some milliseconds; a hung driver must not hang the daemon."""
+"""Timeout of opening a port: a healthy USB port needs some milliseconds; a hung driver must not hang the daemon."""
 
 DRIVER_REFUSES = "the driver refuses"
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
-    """Open a port raw, non-blocking, 8 data bits, one stop bit, no flow control. This call blocks with its driver."""
+    """Open a port: raw, non-blocking, 8 data bits, one stop bit, no flow control. A slow driver blocks this call."""
     import serial  # costs 10 ms: imported only if there is a serial port
 
     try:
@@ -55,7 +55,7 @@ def open_serial(path: str, baud: int, parity: Parity) -> int:
 
 
 def close_serial(descriptor: int) -> None:
-    """Unlock and close a port: a pseudo-terminal would keep the exclusive lock while its other end is open."""
+    """Unlock and close a port: a pseudo-terminal would keep the exclusive lock while its peer end is open."""
     with contextlib.suppress(OSError):  # gone already, or a socket
         fcntl.ioctl(descriptor, termios.TIOCNXCL)
     os.close(descriptor)
@@ -133,7 +133,7 @@ def _is_character_device(path: str) -> bool:
 class SerialOpener:
     """Opens one port without blocking the event loop or the exit of the process.
 
-    A hung driver may block for ever, so each attempt runs in a daemon thread: asyncio would wait for its own threads.
+    A hung driver may block for ever, so each attempt runs in a daemon thread. asyncio would wait for its own threads.
     """
 
     def __init__(self, path: str, baud: int, parity: Parity) -> None:
@@ -141,7 +141,7 @@ class SerialOpener:
         self._thread: threading.Thread | None = None
 
     async def open(self) -> int:
-        """Open the port and return its descriptor; raise LinkError with port and cause."""
+        """Open the port and return its descriptor; raise LinkError that names the port and the cause."""
         if self._thread is not None and self._thread.is_alive():
             raise LinkError(message("port_cannot_be_opened", port=self._path, reason="the driver hangs"))
         loop = asyncio.get_running_loop()

@@ -1,7 +1,7 @@
-"""Serial ports: stable names, holders, and faults of the system such as consoles, ModemManager and slow timers.
+"""Serial ports: stable names, processes that use them, and faults such as consoles, ModemManager and slow timers.
 
-Read from sysfs, /dev/serial and /proc below a `root` that a test may replace; a file that cannot be read shows no
-fault. pyserial's list hides platform UARTs.
+All facts come from sysfs, /dev/serial and /proc below a `root` that a test may replace; an unreadable file shows no
+fault. pyserial's list is not used, because it hides platform UARTs.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ _TEXT_LIMIT = 80
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """A process that has the port open."""
-
     pid: int
     name: str
 
@@ -67,7 +65,7 @@ def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
 
 
 def in_use(port: str, holders: Sequence[Holder]) -> str:
-    """Return the message that other programs have the port open; without rights their names are unknown."""
+    """Return the message that a port is in use; `holders` is empty if the rights to see the programs are missing."""
     programs = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
     return message("port_in_use", port=port, programs=f" ({programs})" if programs else "")
 
@@ -104,12 +102,12 @@ def _describe(
 
 
 def _has_hardware(entry: Path) -> bool:
-    """Check for hardware: virtual consoles and ptys have no device; the 8250 driver lists absent ports as type 0."""
+    """Check that a tty has hardware: virtual consoles and ptys have no device, absent ports of 8250 have type 0."""
     return (entry / "device").exists() and _number(entry / "type", 10) != 0
 
 
 def _driver(hardware: Path) -> str | None:
-    """Return the hardware's driver; newer kernels insert two nodes of the serial core in the path."""
+    """Return the name of a port's driver; newer kernels insert two nodes of the serial core in the path."""
     for node in (hardware, *hardware.parents[:2]):
         link = node / "driver"
         if link.is_symlink() and link.resolve().name not in ("port", "ctrl"):
@@ -137,7 +135,7 @@ def _links_by_device(root: Path) -> dict[str, list[str]]:
 
 
 def resolve(root: Path, name: str) -> str:
-    """Follow the links of a name below `root`; return the device's path without `root`."""
+    """Follow the symbolic links of a device name below `root`; return the device's path without `root`."""
     for _ in range(8):
         path = root / name.lstrip("/")
         try:
@@ -173,7 +171,7 @@ def _consoles(root: Path) -> set[str]:
 
 
 def entries(folder: Path) -> Iterator[Path]:
-    """Yield the entries of a folder, sorted by name; none if it cannot be read."""
+    """Yield the entries of a folder, sorted by name; nothing if the folder cannot be read."""
     try:
         yield from sorted(folder.iterdir())
     except OSError:
@@ -181,7 +179,7 @@ def entries(folder: Path) -> Iterator[Path]:
 
 
 def read_attribute(path: Path, limit: int = _TEXT_LIMIT) -> str | None:
-    """Read a one-line attribute, shortened and without control characters: a device may report any text."""
+    """Read a one-line sysfs or procfs file, shortened and made printable, as a device may report any text."""
     try:
         raw = path.read_bytes()[:limit]
     except OSError:
@@ -204,7 +202,7 @@ _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 @dataclass(frozen=True, slots=True)
 class PortFault:
-    """One fault of a port as text, and the command that repairs it; `good`: it is only a warning."""
+    """One fault of a port as text, and the command that repairs it; `good`: only a warning."""
 
     words: str
     remedy: str
@@ -218,7 +216,7 @@ def port_faults(
     port: str, *, is_fast: bool = False, ours: Sequence[int] = (), among: Sequence[SerialPort] | None = None,
     root: Path = ROOT,
 ) -> list[PortFault]:  # fmt: skip
-    """List the faults of a port, worst first. `is_fast`: an IMU; `ours`: our processes; `among`: all ports."""
+    """List the faults of a port, worst first. `is_fast`: an IMU; `ours`: our process ids; `among`: all ports."""
     device = resolve(root, port)
     ports = list_ports(root) if among is None else among
     found = next((one for one in ports if one.device == device), None)
@@ -247,7 +245,7 @@ def port_faults(
 
 
 def same_ports(configured: dict[str, str], root: Path = ROOT) -> list[tuple[str, str, str]]:
-    """List pairs of configured ports that are one device under two names, each with that device."""
+    """List pairs of configuration entries that are one device under two port names, each pair with that device."""
     seen: dict[str, str] = {}
     found = []
     for name, port in configured.items():

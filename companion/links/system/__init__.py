@@ -1,1 +1,1 @@
-"""Common parts of all links: TCP, retries, budgets, the service manager."""
+"""Common parts of all links: TCP, retries, limits on incoming bytes, child processes, the service manager."""

@@ -31,10 +31,10 @@ OnState = Callable[[bool, str], object]
 
 
 class Reconnection:
-    """Retry loop of one connection. It is reopened after every loss and logs one warning per outage.
+    """Retry loop of one connection: reopens it after every loss and logs one warning per outage.
 
-    The backoff doubles from `first_s` to `cap_s`. It restarts at `first_s` after a connection that lasted `worth_s` or
-    after `reset`. There is no jitter: each end has few clients.
+    The pause before a retry doubles from `first_s` to `cap_s`. It restarts at `first_s` after a connection that lasted
+    `worth_s` or after `reset`. There is no jitter: each server has few clients.
     """
 
     def __init__(
@@ -138,12 +138,12 @@ async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, add
 
 
 BYTES_PER_S: Final = 262144.0
-"""Limit above the rate of any sensor: an IMU at 1 kHz with frames of 200 bytes, plus a margin; 2.6 Mbaud."""
+"""Limit of incoming bytes, above any sensor's: an IMU at 1 kHz with frames of 200 bytes, plus a margin; 2.6 Mbaud."""
 BURST_BYTES: Final = 65536.0
 
 
 class Budget:
-    """Token bucket of bytes: fills at a constant rate; every read withdraws its size."""
+    """Token bucket that limits bytes: it fills at a constant rate, and every read withdraws its size."""
 
     def __init__(self, bytes_per_s: float = BYTES_PER_S, burst_bytes: float = BURST_BYTES) -> None:
         self._bytes_per_s, self._burst_bytes = bytes_per_s, burst_bytes
@@ -155,7 +155,7 @@ class Budget:
         return min(self._left + gained, self._burst_bytes)
 
     def spend(self, count: int, now_s: float) -> bool:
-        """Withdraw `count`; if the bucket holds less, empty it and return False."""
+        """Withdraw `count` bytes; if the bucket holds fewer, empty it and return False."""
         self._left, self._t_s = self.left(now_s) - count, now_s
         if self._left >= 0.0:
             return True
@@ -168,7 +168,7 @@ READ_TIMEOUT_S: Final = 10.0
 
 
 async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
-    """Send one request and yield the replies; raise DaemonUnreachableError unless a daemon answers completely."""
+    """Send one request to the daemon and yield its replies; raise DaemonUnreachableError if not all arrive."""
     try:
         reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
     except OSError as error:
@@ -197,7 +197,7 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
 
 
 async def write_line(writer: asyncio.StreamWriter, reply: Object) -> None:
-    """Send one JSON object; raise ConnectionError if the peer is gone or does not read."""
+    """Send one JSON object; raise ConnectionError if the peer is gone or does not read it in time."""
     writer.write(msgspec.json.encode(reply) + b"\n")
     try:
         async with asyncio.timeout(READ_TIMEOUT_S):

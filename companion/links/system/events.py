@@ -1,4 +1,4 @@
-"""Listeners to an event, and waiting for one with a time limit."""
+"""Lists of event listeners, and a wait for an asyncio.Event with a time limit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Unsubscribe = Callable[[], None]
 
 
 class Listeners(Generic[P]):
-    """Callbacks, called in the order of their subscription; a failing one does not stop the others."""
+    """List of callbacks, called in the order of their subscription; a failing one does not stop the others."""
 
     def __init__(self) -> None:
         self._callbacks: list[Callable[P, object]] = []

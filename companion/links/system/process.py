@@ -40,7 +40,7 @@ BURST: Final = 10.0
 
 
 class LimitedHandler(logging.StreamHandler[TextIO]):
-    """Log handler with a rate limit per call site and level; `clock`: monotonic seconds."""
+    """Log handler that limits the rate of lines per place in the code and level; `clock`: monotonic seconds."""
 
     def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(stream)
@@ -64,7 +64,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
 
 
 class OneLineFormatter(logging.Formatter):
-    """Formatter of one line per message, whatever received bytes it quotes; only a traceback has more lines."""
+    """Formatter that writes one line per message, even if the message quotes line ends; tracebacks have more lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         said = copy.copy(record)
@@ -90,7 +90,7 @@ def set_up_logs(level: str) -> None:
 
 
 def goes_to_journal(stream: TextIO) -> bool:
-    """Return whether JOURNAL_STREAM names this stream; a redirected process inherits the variable too."""
+    """Check that `stream` is the one in JOURNAL_STREAM; a process with redirected output inherits the variable too."""
     named = os.environ.get("JOURNAL_STREAM")
     if named is None:
         return False
@@ -102,7 +102,7 @@ def goes_to_journal(stream: TextIO) -> bool:
 
 
 class ServiceManager:
-    """Client of the service manager at a path or "@" name, if any; `watchdog_s`: longest time between WATCHDOG=1."""
+    """Client of systemd's notify socket, if `address` is set; `watchdog_s`: longest time between WATCHDOG=1."""
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
         self._address = address or ""
@@ -168,9 +168,9 @@ REPORT_EVERY_S: Final = 1.0
 NICENESS: Final = 19  # the daemon must answer an arming request within 20 ms, however busy its children are
 OUT_OF_MEMORY: Final = 12  # exit code of a child that needed more than its limit: ENOMEM
 STACK_BYTES: Final = 1024 * 1024
-"""Stack of a thread. It counts as data; the default of 8 MiB would use up the memory limit."""
+"""Stack size of a thread. The default of 8 MiB would count as data and use up the memory limit."""
 OOM_SCORE: Final = "900"
-"""Score at which the kernel, out of memory, kills a child before any other process."""
+"""Score with which the kernel, out of memory, kills a child process before other processes."""
 
 
 class ChildSettings(msgspec.Struct, frozen=True):
@@ -182,8 +182,6 @@ class ChildSettings(msgspec.Struct, frozen=True):
 
 
 class ChildWork(Protocol):
-    """Work of a child process."""
-
     async def run(self) -> None:
         """Work until cancelled."""
 
@@ -192,7 +190,7 @@ class ChildWork(Protocol):
 
 
 def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) -> None:
-    """Run a child process until its daemon ends; an allocation beyond `memory_mib` of data ends the child."""
+    """Run a child process until its daemon ends. A child that allocates more than `memory_mib` of data ends itself."""
     limit = memory_mib * 1024 * 1024
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     threading.stack_size(STACK_BYTES)

@@ -5,8 +5,8 @@ r"""Honeywell HMR3300 (three axes) and HMR3200 (two): lines of numbers, no check
     1256, -234, -1894\r\n      magnetometer counts (mode *M): no decimal point in any field
     #I\r\n                     the answer to an unknown command
 
-Source: Honeywell's HMR3200/HMR3300 data sheet: 19200 baud 8N1, 8 lines/s. Since nothing marks a line's start, a line
-is accepted only after a whole line end: the remainder "3.4, 18.6, -0.5" of a line looks like a valid line.
+Source: Honeywell's HMR3200/HMR3300 data sheet: 19200 baud 8N1, 8 lines/s. Nothing marks a line's start. So a line is
+accepted only after a whole line end, because the end of a cut line, "3.4, 18.6, -0.5", looks like a valid line.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _COUNTS = re.compile(rb"[+-]?\d{1,6}")
 _FRAGMENT = re.compile(rb"[-+0-9., ]+")
 _COUNTS_LIMIT = 32768
 _SURE = 3
-"""After this many lines of three numbers in a row, a single number is rejected as a fragment until more follow."""
+"""Lines of three numbers in a row after which a single number is a fragment, until as many single numbers follow."""
 
 
 class Hmr3300Decoder(LineDecoder):
-    """Lines of an HMR3300 or HMR3200; gives `CompassSample`, or `MagSample` in counts in mode *M."""
+    """Decoder of HMR3300 and HMR3200 lines into `CompassSample`, or `MagSample` with counts in mode *M."""
 
     LIMIT: ClassVar[int] = 40
     _follows_line_end = True

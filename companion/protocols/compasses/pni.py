@@ -3,9 +3,9 @@
     00 10 | 05 | 02 | 05 43 B3 F3 33 | 18 41 28 00 00 | 5C 2D      kGetDataResp: heading 359.9, pitch 10.5
 
 A frame is its whole length (16 bits, big-endian), a frame id, a payload, and a CRC-16/XMODEM, big-endian, over all
-before it. Nothing marks its beginning: each offset with a possible length and id is tried. A data frame lists
-its own components. Sources: PNI TCM3/TCM5 manual r12 p. 33-43, TCM manual r06 p. 36-47, TRAX manual r06 p. 10 and
-36-50; PNI's own pni-sdk-rs for component 88. Pitch is positive nose up, roll right side down (TRAX p. 10).
+bytes before the CRC. Nothing marks the beginning of a frame: each offset with a possible length and id is tried. A data
+frame lists its own components. Sources: PNI TCM3/TCM5 manual r12 p. 33-43, TCM manual r06 p. 36-47, TRAX manual r06 p.
+10 and 36-50; PNI's own pni-sdk-rs for component 88. Pitch is positive nose up, roll right side down (TRAX p. 10).
 
 Floats are big-endian by default (kBigEndian, TRAX p. 42), but the device can save the other order. A little-endian
 heading, read as big-endian, may be a small number that looks valid. So both orders are tried on all floats of a frame:
@@ -29,7 +29,7 @@ SHORTEST: Final = 5
 LONGEST: Final = 200
 
 DISTORTION: Final = "magnetic distortion"
-"""Rejection: the device reports its magnetometer out of range (80 to 150 uT by model), so its heading is invalid."""
+"""Rejection: the device reports its magnetometer out of range (80 to 150 uT by model), so the heading is invalid."""
 HEADING_UNSURE: Final = "heading unsure"
 """Rejection: the device reports a heading error of more than 10 degrees (TRAX p. 49, kHeadingStatus 3)."""
 NOT_CALIBRATED: Final = "not calibrated by the user"
@@ -138,7 +138,7 @@ def _possible(names: list[int], values: tuple[float, ...]) -> bool:
 
 
 def _components(frame: bytes, size: int) -> list[tuple[int, int]]:
-    """List the components in the received part of a frame of `size` bytes, with the offsets of their values."""
+    """List the components (id, offset of its value) in the received part of a frame of `size` bytes."""
     here, last = 4, size - 2
     parts: list[tuple[int, int]] = []
     for _ in range(frame[3] if len(frame) > 3 else 0):

@@ -1,1 +1,1 @@
-"""Framing, checks, clocks and dialogues of all decoders."""
+"""Common parts of all decoders: framing, checks, clocks, and commands to devices."""

@@ -19,7 +19,7 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
 AHEAD_S = 0.5
-"""Seconds by which bytes may come earlier than the baud rate permits; earlier ones have none (USB without a UART)."""
+"""Seconds by which bytes may be earlier than the baud rate permits; beyond that the line time is 0 (USB, no UART)."""
 _STALL_S = 10.0
 
 NO_FRAME: Final = 0
@@ -28,7 +28,7 @@ ECHO: Final = "echo of a command"  # own command, or one of another master, on a
 
 
 class RejectedError(Exception):
-    """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Decoders always catch it."""
+    """Error of a frame that cannot be used; its reason is a counter of `Decoder.rejected`. Decoders always catch it."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -39,7 +39,7 @@ class Decoder(ABC):
     """Finds frames in the bytes of one device; a subclass checks and decodes each frame.
 
     `seconds_per_byte` is the line time of one byte, 0 if unknown (sockets, USB). `ImuSample.t_device_s` wraps to 0
-    after `device_clock_wraps_s`, `ImuSample.sequence` after `sequence_modulus`; None: the protocol has no such value,
+    after `device_clock_wraps_s`, `ImuSample.sequence` after `sequence_modulus`. None: the protocol has no such value,
     or it never wraps.
     """
 
@@ -52,7 +52,7 @@ class Decoder(ABC):
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
         self.frame_bytes = self._earlier_bytes = 0
-        """Length of the latest frame, and of earlier frames of the same reading."""
+        """Length of the latest frame, and length of earlier frames of the same reading."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0
@@ -61,7 +61,7 @@ class Decoder(ABC):
         self._buffer = b""  # bytes of a possible frame; never longer than the longest frame
         self._received = self._origin = 0  # stream positions of the last byte and of the buffer
         self._chunks: deque[tuple[int, float]] = deque()
-        """End of each chunk (as a stream position) that still has bytes in the buffer, and the time of its read."""
+        """Chunks that still have bytes in the buffer: stream position of each one's end, and time of its read."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
         samples = self.feed(data, t_s)
@@ -80,7 +80,7 @@ class Decoder(ABC):
         self._read_s = t_s
 
     def feed(self, data: bytes, t_s: float) -> list[Sample]:
-        """Decode bytes read at `t_s` on the host's clock; a sample's time is that of its frame's last byte."""
+        """Decode bytes read at `t_s` on the host's clock. The time of a sample is that of its frame's last byte."""
         if not data:
             return []
         self._received += len(data)
@@ -109,7 +109,7 @@ class Decoder(ABC):
         self._chunks.clear()
 
     def _take(self, buffer: bytes, at: int, samples: list[Sample]) -> int:
-        """Append the samples of the frame at `at`, if there is one; return the bytes to skip, or `WAIT`."""
+        """Append the samples of the frame at `at`, if one is there; return the number of bytes to skip, or `WAIT`."""
         try:
             size = self._size(buffer, at)
             if size <= 0:  # NO_FRAME or WAIT
@@ -137,7 +137,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def _size(self, buffer: bytes, at: int) -> int:
-        """Return the length of the frame at `at`, `NO_FRAME`, or `WAIT`.
+        """Return the length of the frame at `at`, `NO_FRAME` for none, or `WAIT` if more bytes are needed.
 
         IndexError means `WAIT` too; RejectedError counts the frame and skips only its first byte.
         """
@@ -162,7 +162,7 @@ def xor_checksum(body: bytes) -> int:
 
 
 def body_of_sentence(sentence: bytes) -> bytes:
-    """Return the body of `$body*hh`, or of VectorNav's CRC-16/XMODEM `*hhhh` (UM001, 3.8); raise RejectedError."""
+    """Return the body of `$body*hh`, or VectorNav's `$body*hhhh` (CRC-16/XMODEM, UM001 3.8); raise RejectedError."""
     body, _, digits = sentence[1:].rpartition(b"*")
     if len(digits) not in (2, 4) or sentence[-1 - len(digits)] != ord("*"):
         raise RejectedError("no checksum")
@@ -179,7 +179,7 @@ GYRO_LIMIT_RAD_S = 100.0  # 5730 deg/s; the widest ranges sold are 4000 deg/s
 ACCEL_LIMIT_M_S2 = 2000.0  # 204 g; the widest range of a part with a gyro in it is 200 g
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Limit for an IMU, also in kelvin or tenths: `estimation/collector/intake.py:Thermometer` reports impossible degC."""
+"""Limit for an IMU, also in kelvin or tenths; `estimation/collector/intake.py` reports impossible values in degC."""
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:
@@ -193,7 +193,7 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
 
 
 DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
-"""Bytes that text never contains: the parity or the baud rate is wrong."""
+"""Bytes that text never contains; they mean that the parity or the baud rate is wrong."""
 
 
 def out_of_range(value: float) -> RejectedError:
@@ -201,7 +201,7 @@ def out_of_range(value: float) -> RejectedError:
 
 
 def full_circle(heading_deg: float) -> float:
-    """Return the heading, with 360.0 (359.96 rounded) as 0; raise RejectedError outside 0 to 360 deg."""
+    """Return the heading, but 0 for 360 deg (359.96 rounded); raise RejectedError outside 0 to 360 deg."""
     if heading_deg == 360.0:
         return 0.0
     if not 0.0 <= heading_deg < 360.0:
@@ -210,13 +210,12 @@ def full_circle(heading_deg: float) -> float:
 
 
 def check_vector(vector: Vector) -> None:
-    """Raise RejectedError if a component is not finite."""
     if not math.isfinite(sum(vector)):
         raise RejectedError("non-finite")
 
 
 class LineDecoder(Decoder):
-    r"""Decoder of lines that end in "\n". From a longer line it passes on the last `LIMIT` bytes, marked as cut."""
+    r"""Decoder of lines that end in "\n". Only the last `LIMIT` bytes of a longer line are decoded, as `cut`."""
 
     START = re.compile(rb".", re.DOTALL)
     LIMIT: ClassVar[int] = 80
@@ -245,7 +244,7 @@ class LineDecoder(Decoder):
 
     @abstractmethod
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
-        r"""Decode one line, without its "\n"; None: valid, but no sample (yet). Raise RejectedError to count it."""
+        r"""Decode one line without its "\n"; None: valid, but no sample (yet). Raise RejectedError to count it."""
 
 
 class SentenceDecoder(Decoder):
@@ -274,4 +273,4 @@ class SentenceDecoder(Decoder):
 
     @abstractmethod
     def _read(self, body: bytes, t_s: float) -> list[Sample]:
-        """Return the samples of a body whose checksum is right; RejectedError or ValueError reject it."""
+        """Decode a body whose checksum is right; RejectedError or ValueError count it as a frame without a sample."""

@@ -1,9 +1,9 @@
 """Times of samples on the host's clock, from a device's own clock and its counter.
 
-A read is delayed by the line, a USB adapter, or a busy host. The offset between the two clocks is the running minimum
-of (read - device), which may creep upwards as two crystals drift apart: causal, and immune to stalls (sensors 4.4).
-If the clock went back or fell behind, the device has restarted. If it jumped forward, the device was replaced or the
-host slept. Both start a new mapping.
+A read is delayed by the line, a USB adapter, or a busy host. So the offset between the two clocks is the running
+minimum of (read time - device time). The minimum may creep upwards, because two crystals drift apart. This estimate is
+causal and immune to stalls (docs/reference/sensors 4.4). If the device's clock went back or fell behind, the device has
+restarted. If it jumped forward, the device was replaced or the host slept. Both start a new mapping.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ import msgspec
 from companion.samples import ImuSample, Sample
 
 CREEP: Final = 100e-6
-"""Largest rise of the minimum, s/s: two crystals of 50 ppm. A ceramic resonator needs steps of `STEP_S` as well."""
+"""Largest rise of the minimum offset, s/s: two crystals of 50 ppm. A ceramic resonator also needs steps of `STEP_S`."""
 
 STEP_S: Final = 0.005
-"""Delay, s: if all samples of a `SPAN_S` exceed it, the offset itself has changed."""
+"""Delay, s; if all samples of a `SPAN_S` are later than this, the offset between the clocks itself has changed."""
 SPAN_S: Final = 1.0
 SPAN_SAMPLES: Final = 20  # fewest samples in a span: a USB adapter may delay all of a smaller number
 
 LATE_S: Final = 1.0
-"""Largest delay of a sample, s; a later one is dropped: it is too old, or its clock is wrong."""
+"""Largest delay of a sample, s; a later sample is dropped, because it is too old or its clock is wrong."""
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
-"""Tolerance to recognise a wrap: largest stall, and share by which the rates of the two clocks may differ."""
+"""Share by which the two clocks' rates may differ when a wrap is recognised; a stall may add `_WRAP_S`."""
 LATE: Final = "late"
 
 
 class DeviceClock:
-    """Map from one device's clock to the host's. The device's clock wraps to 0 after `wraps_s`; None: never."""
+    """Conversion of one device's clock to the host's. The device's clock wraps to 0 after `wraps_s`; None: never."""
 
     def __init__(self, wraps_s: float | None) -> None:
         self.breaks = 0  # number of breaks: restarts, replacements or pauses of the device
@@ -56,7 +56,7 @@ class DeviceClock:
         return arrival_s
 
     def remap(self) -> None:
-        """Discard the offset: the arrival times of earlier samples were wrong."""
+        """Discard the offset between the clocks, because the arrival times of earlier samples were wrong."""
         self._offset_s = math.nan
 
     def host_s(self, raw_s: float, arrival_s: float) -> float | None:
@@ -109,7 +109,7 @@ class DeviceClock:
 
 
 class SampleTimes:
-    """Time stamps for the samples of one device, and its unwrapped counter."""
+    """Assigns host times and unwrapped counter values to the samples of one device."""
 
     def __init__(self, clock_wraps_s: float | None = None, sequence_modulus: int | None = None) -> None:
         self.clock = DeviceClock(clock_wraps_s)
@@ -120,7 +120,7 @@ class SampleTimes:
         self._newest_s = -math.inf
 
     def place(self, samples: list[Sample], read_s: float, frame_s: float = 0.0) -> list[Sample]:
-        """Return one feed's samples with host times; `frame_s`, the line time of a frame, is subtracted from each."""
+        """Return samples with host times; `frame_s`, the line time of a whole frame, is subtracted from each time."""
         placed: list[Sample] = []
         frame_at_s, frame_t_s = math.nan, math.nan
         clock = self.clock
@@ -155,7 +155,7 @@ class SampleTimes:
         return t_s
 
     def _counted(self, raw: int, *, anew: bool) -> int:
-        """Unwrap the counter; after a step back continue with the next number, so that no sample seems lost."""
+        """Unwrap the counter. After a step back continue with the next number, so that no sample seems lost."""
         last, self._raw_sequence = self._raw_sequence, raw
         if last is None:
             self._sequence = raw

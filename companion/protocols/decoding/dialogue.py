@@ -1,6 +1,6 @@
 """Polls, and commands that start a stopped stream. Pure: the caller passes the time and sends the bytes.
 
-No command is sent that a device stores or toggles, none while it streams, and none with `read_only = true`.
+No command is sent that a device stores or that toggles a mode, none while it streams, none with `read_only = true`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LONGEST_PAUSE_S: Final = 64.0
 
 
 class Dialogue(ABC):
-    """Questions and commands to one device; it continues when the port is opened again."""
+    """Requests and commands to one device; the dialogue starts anew when the port is opened again."""
 
     words = ""
 
@@ -28,21 +28,21 @@ class Dialogue(ABC):
 
     @abstractmethod
     def heard(self, data: bytes, samples: int, t_s: float) -> None:
-        """Record received bytes and the number of samples decoded from them; call after decoding."""
+        """Record received bytes and the number of samples decoded from them; call this after decoding."""
 
     @abstractmethod
     def due(self, t_s: float) -> bytes:
-        """Return the bytes to send now, or none; called every 20 ms or so, and after every `heard`."""
+        """Return the bytes to send now, or none. The caller asks every 20 ms or so, and after every `heard`."""
 
 
 class PollDialogue(Dialogue):
-    """Poll of single readings: the next question follows the last answer; none while the device streams by itself."""
+    """Polls single readings: the next request follows the last answer; none while the device streams by itself."""
 
     def __init__(self, question: bytes, name: str, *, period_s: float, set_up: bytes = b"") -> None:
         self.period_s = period_s
         self._question, self._name = question, name
         self._first = set_up + question
-        """First question, with the set-up; also sent after an unanswered one: the device may have lost its power."""
+        """First request, with set-up; also sent after an unanswered request, as the device may have lost its power."""
         self._quiet_until_s = self._next_s = 0.0
         self._asked_s: float | None = None  # Time of the pending question; None: answered
         self._since_asked = self._unanswered = 0

@@ -2,8 +2,8 @@ r"""Text line of this project for an IMU on a microcontroller; defined in docs/i
 
     $IMU,<seq>,<t_us>,<gx>,<gy>,<gz>,<ax>,<ay>,<az>,<T>*hh\r\n
 
-`seq` counts samples modulo 2^16, `t_us` is the board's clock in microseconds modulo 2^32, rates in rad/s, specific
-force in m/s^2, `T` in degrees Celsius or empty; `hh` is the exclusive or of everything between "$" and "*".
+`seq` counts samples modulo 2^16. `t_us` is the board's clock in microseconds modulo 2^32. Rates are in rad/s, specific
+force in m/s^2, `T` in degrees Celsius or empty. `hh` is the exclusive or of everything between "$" and "*".
 """
 
 from __future__ import annotations

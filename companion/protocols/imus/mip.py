@@ -3,8 +3,8 @@
     75 65  set  length  (length, descriptor, data)...  F1 F2        big-endian; F1 F2: 8-bit Fletcher over all before
 
 Source: 3DM-GX5-35 data communications protocol manual, p. 12; MicroStrain's `mip_sdk`. Fields used from the sensor data
-(set 0x80): 0x04 accelerometer in g, 0x05 gyro in rad/s, 0x12 GPS time of week in seconds, which is the device's own
-clock until it has a GPS time. Accelerometer and gyro must be set to the same rate: they then share a packet, and only a
+(set 0x80): 0x04 accelerometer in g, 0x05 gyro in rad/s, 0x12 GPS time of week in seconds. Until the device has a GPS
+time, 0x12 is its own clock. Accelerometer and gyro must be set to the same rate: they then share a packet, and only a
 pair makes a sample. Axes are X forward, Y right, Z down: level and at rest z reads -1 g. A unit with X forward and its
 base down has the mounting ROTATION_NONE.
 """
@@ -29,8 +29,6 @@ _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class MipDecoder(Decoder):
-    """Decoder of MIP packets into `ImuSample`."""
-
     device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week
 
     START = re.compile(rb"\x75(?:\x65|\Z)")
@@ -76,6 +74,6 @@ def fletcher(data: bytes) -> bytes:
 
 
 class MipDialogue(WakeDialogue):
-    """Base command 0x06: an idle device resumes the outputs of its settings (mip_sdk: "out of idle mode")."""
+    """Base command 0x06, resume: an idle device sends its configured outputs again (mip_sdk: "out of idle mode")."""
 
     SAYINGS = ((bytes.fromhex("756501020206E5CB"), "stream resumed with MIP command 01 06"),)

@@ -2,8 +2,8 @@ r"""Sensonor (Safran) STIM300 and STIM318: gyros, accelerometers, inclinometers 
 
     id  (3 x int24, status)...  counter  latency (us)  CRC-32  [CR LF]        big-endian
 
-Source: TS1524 rev. 31. Scales: rate 2^-14 deg/s, inclination 2^-22 g, temperature 2^-8 degC; acceleration 2^-19 g for
-a unit of 10 g, which is assumed, 2^-20 for 5 g, 2^-18 for 30 g, 2^-16 for 80 g (2^-21 for the former 2 g).
+Source: TS1524 rev. 31. Units: rate 2^-14 deg/s, inclination 2^-22 g, temperature 2^-8 degC. Acceleration: 2^-19 g for a
+range of 10 g, which is assumed, 2^-20 for 5 g, 2^-18 for 30 g, 2^-16 for 80 g (2^-21 for the former 2 g).
 
 *Range*: only the configuration datagram (table 5-16), sent at power-on, names the unit's range. The range of a unit
 that already runs is found from gravity: a second at rest shows 1 g in one range only, because ranges differ by factors
@@ -11,11 +11,11 @@ of two. Until the range is known, samples far from 1 g in the assumed range are 
 
 *Time*: a sample is older than its datagram by the latency. *Counter*: internal samples, 2000 a second, modulo 256.
 
-*Axes* are those of figure 6-4; a cluster reads +1 g on the axis that points up. The inclinometers become a
-`TiltSample` of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity. So y,
-nose up, is asin(X / |g|). And x, right side down, is -asin(Y / |g|) with Z down (Y right), or +asin(Y / |g|) with Z up
-(Y left). The unit may lie on either side, with X forward. Beyond 60 degrees there is no `TiltSample`. Rates and
-forces stay in the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
+*Axes* are those of figure 6-4; a cluster reads +1 g on the axis that points up. The inclinometers become a `TiltSample`
+of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity. So y, nose up, is
+asin(X / |g|). And x, right side down, is -asin(Y / |g|) with Z down (Y right), or +asin(Y / |g|) with Z up (Y left).
+The unit may lie on either side, with X forward. Beyond 60 degrees there is no `TiltSample`. Rates and forces stay in
+the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
 
 Datagrams: tables 5-13 to 5-23. Earlier revisions have datagrams with AUX (0x98 to 0x9C, 0xAD to 0xAF), rev. 31 has PPS
 instead (0xF0 to 0xF7); both add one cluster of a 24-bit value and a status byte.
@@ -42,10 +42,10 @@ SPECIAL_BYTES: Final[dict[int, int]] = {
     **dict.fromkeys((0xBE, 0xBF), 21),  # extended error
     **dict.fromkeys((0xD1, 0xD2), 40),  # bias trim
 }
-"""Sizes, CRC included, of the datagrams sent at start-up or on demand; the second id of each pair ends in CR LF."""
+"""Sizes, CRC included, of datagrams sent at start-up or on demand, by id; the second id of each pair ends in CR LF."""
 
 _VECTOR = "bHbHbHB"
-"""Three 24-bit numbers, each as its signed first byte and the rest, and the cluster's status byte."""
+"""Struct format of three 24-bit numbers, each as its signed first byte and the rest, and of a status byte."""
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
@@ -83,9 +83,9 @@ FRAME_BYTES: Final = {name: values.size + CRC_BYTES for name, (values, _) in NOR
 
 
 def is_whole(frame: bytes) -> bool:
-    """Check the CRC-32/MPEG-2 at the end of a datagram, which is padded with zeros to whole words.
+    """Check the CRC-32/MPEG-2 at the end of a datagram; it covers the datagram, padded with zeros to whole words.
 
-    CRC-32/MPEG-2 is zlib's CRC with reversed bit order and no final inversion: so zlib runs over mirrored bytes.
+    CRC-32/MPEG-2 is zlib's CRC with reversed bit order and no final inversion, so zlib runs over mirrored bytes.
     """
     mirrored = frame.translate(_REVERSED)
     body = mirrored[:-CRC_BYTES]
@@ -105,7 +105,7 @@ REST_DEG_S: Final = 3.0  # the fastest rate that counts as "at rest"; a turn-on 
 _ASSUMED_BITS = 19
 _BITS = (16, 18, 19, 20, 21)
 _RANGE_CODES = {0: 19, 2: 21, 3: 20, 4: 18, 6: 16}
-"""Fraction bits of the acceleration by range code: a nibble of bytes 17 and 18 of the configuration datagram."""
+"""Exponent n of the acceleration's unit 2^-n g, by range code: a nibble of the configuration's bytes 17 and 18."""
 _GYRO_SCALE: Final = DEG / 2**14
 _GYRO_UNIT, _ACCEL_UNIT, _INCLINATION_UNIT, _ACCEL_RANGE = 5, 8, 11, 17
 

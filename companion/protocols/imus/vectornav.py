@@ -6,11 +6,10 @@ r"""VectorNav VN-100 and relatives: ASCII and binary asynchronous outputs on one
 
 Source: VectorNav UM001. Axes are X forward, Y right, Z down; level and at rest the accelerometer reads z = -9.8.
 
-A binary frame is 0xFA, a byte with one bit a group, and one little-endian 16-bit mask of fields a group. The fields
-follow in ascending order of their bits, then a CRC-16/XMODEM, big-endian, over all but the first byte ("Binary Output
-Messages").
-Only groups 1 (common) and 3 (IMU) are decoded. An unknown field has an unknown length, so its whole frame is rejected.
-Older firmware gave some bits other meanings; such frames fail the CRC.
+A binary frame ("Binary Output Messages") is 0xFA, a byte with one bit per group, and one little-endian 16-bit mask of
+fields per group. The fields follow in ascending order of their bits, then a CRC-16/XMODEM, big-endian, over all but the
+first byte. Only groups 1 (common) and 3 (IMU) are decoded. An unknown field has an unknown length, so its whole frame
+is rejected. Older firmware gave some bits other meanings; such frames fail the CRC.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ _GROUPS: Final[dict[int, tuple[str, dict[int, dict[str, int]]]]] = {
         },
     ),
 }
-"""Known groups: the formats of their fields by bit, and the positions of the used values in a field."""
+"""Known groups: formats of their fields in the order of bits, and per bit the index of each used value in the field."""
 _KNOWN_GROUPS: Final = 0x05
 # Preferred order: rate and acceleration from one group first, and compensated values (as in $VNYMR) before raw ones.
 _SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
@@ -60,7 +59,7 @@ _SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
 
 @functools.lru_cache(maxsize=16)
 def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
-    """Return the layout of a frame before its CRC, and the positions of the used values; raise RejectedError."""
+    """Return the struct of a frame without its CRC, and the index of each used value in it; raise RejectedError."""
     places: dict[str, int] = {}
     code, count = f"<{len(header)}x", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
@@ -95,8 +94,6 @@ _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR"
 
 
 class VectorNavDecoder(SentenceDecoder):
-    """Decoder of VectorNav outputs into `ImuSample`."""
-
     START = re.compile(rb"\xfa|\$(?:V(?:N|\Z)|\Z)")
     END = re.compile(rb"[^ -#%-~]")
     """First byte that cannot be inside a sentence: a line end, a "$", or an unprintable byte."""
@@ -157,7 +154,7 @@ _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
     b"VNYMR": (12, slice(6, 12), slice(0, 0)),
     b"VNIMU": (11, slice(3, 9), slice(9, 10)),
 }
-"""Count of numbers, and the positions of force and rate, and of the temperature."""
+"""Sentences: count of numbers, slice of acceleration and rate, slice of the temperature (empty: none)."""
 
 
 def _command(body: bytes) -> bytes:
@@ -167,9 +164,9 @@ def _command(body: bytes) -> bytes:
 class VectorNavDialogue(WakeDialogue):
     """Commands that end a pause of the outputs, then select the factory's output, $VNYMR, on the port in use.
 
-    UM001: p. 56 (a pause changes no register), p. 63 (register 6 without a port is that of the port in use), p. 54
-    (registers survive a reset only after $VNWNV, which is never sent). A device without any output is
-    rare; binary outputs (register 75) stay unchanged, because they name a port by its number, which is unknown.
+    UM001: a pause changes no register (p. 56). A write of register 6 without a port acts on the port in use (p. 63).
+    Registers survive a reset only after $VNWNV, which is never sent (p. 54). A device without any output is rare.
+    Binary outputs (register 75) stay unchanged, because they name a port by its number, which is unknown.
     """
 
     SAYINGS = (

@@ -4,18 +4,18 @@
     55 52 wx wy wz T SUM      rates, 2000/32768 deg/s
     55 53 roll pitch yaw V SUM      angles, 180/32768 deg
 
-Little-endian 16-bit numbers, and the low byte of the sum of the ten bytes before it. Sources: WitMotion's WT901 data
-sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 as it comes).
+Numbers have 16 bits, little-endian; SUM is the low byte of the sum of the ten bytes before it. Sources: WitMotion's
+WT901 data sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 by default).
 
 0x55 also occurs in data, and the sum is weak. So a frame is accepted only if another good frame follows at once. A
 single frame would pass at one offset in 10^6 of noise, and for one in 256 frames with a lost byte; a pair passes at one
-in 10^12. The cost: the last frame of an epoch waits for the next epoch; its time stays right. The packets
-of Bluetooth models (0x61) have no checksum and are not read.
+in 10^12. The cost: the last frame of a burst waits for the next burst, but its time stays right. The packets of
+Bluetooth models (0x61) have no checksum and are not read.
 
 The axes are the device's own, and Z is up. The angles turn Z-Y-X about these axes (WT901 p. 12), so with X forward and
-Y left roll is right side down and pitch nose down: as a gradienter it gives x = roll and y = -pitch, law "euler",
-with the device's X forward. The temperature scale is that of these documents. Six-axis models (BWT61CL, JY61) use
-1/340 degree from 36.53 instead; their temperature is wrong.
+Y left roll is right side down and pitch nose down. As a gradienter the device therefore gives x = roll and y = -pitch,
+law "euler", with its own X forward. The temperature scale is that of these documents. Six-axis models (BWT61CL, JY61)
+use 1/340 degree from 36.53 instead; their temperature is wrong.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class WitMotionDecoder(Decoder):
     """Decoder of WitMotion frames into `ImuSample` (from adjacent acceleration and rate) and `TiltSample`."""
 
     _good_at = -1
-    """Stream position of a good frame that followed another, or that waits for the next one."""
+    """Stream position of a good frame that followed another one, or that waits for the next one; -1: none."""
     _accel: tuple[int, Vector, float] | None = None
-    """Acceleration that waits for its rate: end of its frame, m/s^2, degrees Celsius."""
+    """Acceleration frame that waits for its rate frame: stream position of its end, m/s^2, degrees Celsius."""
 
     def interrupted(self) -> None:
         super().interrupted()
@@ -103,7 +103,7 @@ class WitMotionDecoder(Decoder):
 
 
 def _good(buffer: bytes, at: int) -> int:
-    """Return `FRAME_BYTES` if a frame begins at `at`, else `NO_FRAME`; raise RejectedError for a wrong sum."""
+    """Return `FRAME_BYTES` if a frame begins at `at`, otherwise `NO_FRAME`; raise RejectedError for a wrong sum."""
     if buffer[at] != 0x55 or not _FIRST_TYPE <= buffer[at + 1] <= _LAST_TYPE:
         return NO_FRAME
     last = at + FRAME_BYTES - 1

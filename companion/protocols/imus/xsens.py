@@ -2,11 +2,11 @@
 
     FA FF 36  length  (id, size, data)...  checksum        big-endian; all bytes after FA sum to 0 modulo 256
 
-A length of 255 means that the true one follows in 16 bits. The low nibble of an id names the number format: 0 float32,
-1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Fields used: 0x1020 packet counter,
+A length of 255 means that the actual length follows in 16 bits. The low nibble of an id names the number format: 0
+float32, 1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Fields used: 0x1020 packet counter,
 0x1060 SampleTimeFine (ticks of 0.1 ms), 0x0810 temperature (sent once a second at most, and held), 0xE020 status word.
-Also 0x4020 acceleration in m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate). Sources:
-MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
+Also 0x4020 acceleration in m/s^2 and 0x8020 rate of turn in rad/s, otherwise 0x4040 and 0x8040 (the same at high rate).
+Sources: MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
 
 Axes: X forward, Y left, Z up; level and at rest z reads +9.8. Samples keep the device's own axes: for an MTi on its
 base with X forward, the mounting ROTATION_ROLL_180 makes them forward, right, down.
@@ -38,8 +38,6 @@ _FLOAT32 = struct.Struct(">3f")
 
 
 class XsensDecoder(Decoder):
-    """Decoder of MTData2 messages into `ImuSample`."""
-
     START = re.compile(rb"\xfa(?:\xff|\Z)")
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
     clock_from_start: ClassVar[bool] = True
@@ -132,9 +130,9 @@ def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
 
 
 class XsensDialogue(WakeDialogue):
-    """GoToMeasurement: switch a device from the config state to sending (MT0605P.E, p. 53).
+    """Command GoToMeasurement: switch a device from the config state to sending (MT0605P.E, p. 53).
 
-    After power-on a device sends WakeUp. It gets no answer: WakeUpAck would put it into the config state.
+    After power-on a device sends WakeUp. We do not answer it: WakeUpAck would put the device into the config state.
     """
 
     SAYINGS = ((bytes.fromhex("FAFF1000F1"), "measurement started with GoToMeasurement"),)

@@ -33,7 +33,7 @@ class InclinometerXyDecoder(LineDecoder):
 
     LIMIT: ClassVar[int] = 64
     _x_deg: float | Literal["spoiled"] | None = None
-    """X that waits for its Y; "spoiled": rejected, so its Y is rejected too."""
+    """X reading that waits for its Y, deg; "spoiled": X was rejected, so its Y is rejected too."""
     _decimals = _fewer_running = 0
 
     def interrupted(self) -> None:
@@ -110,7 +110,7 @@ class InclinometerXyDecoder(LineDecoder):
         return degrees
 
     def _check_decimals(self, decimals: int) -> None:
-        """Reject a lost digit: a device always prints equally many decimals, so `+00.30` after `+00.430` is damaged."""
+        """Reject a lost digit: a device prints a fixed number of decimals, so `+00.30` after `+00.430` is damaged."""
         if decimals < self._decimals:
             self._fewer_running += 1
             if self._fewer_running < _SURE:

@@ -45,7 +45,7 @@ _START: Final = re.compile(rb".*(?=\$)", re.DOTALL)
 
 
 class JewellDecoder(LineDecoder):
-    """Decoder of Jewell lines in any of these formats into `TiltSample`."""
+    """Decoder of Jewell lines in the formats SIM, XDR, ASH and TCM into `TiltSample`."""
 
     LIMIT: ClassVar[int] = 90
 

@@ -2,14 +2,14 @@
 
     68 0D 00 84 | 00 10 50 | 10 10 05 | 01 04 01 | 1C      pitch +10.50, roll -10.05, heading 104.01
 
-After 0x68: length (from itself through the sum), address, command, data, and the low byte of the sum of all from the
-length on. An angle is a sign (0 or 1) and hundreds, then tens and units, then tenths and hundredths. The 8-bit sum is
-weak, but few byte values are valid digits of angles: noise passes at one offset in 10^16.
+After 0x68 come the length (of all bytes but 0x68), address, command, data, and the low byte of the sum of all bytes
+between 0x68 and the sum. An angle is a sign (0 or 1) and hundreds, then tens and units, then tenths and hundredths. The
+8-bit sum is weak, but few byte values are valid digits of angles: noise passes at one offset in 10^16.
 
 Sources: HCM370B/375B manual p. 11-12, HCM705B manual p. 12-17 (9600 8N1; "heading no negative"). The frame of 16 bytes
-with two angles of seven digits is the HCA726's, known only from a public driver, which ignores the command byte; its
-answer is assumed to be 0x84 as for the others. No document of the SCA and ACA inclinometers was found; they reportedly
-use the compass' frame, and are decoded so. Records of floats (0x94) are neither requested nor read.
+with two angles of seven digits is the HCA726's, known only from a public driver, which ignores the command byte. Its
+answer is assumed to be 0x84 as for other models. No document of the SCA and ACA inclinometers was found; they
+reportedly use the compass' frame, and are decoded so. Records of floats (0x94) are neither requested nor read.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _LENGTHS: Final[dict[int, frozenset[int]]] = {
     0x94: frozenset(range(10, LONGEST, 5)),
     _ANSWER: frozenset((_ANGLES_LENGTH, _LONG_ANGLES_LENGTH)),
 }
-"""Allowed lengths of commands and answers; for most, the documents show only that they are short."""
+"""Lengths that commands and answers may have, by command byte; for most the documents show only that they are short."""
 
 
 class RionDecoder(Decoder):
-    """Decoder of RION frames into `CompassSample`, or `TiltSample` for the inclinometer's longer frame."""
+    """Decoder of RION frames into `CompassSample`, or `TiltSample` for the longer frame of an inclinometer."""
 
     START = re.compile(b"\x68")
 
