@@ -1,1 +1,1 @@
-"""Attitude estimation in flight from calibrated rates: no I/O, no clock; time comes in with the samples."""
+"""Attitude estimation in flight from calibrated rates; without I/O and clock: all times come with the samples."""

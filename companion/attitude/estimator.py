@@ -1,15 +1,15 @@
-"""Attitude of the aircraft from one calibrated IMU, a compass and the site (method 3.7).
+"""Attitude of the aircraft, estimated from one calibrated IMU, a compass and the site (method.md section 3.7).
 
-Integrates calibrated rates minus the Earth's rotation, with a slow leveller and a scalar heading correction.
-Gyro biases are refined at rest only: in flight a manoeuvre looks like a bias.
+Calibrated rates minus the Earth's rotation are integrated; a slow leveller corrects the tilt, a scalar gain the
+heading. Gyro biases are refined at rest only: in flight a manoeuvre looks like a bias.
 
 Levelling has the form of VQF (Laidig and Seel, Information Fusion 91:187-204, 2023): specific force is low-passed in a
-frame that only gyro errors turn. Manoeuvre accelerations average out over the time constant, gravity stays; a bias b
-leaves b * tau of tilt. A lasting turn or climb does not average out, but makes the force longer or shorter than g: then
-it has less weight.
+frame that only gyro errors turn. Over the time constant tau, manoeuvre accelerations average out and gravity stays; a
+gyro bias b leaves a tilt of b * tau. A lasting turn or climb does not average out, but makes the force longer or
+shorter than g: then the force has less weight.
 
-The compass corrects the gated heading, never the tilt: its own tilt comes from a pendulum, which is wrong while the
-aircraft accelerates or is steep (method 3.5).
+The compass corrects the heading through a gate, never the tilt. A compass' own tilt comes from a pendulum, which is
+wrong while the aircraft accelerates or is steep (method.md section 3.5).
 """
 
 from __future__ import annotations
@@ -52,34 +52,34 @@ STEADY_RAD_S: Final = math.radians(20.0)  # Largest rate at which the compass is
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
 REST_SIGMAS: Final = 5.0  # Threshold above which a rest counts as an undetected movement
-KEPT_S: Final = 2.0  # Span of orientations kept for late compass readings
+KEPT_S: Final = 2.0  # Span of orientations stored for late compass readings
 FORCE_SMOOTHED_S: Final = 1.0
-"""Averaging time of the length of specific force, longer than vibration and gusts."""
+"""Averaging time of the specific force's length, s; longer than vibration and gusts."""
 DOUBTED_SHARE: Final = 0.03
-"""Deviation from g, as a share of g, that halves the weight: three times the scale error of accelerometers. In a turn
-beyond 15 degrees of bank, levelling would add more tilt error than a calibrated gyro's drift."""
+"""Deviation of specific force from g, as a share, that halves its weight: three times accelerometers' scale error. In a
+turn beyond 15 degrees of bank, levelling would add more tilt error than a calibrated gyro's drift."""
 _UP: Final = (0.0, 0.0, -1.0)
 
 TAU_S: Final = 9.0
-"""Time constant of the correction; the first readings after an alignment without heading count more."""
+"""Time constant of the heading correction, s; the first readings after an alignment without heading count more."""
 GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
 FIRST_S: Final = 0.1  # Time span assigned to the first reading
 BADLY: Final = 1.5
-"""Heading sigma, in compass sigmas, above which the heading counts as poorly known."""
+"""Ratio of heading sigma to compass sigma above which the heading counts as poorly known."""
 REFUSED_S: Final = 20.0
-"""Duration of rejected compass readings after which the companion stops sending the heading."""
+"""Time of continuously rejected compass readings after which the companion stops sending the heading, s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class AttitudeSettings:
-    """Calibration results and site data for the estimator; vehicle FRD."""
+    """Calibration results and site data that the estimator needs, in vehicle axes (FRD)."""
 
     vehicle_from_sensor: Matrix
     gravity_m_s2: float
     latitude_deg: float | None
-    """None: the Earth's rotation is not subtracted, an error of up to 15 deg/h."""
+    """Latitude of the site; None: the Earth's rotation is not subtracted, an error of up to 15 deg/h."""
     gyro_noise: AllanModel
     gyro_bias_rad_s: Triple
     gyro_covariance: Matrix  # (3, 3) covariance of the bias in the next minutes
@@ -88,14 +88,14 @@ class AttitudeSettings:
 
 
 class Attitude(msgspec.Struct, frozen=True, gc=False):
-    """Attitude at one instant, body FRD to NED and true north, with one sigma of roll, pitch and yaw.
+    """Attitude at one instant, from body axes (FRD) to NED and true north, with one sigma of roll, pitch and yaw.
 
-    `rate_rad_s` is that of the body relative to the Earth, in FRD, without bias.
+    `rate_rad_s` is the rotation rate of the body relative to the Earth, in FRD, without bias.
     """
 
     t_s: float
     quaternion: Quaternion
-    """w, x, y, z; body to NED; w >= 0."""
+    """Components w, x, y, z of the rotation from body axes to NED; w >= 0."""
     roll_rad: float
     pitch_rad: float
     yaw_rad: float  # In [-pi, pi], from true north
@@ -104,21 +104,21 @@ class Attitude(msgspec.Struct, frozen=True, gc=False):
 
 
 class Leveller:
-    """Estimates the rotation from E to NED that levels the mean specific force."""
+    """Estimator of the rotation from frame E (nearly NED) to NED that makes the mean specific force vertical."""
 
     def __init__(self, gravity_m_s2: float) -> None:
         self.gravity_m_s2 = gravity_m_s2
         self.ned_from_e: Quaternion = IDENTITY
         self.doubt = 0.0
-        """Smoothed deviation of the force from gravity, as a share of g."""
+        """Smoothed deviation of the specific force's length from gravity, as a share of g."""
         self._force: Triple = (0.0, 0.0, -gravity_m_s2)
         self._slope: Triple = (0.0, 0.0, 0.0)
         self._length = gravity_m_s2
 
     def update(self, force_m_s2: Triple, span_s: float, tau_s: float) -> float:
-        """Add the mean specific force (3,) in E over `span_s`; return its weight.
+        """Add the mean specific force (3,) over `span_s`, in frame E (nearly NED); return its weight, at most 1.
 
-        A Butterworth low-pass of second order with natural frequency sqrt(2) / tau, so that tau may change at any time.
+        The filter is a second-order Butterworth low-pass with natural frequency sqrt(2) / tau, so tau may change.
         """
         x, y, z = force_m_s2
         length = math.sqrt(x * x + y * y + z * z)
@@ -145,14 +145,14 @@ class Leveller:
 
 
 class HeadingAid:
-    """Gain and gate of the heading correction."""
+    """Gain and rejection gate of the heading correction by a compass."""
 
     def __init__(self) -> None:
         self._last_s: float | None = None
         self._refused_since_s: float | None = None
 
     def gain(self, t_s: float, innovation_rad: float, sigma_rad: float, compass_sigma_rad: float) -> float:
-        """Return the gain for an innovation; `sigma_rad`: of the estimated heading; 0: rejected by the gate."""
+        """Return the gain for a compass innovation, 0 if the gate rejects it; `sigma_rad`: of the estimated heading."""
         gate = max(GATE_LEAST_RAD, GATE_SIGMAS * math.hypot(sigma_rad, compass_sigma_rad))
         if not abs(innovation_rad) <= gate:
             if self._refused_since_s is None:
@@ -171,7 +171,7 @@ class HeadingAid:
 
 
 class AttitudeEstimator:
-    """Estimates the attitude; one call per batch of samples. No sample value raises an exception."""
+    """Estimator of the aircraft's attitude, called once per batch of samples; no sample value raises an exception."""
 
     def __init__(self, settings: AttitudeSettings) -> None:
         self._strapdown = Strapdown()
@@ -186,7 +186,7 @@ class AttitudeEstimator:
         self._leveller = Leveller(settings.gravity_m_s2)
 
     def settle(self, settings: AttitudeSettings) -> None:
-        """Use a newer calibration; keep the attitude and restart the bias sigma."""
+        """Switch to a newer calibration; keep the attitude, and restart the gyro bias' sigma."""
         kept = self._uncertainty.attitude
         self._settle(settings)
         self._leveller.gravity_m_s2 = settings.gravity_m_s2
@@ -207,7 +207,7 @@ class AttitudeEstimator:
     # --- alignment
 
     def align(self, t_s: float | None, body_from_ned: Matrix, covariance: Matrix) -> None:
-        """Start from an attitude (3, 3) at `t_s` (None: at the next sample) with its covariance (3, 3) in NED, rad^2.
+        """Start from a known attitude (3, 3) at `t_s` (None: at the next sample); `covariance` (3, 3) is in NED, rad^2.
 
         An unknown heading may have any value, with a variance of at least `HEADING_UNKNOWN_RAD` squared.
         """
@@ -238,9 +238,9 @@ class AttitudeEstimator:
     def update(
         self, samples: Sequence[ImuSample], *, phase: Phase, still: bool = False, airspeed_m_s: float | None = None
     ) -> None:
-        """Add samples, in the sensor's axes and in order of time; ignored without an alignment.
+        """Process samples, in the sensor's axes and in order of time; they are ignored before an alignment.
 
-        `still` refines the gyro biases; `airspeed_m_s` corrects the centripetal acceleration (omega x V).
+        `still` lets the gyro biases be refined; `airspeed_m_s` corrects the centripetal acceleration (omega x V).
         """
         if not self._aligned:
             return
@@ -304,7 +304,7 @@ class AttitudeEstimator:
             self._forget_rest()
             return
         gain = self._uncertainty.rest(self._still_s)
-        # Both states are truth minus estimate: add the correction to the bias, and turn the attitude by it.
+        # Both states are true value minus estimate: add the correction to the bias, and turn the attitude by it.
         found = gain @ left
         bx, by, bz = self._strapdown.bias_rad_s
         self._strapdown.bias_rad_s = (bx + float(found[3]), by + float(found[4]), bz + float(found[5]))
@@ -315,7 +315,7 @@ class AttitudeEstimator:
     # --- compass
 
     def add_heading(self, t_s: float, heading_true_rad: float, sigma_rad: float) -> bool:
-        """Add the heading of a self-levelling compass at `t_s`; return whether it was used."""
+        """Correct the heading by a self-levelling compass' reading of the time `t_s`; return True if it was used."""
         found = self.kept_at(t_s)
         if found is None or self._leveller.doubt > STEADY_SHARE:
             return False
@@ -335,7 +335,7 @@ class AttitudeEstimator:
         return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return time and attitude (body to NED, at the present level) of the last step up to `t_s`; None: too old."""
+        """Return time and attitude (body to NED, newest levelling) of the last step up to `t_s`; None: not stored."""
         for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:
                 return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)

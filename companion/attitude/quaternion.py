@@ -1,4 +1,4 @@
-"""Unit quaternions as plain tuples (w, x, y, z), with Hamilton's product; at this size faster than arrays.
+"""Unit quaternions as plain tuples (w, x, y, z), with Hamilton's product; tuples are faster than arrays of this size.
 
 A quaternion `q` maps a vector's components from frame A to frame B: v_B = rotate(q, v_A). Multiplying on the left
 rotates in B, on the right in A.
@@ -20,7 +20,7 @@ _NO_LENGTH = 1e-150
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the product p q: first q, then p."""
+    """Return the product p q, the rotation by q followed by that by p."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return (
@@ -36,7 +36,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def normalised(q: Quaternion) -> Quaternion:
-    """Scale to length 1; raise ValueError if the length is zero or not finite."""
+    """Scale a quaternion to length 1; raise ValueError if its length is zero or not finite."""
     w, x, y, z = q
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.0 < length < math.inf:
@@ -59,7 +59,7 @@ def from_rotation_vector(v: Triple) -> Quaternion:
 
 
 def shortest_arc(a: Triple, b: Triple) -> Quaternion:
-    """Return the smallest rotation from direction `a` to `b`; the identity if either has length zero."""
+    """Return the smallest rotation from direction `a` to direction `b`; the identity if either has length zero."""
     length_a, length_b = math.hypot(*a), math.hypot(*b)
     if not (length_a > _NO_LENGTH and length_b > _NO_LENGTH):
         return IDENTITY
@@ -74,7 +74,7 @@ def shortest_arc(a: Triple, b: Triple) -> Quaternion:
 
 
 def from_matrix(matrix: Matrix) -> Quaternion:
-    """Convert a 3x3 rotation matrix (Shepperd's choice of the largest element)."""
+    """Convert a 3x3 rotation matrix to a quaternion, by Shepperd's choice of the largest element."""
     ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz)) = np.asarray(matrix, dtype=np.float64).tolist()
     # The rows are multiples of the quaternion; the largest one is known best.
     rows = (
@@ -91,9 +91,9 @@ def to_matrix(q: Quaternion) -> Matrix:
 
 
 def roll_pitch_yaw(q: Quaternion) -> Triple:
-    """Return the aerospace angles, rad, of a quaternion from body FRD to NED; yaw in [-pi, pi].
+    """Return roll, pitch and yaw, rad, of a quaternion from body axes (FRD) to NED; yaw is in [-pi, pi].
 
-    At pitch +-90 degrees roll and yaw are not separable; then roll is 0 and yaw carries both.
+    At pitch +-90 degrees roll and yaw are not separable: roll is then 0, and yaw carries both.
     """
     w, x, y, z = q
     sine = 2.0 * (w * y - z * x)
@@ -108,6 +108,6 @@ def roll_pitch_yaw(q: Quaternion) -> Triple:
 
 
 def from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
-    """Return the quaternion from body FRD to NED for aerospace angles."""
+    """Return the quaternion from body axes (FRD) to NED for roll, pitch and yaw."""
     roll, pitch = from_rotation_vector((roll_rad, 0.0, 0.0)), from_rotation_vector((0.0, pitch_rad, 0.0))
     return multiply(from_rotation_vector((0.0, 0.0, yaw_rad)), multiply(pitch, roll))

@@ -1,10 +1,11 @@
-"""Quaternion strapdown: integrate calibrated rates to attitude, rotate the specific force, propagate the covariance.
+"""Quaternion strapdown: integration of calibrated rates to an attitude, with specific force and covariance.
 
-Frame E is fixed to the Earth and close to NED; `estimator` holds E to NED. Rotation vectors with two-sample coning,
-phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method 3.7). Plain floats: at these sizes ten times faster than arrays.
+Frame E is fixed to the Earth and close to NED; the module `estimator` holds the rotation from E to NED. Rotation
+vectors have a two-sample coning correction, phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method.md section 3.7). Plain
+floats are ten times faster than arrays at these sizes.
 
-The covariance is updated in Joseph's form, because the gains in use are not a Kalman filter's. Six states: attitude
-error in NED (rad) and gyro bias error in the sensor's axes (rad/s). Method 2.2 and 3.7.
+The covariance has six states: attitude error in NED (rad) and gyro bias error in sensor axes (rad/s). The update has
+Joseph's form, because the gains are not a Kalman filter's (method.md sections 2.2 and 3.7).
 """
 
 from __future__ import annotations
@@ -30,37 +31,37 @@ from companion.samples import ImuSample
 
 STEP_S: Final = 0.02  # Length of the steps over which specific force is averaged for levelling
 TURN_S: Final = 0.004
-"""Longest time between rotations of the specific force into E: 4 degrees at 1000 deg/s."""
+"""Longest time between two rotations of specific force into frame E (nearly NED): 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
-"""Longest gap between samples that is integrated as usual; a longer one counts as `missing_s`."""
+"""Longest gap between samples, s, that is integrated as usual; a longer one counts as `missing_s`."""
 _ROUNDING_S: Final = 1e-6
 _ANGLE_SQUARE: Final = 1e6
 _FORCE_SQUARE: Final = 1e8
-"""Largest squared norms of one sample: ten times the decoders' limits, so that nothing overflows."""
+"""Largest squared norm of a sample's specific force: ten times the decoders' limits, so that nothing overflows."""
 LOST_S: Final = 1.0
-"""Gap between samples after which the attitude is lost."""
+"""Gap between samples, s, after which the attitude counts as lost."""
 
 
 class MotionStep(NamedTuple):
-    """Motion over about `STEP_S`: mean force in E, mean rate in the sensor's axes, and orientation at the end."""
+    """Motion over about `STEP_S`: mean specific force, mean rotation rate, and orientation at the end."""
 
     t_s: float
     span_s: float
-    force_m_s2: Triple  # Mean specific force in E
+    force_m_s2: Triple  # Mean specific force in frame E (nearly NED)
     rate_rad_s: Triple  # Mean rate in the sensor's axes, bias removed
     missing_s: float
-    orientation: Quaternion  # Sensor axes to E at its end
+    orientation: Quaternion  # From sensor axes to frame E, at the end
 
 
 class Strapdown:
-    """Integrates the rates of one IMU in its own axes; `orientation` is sensor axes to E."""
+    """Integrator of one IMU's rates in sensor axes; `orientation` rotates from there to frame E (nearly NED)."""
 
     def __init__(self) -> None:
         self.orientation: Quaternion = IDENTITY
         self.bias_rad_s: Triple = (0.0, 0.0, 0.0)
         self.force_bias_m_s2: Triple = (0.0, 0.0, 0.0)
         self.frame_rate_rad_s: Triple = (0.0, 0.0, 0.0)
-        """The Earth's rotation, in E."""
+        """Rotation rate of the Earth, in frame E (nearly NED)."""
         self.last_s: float | None = None
         self.last_rate_rad_s: Triple = (0.0, 0.0, 0.0)
         self.lost = False
@@ -141,21 +142,21 @@ class Strapdown:
 
 
 SCALE_SHARE: Final = 0.003
-"""Scale error and misalignment of a trimmed consumer gyro, times the net turn since the last correction."""
+"""Scale error and misalignment of a trimmed consumer gyro, as a share of the net turn since the last correction."""
 GAP_RATE_RAD_S: Final = math.radians(20.0)
-"""Error of the rate while samples were missing."""
+"""Assumed error of the rotation rate while samples were missing."""
 MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
-"""Horizontal acceleration that remains after averaging and does not change the length of the force."""
+"""Horizontal acceleration of the aircraft that remains after averaging and does not change the force's length."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
 _BIAS_WANDERS_S: Final = 300.0
-"""Time in which a bias moves by the floor of its Allan deviation, for consumer gyros."""
+"""Time in which a consumer gyro's bias moves by the floor of its Allan deviation, s."""
 
 
 class Uncertainty:
-    """Covariance of attitude and gyro bias.
+    """Covariance of the attitude error and of the gyro bias error.
 
-    `bias_covariance`: (3, 3) of the gyro bias from sigma_use, sensor axes. An accelerometer bias adds a constant tilt.
+    `bias_covariance` (3, 3) is the calibrated gyro bias', in sensor axes. An accelerometer bias adds a constant tilt.
     """
 
     def __init__(
@@ -168,7 +169,7 @@ class Uncertainty:
         self.restart(np.eye(3) * HEADING_UNKNOWN_RAD**2)
 
     def restart(self, attitude_covariance: Matrix) -> None:
-        """Start from the covariance of an alignment, (3, 3) in NED, rad^2."""
+        """Start again from the covariance of an aligned attitude, (3, 3) in NED, rad^2."""
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = attitude_covariance
         self._covariance[3:, 3:] = self._bias_start
@@ -176,7 +177,7 @@ class Uncertainty:
         self._turned = np.zeros(3)
 
     def propagate(self, span_s: float, ned_from_sensor: Matrix, turned_rad: Array, missing_s: float) -> None:
-        """Add the errors of `span_s` with a turn by `turned_rad` (3,) about the sensor's axes."""
+        """Add the errors of a span of time in which the sensor turned by `turned_rad` (3,) about its own axes."""
         step = np.eye(6)
         step[:3, 3:] = -span_s * ned_from_sensor
         self._covariance = step @ self._covariance @ step.T
@@ -211,11 +212,11 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
-        """Return one sigma (3,) of the mean rate over a rest of `seconds`, sensor axes."""
+        """Return one sigma (3,) of the mean rate measured over a rest of `seconds`, in sensor axes."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:
-        """Update with a rest of `seconds`; return the gain (6, 3) for its mean rate, sensor axes."""
+        """Update the covariance with a rest of `seconds`; return the gain (6, 3) for the mean rate in sensor axes."""
         variance = self._rest_variance(seconds)
         part = self._covariance[:, 3:]
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T
@@ -225,7 +226,7 @@ class Uncertainty:
 
     @property
     def attitude(self) -> Matrix:
-        """Return the covariance (3, 3) of the attitude error in NED, rad^2."""
+        """Covariance (3, 3) of the attitude error in NED, rad^2."""
         result = self._covariance[:3, :3].copy()
         result[range(2), range(2)] += self._levelled**2 * self._level_variance
         result[range(3), range(3)] += np.square(SCALE_SHARE * self._turned)

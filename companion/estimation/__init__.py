@@ -1,1 +1,1 @@
-"""Estimation: stillness, averages, biases and their sigmas. No I/O, no clock, no event loop."""
+"""Estimation of biases and their sigmas from still readings; without I/O, clock and event loop."""

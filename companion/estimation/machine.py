@@ -1,4 +1,4 @@
-"""Kinds of calibration, and its state machine as a table, which docs/calibration.md shows as a diagram."""
+"""States, events and transitions of a calibration, as a table; docs/calibration.md shows them as a diagram."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import enum
 from typing import Final
 
 LONGEST_S: Final = 1e6
-"""Upper bound of the time limit in a request, s."""
+"""Longest time limit that a request may have, s."""
 
 
 class What(enum.Enum):
-    """The biases to calibrate; the numbers are param1 of MAV_CMD_USER_1."""
+    """Sensors whose biases a calibration estimates; the numbers are param1 of the MAVLink command MAV_CMD_USER_1."""
 
     BOTH = 0
     GYROS = 1
@@ -52,7 +52,7 @@ class State(enum.Enum):
 
     @property
     def shown(self) -> str:
-        """Coarser state names; other programs rely on them."""
+        """Coarser name for other programs: restarting and settling count as verifying, undoing as writing."""
         return _SHOWN.get(self, self).value
 
     @property
@@ -61,7 +61,7 @@ class State(enum.Enum):
 
 
 class Event(enum.Enum):
-    """Event in a calibration."""
+    """Event that changes the state of a calibration."""
 
     REQUEST = "request"
     UNDO = "undo"
@@ -117,7 +117,7 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
 
 
 class IllegalEventError(Exception):
-    """Event that cannot happen in this state: a fault of the program, never of a device."""
+    """Error for an event that the present state does not allow: a fault of the program, never of a device."""
 
 
 class Machine:
@@ -130,7 +130,7 @@ class Machine:
         """Handle an event; return the new state.
 
         Raises:
-            IllegalEventError: the table has no such transition.
+            IllegalEventError: the table has no transition for it.
         """
         try:
             self.state = TRANSITIONS[self.state, event]

@@ -1,1 +1,1 @@
-"""Offline tools: replay, noise profiles, flights. Readers raise StorageError, in one line, for an unusable file."""
+"""Offline tools: replay, noise profiles, flights. File readers raise StorageError, in one line, for unusable files."""

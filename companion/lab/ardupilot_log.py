@@ -1,4 +1,4 @@
-"""ArduPilot's dataflash log of flights (LogStructure.h of AP_Logger, AP_InertialSensor, AP_NavEKF3 and AP_AHRS)."""
+"""Reader of flights in ArduPilot logs (LogStructure.h of AP_Logger, AP_InertialSensor, AP_NavEKF3 and AP_AHRS)."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "EV": ("", ("Id",)),
     "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
 }
-"""Name of the instance field, and names of the fields to read, by message."""
+"""Log messages to read, each with the name of its instance field ("": none) and the names of the fields to read."""
 _IMUS: Final = 5
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
 _STEPS: Final = np.array([*[0.01 * DEG] * 3, 0.01])
-"""Resolution of the biases in XKF1 and XKF2, in rad/s and m/s^2: hundredths of deg/s and m/s^2, truncated to zero."""
+"""Resolution of the EKF's biases in the log, which truncates them towards zero: 0.01 deg/s and 0.01 m/s^2."""
 _EVENTS: Final = {"armed": {10: True, 11: False}, "airborne": {28: True, 18: False}}
 _MOTOR_FUNCTIONS: Final = (*range(33, 41), *range(82, 86), 70)
 _TURNING_US: Final = 30.0
@@ -76,7 +76,7 @@ def _boot(start: BootMessages) -> Boot:
 
 
 def _lanes(start: BootMessages) -> Floats:
-    """Find the EKF core in use over time, (n, 2); each core logs it."""
+    """Find the EKF core in use over time, (n, 2): time and core (every core logs it); core 0 if none is logged."""
     told = next((start.rows("XKF4", core) for core in start.instances("XKF4")), np.zeros((0, 2)))
     told = told[(told[:, 1] >= 0) & (told[:, 1] < _IMUS)]
     return told if len(told) else np.zeros((1, 2))
@@ -127,7 +127,7 @@ def _estimated(start: BootMessages, core: int) -> Floats | None:
         variances = [(first, 1), (first, 2), (second, 1), (second, 2)]
         columns = [np.interp(t_s, rows[:, 0], rows[:, k]) for rows, k in variances]
         sigmas = np.sqrt(np.maximum(np.column_stack(columns), 0.0)) / step_s
-    # A logged value is truncated toward zero: the middle of its range is half a step further out.
+    # A logged value is truncated toward zero: the middle of its range is half a step further from zero.
     middle = biases + 0.5 * _STEPS * np.sign(biases)
     cut = np.where(np.abs(biases) < 0.5 * _STEPS, 2.0 * _STEPS, _STEPS) / math.sqrt(12.0)
     return np.column_stack([t_s, middle, np.hypot(sigmas, cut)])

@@ -1,7 +1,7 @@
-"""Logs of autopilots as rows of numbers: ArduPilot's dataflash (.bin) and PX4's ULog (.ulg).
+"""Readers of autopilots' logs as rows of numbers: ArduPilot's dataflash (.bin) and PX4's ULog (.ulg).
 
-Dataflash: AP_Logger/LogStructure.h, with pymavlink's table of format letters; pymavlink's own reader takes sixteen
-times as long. A ULog is read by pyulog.
+Dataflash is parsed as AP_Logger/LogStructure.h defines it, with pymavlink's table of format letters; pymavlink's own
+reader takes sixteen times as long. A ULog is read by pyulog.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from companion.physics.frames import Floats
 
 US: Final = 1e-6
 DATAFLASH_MAGIC: Final = b"\xa3\x95\x80"
-"""First bytes of a dataflash log: the head of the format message that describes format messages."""
+"""First bytes of a dataflash log: the header of the format message that describes format messages."""
 ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
 _HEAD: Final = DATAFLASH_MAGIC[:2]
 _FMT: Final = np.dtype([("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")])
@@ -37,15 +37,15 @@ _MOST_PARAMETERS: Final = 1 << 16
 _INSTANCES: Final = 16  # Most instances; a larger number is a damaged byte
 
 Fields = Mapping[str, tuple[str, tuple[str, ...]]]
-"""Name of the instance field (or ""), and names of the fields to read, by message."""
+"""Log messages to read, each with the name of its instance field ("": none) and the names of the fields to read."""
 _MOST_TIMES: Final = 4
-"""Most bytes to read, as a multiple of the file's size: in a damaged file pyulog may jump back again and again."""
+"""Limit of bytes to read, as a multiple of the file's size: pyulog may jump back endlessly in a damaged file."""
 _NEEDS_MORE: Final = (
     "a log of PX4 needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
 
 Topics = Mapping[str, tuple[str, ...]]
-"""Fields to read by topic; elements of arrays are listed one by one: `gyro_rad[0]`."""
+"""Fields to read of each ULog topic; elements of arrays are listed one by one: `gyro_rad[0]`."""
 
 _LARGEST: Final = 1e6
 _CORRECTED: Final = (
@@ -61,7 +61,7 @@ _TOPICS: Final = {
 
 
 class BootMessages:
-    """Messages of one start of the autopilot; parameters are rows of time in s, name and value."""
+    """Log messages of one start of the autopilot; `parameters` has rows of time in s, name and value."""
 
     def __init__(self, fields: Mapping[str, int]) -> None:
         self._fields = fields
@@ -70,7 +70,7 @@ class BootMessages:
         self.gaps = 0  # Gaps where the autopilot could not write to the log
 
     def add(self, name: str, instance: int, rows: Floats) -> None:
-        """Add rows in the order of the file: the autopilot's clock in s, then the fields; NaN: no such field."""
+        """Add rows in the order of the file: time in s on the autopilot's clock, then fields; NaN: no such field."""
         if 0 <= instance < _INSTANCES:
             self._chunks[name, instance].append(rows)
 
@@ -78,7 +78,7 @@ class BootMessages:
         self.parameters += itertools.islice(found, _MOST_PARAMETERS - len(self.parameters))
 
     def unsorted(self, name: str, instance: int = 0) -> Floats:
-        """Return the rows of a message in the order of the file, (n, 1 + fields), the time in s first."""
+        """Return the rows of a message in the order of the file, (n, 1 + fields); the first column is time in s."""
         return np.concatenate([np.zeros((0, 1 + self._fields[name])), *self._chunks.get((name, instance), ())])
 
     def rows(self, name: str, instance: int = 0) -> Floats:
@@ -89,7 +89,7 @@ class BootMessages:
 
 
 def ascending(rows: Floats) -> Floats:
-    """Select rows with ascending time (the first column); drop a single row that is ahead, because it is damaged."""
+    """Select rows with ascending time (first column); drop a single row with a time ahead of the next, as damaged."""
     rows = rows[np.isfinite(rows[:, 0])]
     if not len(rows):
         return rows
@@ -131,7 +131,7 @@ class _Kind:
 
 
 def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
-    """Read the messages of `fields` and the parameters; yield them start by start, to save memory."""
+    """Read the messages in `fields` and the parameters; yield one start of the autopilot at a time, to save memory."""
     kinds: dict[bytes, _Kind] = {DATAFLASH_MAGIC: _Kind(_FMT.itemsize + 3)}
     fields = {**fields, _PARAMETER: ("Name", ("Value",))}
     widths = {name: len(columns) for name, (_, columns) in fields.items()}
@@ -167,7 +167,7 @@ def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
 
 
 def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
-    """Return the head and the kind of the messages that a format message describes; None: it is damaged."""
+    """Return the header and the layout of the messages that a format message describes; None: it is damaged."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT
 
     number, length, *said = np.frombuffer(data, _FMT)[0].tolist()
@@ -239,12 +239,11 @@ def ulog(path: Path, topics: Topics) -> BootMessages:
 
 
 class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one log, numbered from 1 as in the configuration.
+    """Readings of one IMU in one flight log, with temperature, vibration and EKF biases.
 
-    Readings (n, 6) are in rad/s and m/s^2, corrected by the firmware, vehicle FRD; `means`: each is the mean since the
-    previous reading, not an instant. Temperatures and vibration levels (m/s^2) have rows of time and value. `estimated`
-    has biases of an EKF, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), sigma of each; NaN: unknown.
-    Readings at `failed_s`, when the autopilot marked the IMU as failed, are left out.
+    `means`: each reading is the mean since the previous one, not an instant. `degc` and `vibration` (m/s^2) have rows
+    of time and value. `estimated` has EKF biases, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), sigma of
+    each; NaN: unknown. Readings at `failed_s` are left out: the autopilot marked the IMU as failed.
     """
 
     number: int  # Number from 1, as in the configuration
@@ -264,28 +263,28 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Boot(msgspec.Struct, frozen=True, kw_only=True):
-    """Log of one start of the autopilot. Times are in s on its clock; `unix_offset_s` converts them to UTC.
+    """Log of one start of the autopilot; times are in s on its clock, and `unix_offset_s` converts them to UTC.
 
-    A simulator may lack the Earth's rate and have standard gravity everywhere.
+    `earth_turns` is False and `standard_gravity` True in a simulator without the Earth's rate and local gravity.
     """
 
     firmware: FirmwareName
     imus: tuple[FlownImu, ...]
     solution: Navigation | None
-    truth: Navigation | None = None  # Truth of a simulator
+    truth: Navigation | None = None  # True trajectory of a simulator
     armed: tuple[tuple[float, bool], ...] = ()
     motors: tuple[tuple[float, bool], ...] = ()
     airborne: tuple[tuple[float, bool], ...] = ()
     parameters: tuple[tuple[float, str, float], ...] = ()
     unix_offset_s: float | None = None
     place: tuple[float, float] | None = None
-    """Latitude in degrees, height in m."""
+    """Latitude in degrees and height in m of the aircraft."""
     earth_turns: bool = True
     standard_gravity: bool = False
     notes: tuple[str, ...] = ()
 
     def parameters_at(self, t_s: float) -> dict[str, float]:
-        """Return the parameters at a time; a parameter that was first logged later has its first value."""
+        """Return the parameter values at a time; a parameter that was first logged later has its first value."""
         found: dict[str, float] = {}
         for told_s, name, value in self.parameters:
             if told_s <= t_s or name not in found:
@@ -302,7 +301,7 @@ def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]
 
 
 def in_use(choices: Floats, t_s: Floats) -> Floats:
-    """Look up the choice in use at each time from rows (n, 2) of time and choice; the first is also used before it."""
+    """Return the choice in use at each time, from rows (n, 2) of time and choice; the first also counts before."""
     return np.asarray(choices[np.maximum(np.searchsorted(choices[:, 0], t_s, side="right") - 1, 0), 1])
 
 
@@ -338,7 +337,7 @@ def read_dataflash(path: Path) -> list[StillLog]:
 
 
 def _log(path: Path, imu: str, table: Floats, notes: tuple[str, ...]) -> Iterator[StillLog]:
-    """Make the log of an IMU from the complete samples in order; rows of time, six readings, temperature."""
+    """Make one IMU's log from the complete, ascending rows of `table`: time, six readings, temperature."""
     t_s, readings = table[:, 0], table[:, 1:7]
     whole = (np.abs(t_s) < LAST_S) & (np.abs(readings) < _LARGEST).all(axis=1)
     ahead = whole.copy()

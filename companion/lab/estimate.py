@@ -1,4 +1,4 @@
-"""Biases in a log: estimated from its longest still stretch, or from adjacent windows to check sigma."""
+"""Estimation of biases from a log: from its longest still part, or from adjacent windows to check sigma."""
 
 from __future__ import annotations
 
@@ -49,28 +49,28 @@ _LONGER: Final = 1.02  # Growth of the stretch after which a new window is chose
 _AT_ONCE: Final = 4096
 
 MOST_WINDOWS: Final = 100_000
-"""Most windows: eleven days of the shortest ones; more mean that the log's clock jumped."""
+"""Largest number of windows: eleven days of the shortest ones; more mean that the log's clock jumped."""
 PAUSE_S: Final = 3.0
-"""Longest silence without a possible power-off of the sensor."""
+"""Longest gap between samples, s, in which the sensor was certainly not powered off."""
 HORIZON_S: Final = 180.0
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
 _SAME_RAD: Final = 1.0 * DEG
-"""Largest rotation of the measured gravity in one pose; it exceeds any drift of the bias."""
+"""Largest rotation of the measured gravity that still counts as one pose; it exceeds any effect of a bias' drift."""
 _EXACT_DEG: Final = 1e-4
 _LATITUDE_DEG: Final = 45.0
-"""Substitute for an unknown latitude; its value does not matter, because the Earth's rate cancels."""
+"""Substitute for an unknown latitude; its value does not matter, because the Earth's rate cancels between windows."""
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
-    """Pose and place of the IMU, which the log does not contain; an unknown one (None) widens the sigmas.
+    """Pose, place and sensor model of an IMU, which its log does not contain; None (unknown) widens the sigmas.
 
-    The heading is true. `powered`: least time in s from the switch-on to the beginning of the log. `mounting`: IMU to
-    vehicle FRD. `profile`: the IMU's model, or learned figures. `any_bias`: accept biases beyond those of any part.
+    `powered` is the least time in s from power-on to the log's beginning. `mounting` rotates from IMU to vehicle axes
+    (FRD). `profile` is the IMU's model, or learned noise figures. `any_bias` accepts biases beyond those of any sensor.
     """
 
     pitch_deg: float | None = None
     roll_deg: float | None = None
-    heading_deg: float | None = None  # True
+    heading_deg: float | None = None  # From true north
     sigma_deg: float = 0.05
     heading_sigma_deg: float = 3.0
     latitude_deg: float | None = None
@@ -82,7 +82,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Object]:
-    """Estimate the biases from the longest still stretch of a log; return the record, and the part used, for JSON."""
+    """Estimate the biases from the longest still part of a log; return the record, and the part used, for JSON."""
     return _Pass(log, given, max_still_s).run()
 
 
@@ -169,7 +169,7 @@ class _Pass:
         return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
 
     def _aged(self, measurement: Measurement) -> Measurement:
-        """Add the power-on time before the log to a measurement that has no pause since the log's beginning."""
+        """Add the power-on time before the log to a measurement without a pause since the log's beginning."""
         begun_s = measurement.begun_s.get(self._log.imu, math.inf)
         powered = self._given.powered
         if self._log.clock_from_start:
@@ -223,10 +223,10 @@ def _posed(window: Window, given: Given) -> Window:
 
 
 class WindowResult(NamedTuple):
-    """One window, samples `start` to `end` of its log, calibrated by itself.
+    """Result of one window of a log, samples `start` to `end`, calibrated by itself.
 
-    `biases` are bias, sigma_stat and sigma_use, (3, 6); None: refused, for the reason `why`. `by_pose` (6,) is the
-    reading of a bias-free sensor in this pose, constant between two moves.
+    `biases` (3, 6) are bias, sigma after averaging, stated sigma; None: refused, for the reason `why`. `by_pose` (6,)
+    is the reading of a bias-free sensor in this pose; it is constant between two moves.
     """
 
     start: int
@@ -238,12 +238,12 @@ class WindowResult(NamedTuple):
 
 
 def calibrated(log: StillLog, given: Given, length_s: float) -> Iterator[WindowResult]:
-    """Calibrate every window of `length_s` seconds independently, as after a start.
+    """Calibrate every window of `length_s` seconds independently, as if the sensor had just been started.
 
-    A pose that is not given comes from the window's mean and counts as exact, so sigma is that of the sensor.
+    A pose that is not given is computed from the window's mean and counts as exact, so sigma is the sensor's alone.
 
     Raises:
-        StorageError: more than `MOST_WINDOWS`.
+        StorageError: the log has more than `MOST_WINDOWS` windows.
     """
     posed, force = given, np.zeros(3)
     begin_s = float(log.t_s[0])
@@ -277,7 +277,7 @@ def calibrated(log: StillLog, given: Given, length_s: float) -> Iterator[WindowR
 
 
 def _without_bias(given: Given) -> Floats:
-    """Return the reading (6,), in vehicle axes, of a bias-free sensor at the given pose and place."""
+    """Return the reading (6,) of a bias-free sensor at the given pose and place, in vehicle axes."""
     roll, pitch, heading = ((angle or 0.0) * DEG for angle in (given.roll_deg, given.pitch_deg, given.heading_deg))
     turn = body_from_ned(roll, pitch, heading)
     latitude_deg, height_m = given.latitude_deg or 0.0, given.height_m or 0.0
@@ -286,7 +286,7 @@ def _without_bias(given: Given) -> Floats:
 
 
 def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
-    """Check sigma on a sensor: compare the result of each window with those of the windows after it.
+    """Check a sensor's stated sigma: compare the biases of each window with those of the windows after it.
 
     In 95 of 100 cases they agree within 2 sigma. The pose is equal in both and cancels. A move ends the comparison.
 
@@ -304,12 +304,12 @@ def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str
 
 
 def uncounted(why: str) -> str:
-    """Return a reason without its figures, for counting."""
+    """Replace the figures in a reason, so that equal reasons can be counted."""
     return re.sub(r"\d+(\.\d+)?", "…", why)
 
 
 def _posed_by(force: Floats, given: Given) -> Given:
-    """Fill in missing values: the pose from the specific force (3,), and a place; both count as exact."""
+    """Fill in unknown values: the pose from the specific force (3,), and a place; both then count as exact."""
     mean = rotation_matrix(given.mounting) @ force
     roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
     return msgspec.structs.replace(
@@ -331,10 +331,10 @@ def _figures(imu: ImuRecord) -> Floats | None:
 
 
 def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[Object]:
-    """Compare every window with the mean of the `span` windows after it; by axis, in rad/s or m/s^2.
+    """Compare each window's biases with the mean of the `span` windows after it; one result per axis, SI units.
 
-    `rms` is that of the differences, `sigma_use` the median, `ratio` the rms of a difference over its sigma (1: sigma
-    is right), `share` the part within 2 sigma. The last two include the white noise of the later windows.
+    `rms` is that of the differences, `sigma_use` the median of the stated sigmas. `ratio` is the rms of difference over
+    sigma (1: sigma is right), `share` the part within 2 sigma; both allow for white noise of the later windows.
     """
     misses, uses, seen = [], [], []
     for at, one in enumerate(found):

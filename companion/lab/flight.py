@@ -1,4 +1,4 @@
-"""Analysis of a flight in a log: active offsets, biases in the air, and the drift of free inertial navigation."""
+"""Analysis of flights in a log: active offsets, biases in the air, and the drift of free inertial navigation."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from companion.storage.records import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
 _SETTLED_S: Final = 3.0
-"""Time left out after the take-off and before the landing."""
+"""Time after the take-off and before the landing that is not analysed, s."""
 _STOOD_S: Final = 30.0
-"""Longest time before the motors' start that is analysed."""
+"""Longest time before the motors' start that is analysed, s."""
 _STILL_RAD_S: Final = 0.005
 _OUTLIER: Final = 6.0
 _USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
-"""Floor of the usual scatter of windows: gyro x y z in rad/s, vertical accelerometer in m/s^2."""
+"""Least assumed scatter of window results: gyro x y z in rad/s, vertical accelerometer in m/s^2."""
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
 _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-"""Parameters of the system id: ArduPilot up to 4.6, ArduPilot from 4.7, PX4."""
+"""Names of the parameter with the MAVLink system id: ArduPilot up to 4.6, ArduPilot from 4.7, PX4."""
 _UNKNOWN: Final[Sequence[Term | None]] = (None,) * 4
 
 Knowledge = tuple[Sequence[Record], Mapping[str, KnownImu]]
-"""Records, the newest first, and learned biases on the companion's disk."""
+"""Calibration records, the newest first, and learned biases of each IMU, from the companion's disk."""
 
 
 def read(path: Path) -> Iterator[Boot]:
@@ -98,7 +98,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
 
 
 def _key(boot: Boot, stages: Stages) -> str:
-    """Make the key of a flight, from the parameters in which both firmwares count their starts and run time."""
+    """Make the key of a flight from its parameters, in which both firmwares count their starts and run time."""
     sensors = [(imu.number, imu.gyro_id, imu.accel_id) for imu in boot.imus]
     told = [boot.firmware, stages.armed_s, sensors, sorted(boot.parameters_at(stages.armed_s).items())]
     return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
@@ -123,7 +123,7 @@ def _on_earth(boot: Boot, reference: Navigation) -> Navigation:
 
 
 def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
-    """List the stages of each arming; without a logged arming, the whole log is one flight."""
+    """List the stages of each flight, one per arming; without a logged arming, the whole log is one flight."""
     logged = [at_s for at_s, state in boot.armed if state]
     armed = logged or [float(reference.t_s[0])]
     found = []
@@ -208,7 +208,7 @@ async def _imu(
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
-    """List windows before the motors' start, compared with a standstill, which is more exact than any solution."""
+    """Compare readings before the motors' start with a standstill, in windows; no solution is as exact as that."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:
@@ -222,7 +222,7 @@ def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
 
 
 def _kept(rows: Floats) -> Floats:
-    """Remove windows in which the solution has jumped, such as at a reset of its heading."""
+    """Remove windows in which the navigation solution has jumped, such as at a reset of its heading."""
     if len(rows) < 4:
         return rows
     off = np.abs(rows[:, 1:5] - np.median(rows[:, 1:5], axis=0))
@@ -259,7 +259,7 @@ def _offset_sets(
     found: Increments,
     in_air: tuple[float, float],
 ) -> dict[str, tuple[Floats, Floats]]:
-    """Return changes of the output (SI): "before", by the offsets before the calibration, and "flown", all zero."""
+    """Return the output changes (SI) to compare: "before" restores the offsets before the calibration, "flown" is 0."""
     sets: dict[str, tuple[Floats, Floats]] = {}
     if calibration is not None and before:
         inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
@@ -335,7 +335,7 @@ async def _calibration_in(firmware: FirmwareName, values: Mapping[str, float], i
 
 
 def _written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple[Record, dict[str, float]] | None:
-    """Find the latest calibration that wrote the active offsets, and the values before it; records newest first.
+    """Find the latest calibration that wrote the active offsets, and the values before it; `records`: newest first.
 
     Records are matched by offsets and not by time: the clocks of companion and autopilot may be years apart.
     """

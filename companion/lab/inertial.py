@@ -1,8 +1,8 @@
 """Free inertial navigation over a flight, and the biases that the flight shows.
 
-Navigation uses the readings as corrected by the firmware, and no aid. They are integrated once, from the log's
-beginning; a start later in the flight is one rotation and one shift of that result, so that many starts cost no more
-than one (method 3.7).
+Navigation uses the readings as corrected by the firmware, without aid. They are integrated once, from the log's
+beginning. A start later in the flight is one rotation and one shift of that result, so many starts cost no more than
+one (method.md section 3.7).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG
 
 STEP_S: Final = 0.02
-"""Length of an increment; coning and sculling within it are integrated."""
+"""Length of one integration step, s; coning and sculling within it are integrated."""
 GAP_S: Final = 0.25
-"""Longest gap in the readings within a stretch of free navigation."""
+"""Longest gap in the readings, s, over which free navigation goes on."""
 _LARGEST: Final = 1e6
 _LAST_S: Final = 1e11  # In microseconds still exact; a simulated PX4 counts from 1970
 _LAG_SPAN_S: Final = 0.3
@@ -31,7 +31,7 @@ _OUTLIER: Final = 50.0
 
 
 class Navigation(NamedTuple):
-    """Solution of an estimator, or truth of a simulator, with the Earth's rate and gravity.
+    """Trajectory by an estimator, or the true one of a simulator, with the Earth's rate and gravity there.
 
     Quaternions (n, 4) rotate body FRD to NED; velocity (n, 3) and position (n, 3) are NED in m/s and m. The Earth's
     rate is zero for an unknown place, and in a simulator without it.
@@ -45,19 +45,19 @@ class Navigation(NamedTuple):
     earth_rate_ned_rad_s: Floats = np.zeros(3)  # (3,)
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Interpolate rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3)."""
+        """Interpolate rotation matrices (m, 3, 3) from body to NED axes, velocities (m, 3) and positions (m, 3)."""
         q = _between(t_s, self.t_s, _one_sign(self.attitude))
         return matrices(q), _between(t_s, self.t_s, self.velocity), _between(t_s, self.t_s, self.position)
 
 
 def whole(rows: Floats) -> Floats:
-    """Select rows of a time in s, which may count from 1970, and values, that hold numbers of a believable size."""
+    """Select the rows with numbers of a believable size; the first column is a time in s, which may count from 1970."""
     sizes = np.abs(rows)
     return np.asarray(rows[(sizes[:, 0] < _LAST_S) & (sizes[:, 1:] < _LARGEST).all(axis=1)])
 
 
 def joined(attitude: Floats, moving: Floats) -> Navigation | None:
-    """Join quaternions (n, 1 + 4) with velocities and positions (m, 1 + 6) by time; None: too few."""
+    """Join rows of time and quaternion (n, 5) with rows of time, velocity and position (m, 7); None: too few rows."""
     attitude, moving = whole(attitude), whole(moving)
     if len(attitude) < 2 or len(moving) < 2:
         return None
@@ -71,9 +71,9 @@ def joined(attitude: Floats, moving: Floats) -> Navigation | None:
 
 
 class Increments(NamedTuple):
-    """Integrated readings: angles (n, 3) in rad, velocities (n, 3) in m/s, in body axes at the beginning of each.
+    """Readings integrated over short steps: angles (n, 3) in rad and velocities (n, 3) in m/s.
 
-    Times are the ends of the increments.
+    Axes are the body's at the beginning of each step; times are the ends of the steps.
     """
 
     t_s: Floats  # (n,) the ends
@@ -82,7 +82,7 @@ class Increments(NamedTuple):
     velocity: Floats  # (n, 3) m/s, body axes at the beginning of each
 
     def shifted(self, rate_rad_s: Floats, force_m_s2: Floats) -> Increments:
-        """Add a rate and a force, (3,) or (n, 3), to the output."""
+        """Add a rotation rate and a specific force, (3,) or (n, 3) each, to the readings."""
         dt = self.dt_s[:, None]
         turned = rate_rad_s * dt
         # The added rotation changes the axes in which the force was summed up.
@@ -133,9 +133,9 @@ def without_earth(found: Increments, solution: Navigation) -> Increments:
 
 
 def lag_s(found: Increments, solution: Navigation) -> float:
-    """Estimate the delay of the readings in filters, by comparison with the solution's attitude.
+    """Estimate the delay of the readings by filters, s, by comparison with the navigation solution's attitude.
 
-    Over a short time the rotation of late readings differs from the solution's by the change of rate times the delay.
+    The rotation of delayed readings over a short time is off by the change of rate times the delay.
     """
     span = max(round(_LAG_SPAN_S / float(np.median(found.dt_s))), 1)
     rate = found.angle / found.dt_s[:, None]
@@ -160,7 +160,7 @@ def lag_s(found: Increments, solution: Navigation) -> float:
 
 
 def _carry(found: Increments) -> tuple[Floats, Floats, Floats]:
-    """Integrate turn, velocity and position (n + 1, ...) in the axes of the body at the log's beginning."""
+    """Integrate rotation, velocity and position, (n + 1, ...) each, in the body's axes at the log's beginning."""
     turn = np.concatenate([np.eye(3)[None], running_products(rotations(found.angle))])
     added = np.einsum("nij,nj->ni", turn[:-1], found.velocity)
     velocity = _cumulative(added)
@@ -174,7 +174,7 @@ def drift(
     spans_s: Sequence[float],
     offsets: Mapping[str, tuple[Floats, Floats]],
 ) -> dict[str, list[Drift]]:
-    """Navigate freely from each second of an interval, with each set of offsets; compare the ends with the solution.
+    """Navigate freely from each second of an interval with each set of offsets; compare the ends with the solution.
 
     Args:
         found: integrated readings, corrected by the firmware, on the solution's clock.
@@ -184,7 +184,7 @@ def drift(
         offsets: change of the output (rad/s, m/s^2) by each set of offsets.
 
     Returns:
-        The drift of each span without a gap in the readings, by set of offsets.
+        The drift by set of offsets, over each span without a gap in the readings.
     """
     clean = without_earth(found, solution)
     nodes = found.nodes()
@@ -219,7 +219,7 @@ NO_WINDOWS: Final = np.zeros((0, 7))
 
 
 def windows(found: Increments, solution: Navigation, within_s: tuple[float, float], length_s: float) -> Floats:
-    """Compare the readings with the solution in adjacent windows; leave out windows with gaps in either.
+    """Compare the readings with the navigation solution in adjacent windows; leave out windows with gaps in either.
 
     Returns:
         (n, 7): middle of the window in s; excess of the readings over the solution, by gyro (3, rad/s, axes of the
@@ -262,19 +262,19 @@ def windows(found: Increments, solution: Navigation, within_s: tuple[float, floa
 
 LENGTH_S: Final = 10.0
 SHORT_S: Final = 2.0
-"""Length of windows before the motors' start, where time is short and noise is low."""
+"""Length of windows before the motors' start, s: shorter than in flight, because time is short and noise is low."""
 _LEAST: Final = 3
 _ATTITUDE_RAD: Final = (0.3 * DEG, 0.3 * DEG, 2.0 * DEG)
-"""Error of tilt and heading at one end of a stretch, for a solution with GNSS and a compass."""
+"""Errors of roll, pitch and heading at one end of a window, for a navigation solution with GNSS and a compass."""
 _VELOCITY_M_S: Final = 0.1
 _GRAVITY_M_S2: Final = 0.003
-"""Error of vertical force: local gravity against normal gravity, and the accelerometer's scale at one g."""
+"""Error of the vertical force: local against normal gravity, and the accelerometer's scale at 1 g."""
 _AT_REST: Final = 0.02
-"""Share of the attitude and velocity errors that applies at rest."""
+"""Share of the navigation solution's attitude and velocity errors that applies at rest."""
 _LEVEL_M_S2: Final = 5.0 * MG
-"""Error of the other two accelerometers; a tilt rotates it into the vertical."""
+"""Assumed error of the two horizontal accelerometers; a tilt rotates a part of it into the vertical."""
 _LEAST_SPREAD: Final = 0.15
-"""Least scatter of vibration, as a share of its median, from which a slope is estimated."""
+"""Least scatter of vibration, as a share of its median, from which a bias' slope over vibration is estimated."""
 _LEAST_TREND_S: Final = 60.0
 
 
@@ -287,8 +287,8 @@ def split(
 ) -> list[Split]:
     """Split the biases of the gyro's three axes and of the accelerometer's vertical axis into their causes.
 
-    `before` are windows before the motors' start, `flight` windows in the air, `levels` the vibration in the latter,
-    (n,) in m/s^2. `warmth` is the part of the step at the motors' start that temperature explains.
+    `before` are windows before the motors' start, `flight` those in the air, `levels` (n,) the vibration in the air,
+    m/s^2. `warmth` is the part of the step at the motors' start that temperature explains.
     """
     found = []
     for k, axis in enumerate(AXES):
@@ -319,7 +319,7 @@ def _tilt(windows: Floats) -> float:
 
 
 def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
-    """Average windows; the solution's error is `end` at the first and the last end, and `constant` throughout."""
+    """Average windows over `span_s`; the solution errs by `end` at both ends, and by `constant` throughout."""
     if len(values) < _LEAST:
         return None
     freedom = len(values) - 1
@@ -357,7 +357,7 @@ def _slopes(
 
 
 def matrices(q: Floats) -> Floats:
-    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4) of any length."""
+    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), which may have any length."""
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -368,7 +368,7 @@ def matrices(q: Floats) -> Floats:
 
 
 def vectors(turns: Floats) -> Floats:
-    """Return the rotation vectors (n, 3) of matrices (n, 3, 3) that rotate by less than 180 degrees."""
+    """Return the rotation vectors (n, 3), rad, of matrices (n, 3, 3) that rotate by less than 180 degrees."""
     skew = 0.5 * (turns - _transposed(turns))
     sine = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
     size = np.linalg.norm(sine, axis=1)
@@ -381,7 +381,7 @@ def _transposed(turns: Floats) -> Floats:
 
 
 def _one_sign(q: Floats) -> Floats:
-    """Choose the sign of each quaternion (q and -q are one rotation) that is nearer to the previous row."""
+    """Choose the sign of each quaternion (n, 4) that is nearer to the previous row; q and -q are one rotation."""
     if not len(q):
         return q
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
@@ -389,7 +389,7 @@ def _one_sign(q: Floats) -> Floats:
 
 
 def _cumulative(values: Floats) -> Floats:
-    """Return the sum of the values before each row, and the sum of all: one row more than `values`."""
+    """Return cumulative sums over rows that begin with zero, one row more than `values`."""
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
 
 

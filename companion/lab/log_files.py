@@ -1,4 +1,4 @@
-"""IMUs at rest in files of any kind: our own recordings, logs of autopilots (ULog, dataflash), CSV.
+"""Reader of IMUs at rest from files of any kind: our own recordings, autopilot logs (ULog, dataflash), CSV.
 
 The readings in an autopilot's log are corrected by its offsets. Biases found in them are residuals after these offsets,
 in the vehicle's axes.
@@ -23,14 +23,14 @@ from companion.recording import messages
 from companion.samples import ImuSample
 
 CONTINUED_S: Final = 60.0
-"""Longest gap between two recordings on the same clock that form one log."""
+"""Longest gap between two recordings on the same clock that form one log, s."""
 _ENCRYPTED: Final = b"ULogEnc"
 
 LogFormat = Literal["ulog", "dataflash", "csv", "recording"]
 
 
 def format_of(path: Path) -> LogFormat:
-    """Identify a format by its first bytes; any other file counts as a recording."""
+    """Identify a file's format by its first bytes; a binary file of no known format counts as a recording."""
     try:
         with path.open("rb") as file:
             head = file.read(len(MAGIC))
@@ -49,7 +49,7 @@ def format_of(path: Path) -> LogFormat:
 def read_logs(
     paths: Sequence[Path], columns: str | None = None, rate_hz: float | None = None, csv_name: str = NAME
 ) -> list[StillLog]:
-    """Read all IMUs in files of any kind, one log for each IMU and run; other arguments are those of `read_csv`."""
+    """Read all IMUs in files of any kind, one log per IMU and run; other arguments are those of `read_csv`."""
     found: list[StillLog] = []
     for path in paths:
         match format_of(path):
@@ -104,7 +104,7 @@ def _read_recording(path: Path) -> list[StillLog]:
 
 
 def _add(playback: Playback, topic: str, t_s: float, data: bytes, found: dict[str, _Columns]) -> None:
-    """Add the samples of a message. A change of the IMU's state is a break: readings are not comparable across it."""
+    """Add the samples of a message; a change of the IMU's state is a break: readings are not comparable across it."""
     if topic == messages.START:
         playback.begin()
     for role, part in playback.take(topic, data, t_s):

@@ -1,4 +1,4 @@
-"""Noise profile from recordings of an IMU at rest: still stretches, a fit of each axis, one model for each triad.
+"""Noise profile of an IMU from recordings at rest: still stretches, a fit of each axis, one model for each triad.
 
 If the recordings are too short for a figure, it is borrowed from another profile, within the bounds that they show.
 """
@@ -25,17 +25,17 @@ from companion.samples import TRIADS, rows_of
 
 MIN_SECONDS: Final = 16  # Least seconds of a stretch: a shorter one shows no flicker or walk
 LEAST_STILL_S: Final = 60
-"""Least total time at rest; a calibration itself measures as long."""
+"""Least total time at rest for a noise profile, s; a calibration itself measures as long."""
 _MIN_GOOD: Final = 10
 _NAMES: Final = ("N", "B", "K")
 
 
 Rest = tuple[NDArray[np.int64], Floats]
-"""One stretch at rest: seconds (m,) that the gate accepted, ascending; means (m, 6) in rad/s and m/s^2, IMU axes."""
+"""One still stretch: seconds (m,) that the gate accepted, ascending; means (m, 6) in rad/s and m/s^2, IMU axes."""
 
 
 def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
-    """Average every whole second of a recording, without the first and the last; for the arguments see `rests`."""
+    """Average the readings (n, 6) at times `t_s` (n,) over every whole second, except the first and the last."""
     finite = np.isfinite(t_s) & np.isfinite(readings).all(axis=1)
     t_s, readings = t_s[finite], readings[finite]
     slot_of = np.floor(t_s).astype(np.int64)
@@ -127,7 +127,7 @@ def fit_profile(
 
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:
-    """Choose a model that is not too optimistic for any of three axes; list the figures that no axis shows."""
+    """Choose a noise model that is not too optimistic for any of three axes; list the figures that no axis shows."""
     other = fallback.white, fallback.flicker, fallback.walk
     chosen, unknown = [0.0, 0.0, 0.0], []
     for which in range(3):

@@ -1,4 +1,4 @@
-"""PX4's ULog of flights (PX4's message definitions; autopilots 4); one file has one start of the autopilot."""
+"""Reader of flights in PX4's ULog, one start of the autopilot per file (PX4's messages; autopilots.md section 4)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _whole(rows: Floats) -> Floats:
 
 
 def _sampled(rows: Floats) -> Floats:
-    """Order rows by the sample's time, the field after the message's time; older versions have only the message's."""
+    """Order rows by the sample's time (second column); older PX4 versions have only the message's (first column)."""
     at_s = rows[:, 1] * US
     return ascending(_whole(np.column_stack([np.where(np.isfinite(at_s), at_s, rows[:, 0]), rows[:, 2:]])))
 
@@ -88,7 +88,7 @@ def _imus(start: BootMessages) -> tuple[FlownImu, ...]:
 
 
 def _selection(start: BootMessages) -> Floats:
-    """Return the device id of the gyro in use over time, (n, 2)."""
+    """Return the device id of the gyro in use over time, (n, 2): time and id."""
     told = _whole(start.rows("sensor_selection"))
     return told if len(told) else np.zeros((1, 2))
 

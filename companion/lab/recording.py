@@ -28,7 +28,7 @@ from companion.samples import ImuSample, Sample
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MOST_BYTES: Final = 4 * 1024 * 1024
-"""Most bytes of a record and of an unpacked chunk; ours have less than 1 MiB, and 2.3 MiB in a flood of bytes."""
+"""Largest record and unpacked chunk, bytes; ours have less than 1 MiB, or up to 2.3 MiB in a flood of bytes."""
 _NEEDS_MORE: Final = (
     "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
@@ -121,7 +121,7 @@ class Recording:
 
 
 class _Bounded:
-    """File that limits each read to the largest record: the library trusts the lengths of texts."""
+    """File that limits each read to the largest record, because the mcap library trusts the lengths of texts."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -133,7 +133,7 @@ class _Bounded:
 
 
 def _records(file: IO[bytes]) -> Iterator[Any]:
-    """Yield all records, with those inside chunks instead of the chunks."""
+    """Yield all MCAP records; a chunk is replaced by the records inside it."""
     from mcap.records import Chunk, DataEnd
     from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -149,7 +149,7 @@ def _records(file: IO[bytes]) -> Iterator[Any]:
 
 
 def _check_size(chunk: Any) -> None:
-    """Check the unpacked size, also that in the zstd frame: unpacking allocates it, whatever the chunk states."""
+    """Check a chunk's unpacked size, also that in its zstd frame: unpacking allocates it, whatever the chunk states."""
     import zstandard
 
     size: int = chunk.uncompressed_size
@@ -165,7 +165,7 @@ def _check_size(chunk: Any) -> None:
 
 @contextlib.contextmanager
 def reporting_damage(path: Path, topic: str) -> Iterator[None]:
-    """Convert errors of a message that no companion wrote to StorageError."""
+    """Convert to StorageError the errors of a message that no companion can have written."""
     try:
         yield
     except _UNUSABLE as error:
@@ -173,7 +173,7 @@ def reporting_damage(path: Path, topic: str) -> Iterator[None]:
 
 
 class Playback:
-    """Devices of a configuration, fed with the recorded bytes."""
+    """Decoders of the devices in a configuration, fed with recorded bytes."""
 
     def __init__(self, config: Config) -> None:
         self._devices = {device.name: device for device in serial_devices(config)}
@@ -193,11 +193,11 @@ class Playback:
             self._link.subscribe(kind, self._on_message)
 
     def state(self, name: str) -> ImuState | None:
-        """Return the state of an IMU of the autopilot; None: another IMU, or unknown so far."""
+        """Return the newest state of an IMU of the autopilot; None: another IMU, or no state so far."""
         return self._states.get(name)
 
     def take(self, topic: str, data: bytes, t_s: float) -> list[Part]:
-        """Decode a message; return its samples, each with its role."""
+        """Decode a recorded message; return its samples, each with its role."""
         self._found = []
         if topic.startswith(SERIAL):
             name = topic.removeprefix(SERIAL)
@@ -227,7 +227,7 @@ class Playback:
                 self._found.append((Role(name, "imu"), sample))
 
     def _sample(self, message: Any, t_s: float, state: ImuState, samples: ImuSamples) -> ImuSample | None:
-        """Return the sample of an IMU in a message; None: the message has no usable one."""
+        """Return the IMU's sample in a MAVLink message; None: the message has no usable one."""
         sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
         source = next((each for each in sources if each.message is type(message)), None)
         header = message.get_header()

@@ -1,8 +1,8 @@
 """Replay of a recording through decoders, collector and estimator, in the recorded order and at the recorded times.
 
-Recomputed: every sample from its raw bytes, every batch, verdict of stillness and mean, pose, biases and sigmas. Copied
-from the recording: times of ticks and windows, parameters of the autopilot, the place, the prediction from earlier
-power-ups, and everything that only the autopilot knows, such as the outcome of a write.
+Samples are computed again from their raw bytes, and from them batches, stillness, means, pose, biases and sigmas.
+Copied from the recording are times of ticks and windows, parameters of the autopilot, the place, the prediction from
+earlier power-ups, and all that only the autopilot knows, such as the outcome of a write.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from companion.recording import messages
 from companion.recording.messages import ImuState, Measured, Solved, Start, decode
 
 FOLLOWS_S: Final = 3.0
-"""Longest gap between consecutive files; a longer one means that a file between them is missing."""
+"""Longest gap between consecutive files, s; a longer one means that a file between them is missing."""
 TOLERANCE_SIGMAS: Final = 0.01
-"""Largest accepted difference of a replayed bias from the recorded one, in its sigma_use."""
+"""Largest accepted difference of a replayed bias from the recorded one, as a share of its sigma_use (stated sigma)."""
 _SIGMAS: Final = {
     "gyro_bias_rad_s": "gyro_sigma_use_rad_s",
     "residual_gyro_rad_s": "gyro_sigma_use_rad_s",
@@ -45,14 +45,14 @@ _SIGMAS: Final = {
     "residual_accel_m_s2": "accel_sigma_use_m_s2",
 }
 _BEFORE: Final = "it was measured before the recording began"
-"""Reason in `Replayed.not_recomputed` for a window that began before the recording."""
+"""Text of `Replayed.not_recomputed` for a window that began before the recording."""
 
 
 class Replayed(msgspec.Struct, frozen=True):
     """Result of one replayed calibration.
 
-    `differences` lists biases that differ by more than the tolerance; `worst_sigmas` is the largest difference, in
-    sigma_use. Both are empty if the estimates were copied from the recording; `not_recomputed` is then the reason.
+    `differences` lists biases that differ by more than the tolerance; `worst_sigmas` is the largest difference
+    in stated sigmas. Both are empty if the estimates were copied from the recording, for the reason `not_recomputed`.
     """
 
     record: Record
@@ -62,7 +62,7 @@ class Replayed(msgspec.Struct, frozen=True):
 
 
 class Replay:
-    """One pass over a recording: a single file, or several of a ring, the oldest first."""
+    """Replay of one recording: a single file, or several of a ring, the oldest first."""
 
     def __init__(self, recording: Recording) -> None:
         self._config = recording.config()
@@ -82,7 +82,7 @@ class Replay:
         self._not_recomputed = _BEFORE
 
     def take(self, recording: Recording) -> None:
-        """Replay one file; if its end is missing, the next file starts without its state."""
+        """Replay one file; if its end is missing, the next file starts with an empty state."""
         for topic, t_s, data in recording.read():
             with reporting_damage(recording.path, topic):
                 self._take(topic, data, t_s)
@@ -135,7 +135,7 @@ class Replay:
     def _measure(
         self, collector: RollingCollector, measured: Measured, now_s: float
     ) -> Measurement | CalibrationRefusedError | None:
-        """Measure the window of the recorded seconds; None: the recording lacks some of them."""
+        """Measure the recorded window again; None: the recording lacks some of its seconds."""
         if measured.start_s < self._begun_s:
             return None
         try:

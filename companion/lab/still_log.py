@@ -40,29 +40,28 @@ COLUMNS: Final[dict[str, tuple[str, float]]] = {
     for what in quantities
     for unit, factor in units.items()
 }
-"""Quantity by column name, and its factor to s, rad/s, m/s^2 or degrees Celsius."""
+"""Quantity by column name, and the factor from its unit to s, rad/s, m/s^2 or degrees Celsius."""
 HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
-"""Allowed median specific force of a log at rest; outside, a unit or a column has a wrong name."""
+"""Allowed median specific force of a log at rest; beyond it, a unit or a column has a wrong name."""
 
 PASSED_OVER: Final = ("-", "_")  # Names in --columns of a column that is not read
 _SEPARATORS: Final = (";", "\t", ",", " ")
 _LONGEST: Final = 1 << 14
 _NUMBERS: Final = 1e20
-"""Limit of a number in any unit: nanoseconds since 1970 are 2e18."""
+"""Limit of a number in any unit, above nanoseconds since 1970 (2e18); a larger one counts as missing."""
 _WRAPS: Final = 2.0**32
-"""Range of a 32-bit counter: an Arduino's micros() wraps every 71.6 min."""
+"""Range of a 32-bit time counter: an Arduino's micros() restarts at zero every 71.6 min."""
 _MOST_NAMED: Final = 12
 
 
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one run: a file, or several consecutive ones.
+    """Readings of one IMU at rest in one run: a file, or several consecutive ones.
 
-    Times (n,) ascend; readings (n, 6) are in rad/s and m/s^2, axes as recorded; they are empty if there were only
-    integers, which are left out. Temperatures are NaN if unknown. `profile` is that of the configuration at the time.
-    `clock_offset_s`: UTC minus the recording's clock. `breaks_s`: times of steps that are not noise, such as a write of
-    offsets or a restart. `left_out`: ignored lines by reason. `clock_from_start`: times count from the switch-on of the
-    autopilot.
+    Readings (n, 6) are in rad/s and m/s^2, axes as recorded; integers are left out, so that there may be none.
+    `profile` is that of the configuration at the time. `clock_offset_s` is UTC minus the recording's clock. `breaks_s`
+    are times of steps that are not noise, such as a write of offsets or a restart. `left_out` counts ignored lines by
+    reason. `clock_from_start`: times count from the autopilot's power-on.
     """
 
     imu: str
@@ -89,7 +88,7 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
         return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
 
     def pieces(self, skip_s: float = 0.0) -> list[slice]:
-        """Return the samples between the breaks, in order, without the first `skip_s` of the run."""
+        """Return slices of the samples between the breaks, in order, without the first `skip_s` of the run."""
         first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s))
         cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
         return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
@@ -168,7 +167,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _header(path: Path, file: TextIO, columns: str | None) -> tuple[list[str], str, Iterator[tuple[int, list[str]]]]:
-    """Return the column names, their source for messages, and the numbered lines as fields."""
+    """Return the column names, their origin for messages, and the numbered lines as fields."""
     lines = _lines(file, path)
     number, first = next(lines, (0, ""))
     if not number:
@@ -228,7 +227,7 @@ def _is_number(text: str) -> bool:
 def _numbers(
     path: Path, lines: Iterator[tuple[int, list[str]]], names: Sequence[str], used: dict[str, str], *, more: bool
 ) -> tuple[Floats, Floats]:
-    """Read time, readings and temperature (n, 8), NaN if missing, and the number of each line.
+    """Read time, readings and temperature, (n, 8), NaN if missing, and the number of each line, (n,).
 
     `more`: lines may have more fields than `names`.
     """
@@ -273,7 +272,7 @@ def _times(path: Path, stamps: Floats, factor: float, numbers: Floats) -> Floats
 
 
 def _check_gravity(path: Path, forces: Floats, names: Sequence[str]) -> None:
-    """Refuse wrong units of force: they would also falsify the bias."""
+    """Refuse a log whose specific force at rest is not gravity: a wrong unit would also falsify the bias."""
     with np.errstate(over="ignore"):
         found_m_s2 = float(np.median(np.sqrt(np.square(forces).sum(axis=1))))
     low, high = GRAVITY_M_S2

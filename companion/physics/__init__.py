@@ -1,1 +1,1 @@
-"""Frames, the Earth, gradienter laws, quantisation: pure functions."""
+"""Pure functions: frames and rotations, the Earth's gravity and magnetic field, tilt sensors, statistics."""

@@ -1,4 +1,4 @@
-"""Gravity, the Earth's rotation, and its magnetic field at a place."""
+"""Gravity, rotation and magnetic field of the Earth at a place."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CompassUse = Literal["good", "poor", "none"]
 
 
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
-    """Return normal gravity by Somigliana's formula (WGS 84; method 3.6).
+    """Return normal gravity by Somigliana's formula (WGS 84; method.md section 3.6).
 
     The height is above the ellipsoid. Height above sea level will do: it differs by at most 100 m, or 31 micro-g.
     """
@@ -39,18 +39,14 @@ def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
 
 
 def earth_rate_ned_rad_s(latitude_deg: float) -> Array:
-    """Return the Earth's rotation in NED, (3,)."""
+    """Return the Earth's rotation rate in NED axes, (3,)."""
     latitude_rad = latitude_deg * DEG
     return np.array([EARTH_RATE_RAD_S * math.cos(latitude_rad), 0.0, -EARTH_RATE_RAD_S * math.sin(latitude_rad)])
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class MagneticField:
-    """Field of the Earth at a place by WMM2025; the sigmas are the model's own, crust and sun included.
-
-    Declination is east positive (true heading = magnetic heading + declination), inclination down positive. Compass use
-    by the model's warning zones: "none" below 2000 nT of horizontal field, "poor" below 6000 nT.
-    """
+    """Magnetic field of the Earth at a place by WMM2025; the sigmas are the model's own, crust and sun included."""
 
     declination_deg: float  # East positive: true heading = magnetic heading + declination
     inclination_deg: float  # Down positive: 90 at the north magnetic pole, -90 at the south
@@ -70,9 +66,9 @@ class MagneticField:
 
 
 def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, date: datetime.date) -> MagneticField:
-    """Compute the field of the world magnetic model WMM2025.
+    """Compute the Earth's magnetic field at a place by the world magnetic model WMM2025.
 
-    Outside the model's years, use its nearest year: the field changes by a few tenths of a degree a year, so an old
+    Outside the model's years, the nearest year is used: the field changes by a few tenths of a degree a year, so an old
     model is better than none. The caller can warn by `WMM_VALID_YEARS`.
     """
     start = datetime.date(date.year, 1, 1)

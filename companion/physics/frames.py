@@ -1,9 +1,8 @@
-"""Frames and rotations.
+"""Coordinate frames and rotations.
 
-Body: FRD (x forward, y right, z down), as on the MAVLink wire. Navigation: NED. The paper writes RFU (x right,
-y forward, z up) and ENU instead.
-Angles: theta is pitch (nose up +), gamma is roll (right side down +), psi is heading, clockwise from true north;
-they are the aerospace 3-2-1 angles (method 1.1).
+Body axes are FRD (x forward, y right, z down), as in MAVLink messages; navigation axes are NED. The paper on which the
+method is based has RFU (x right, y forward, z up) and ENU instead. Theta is pitch (nose up +), gamma is roll (right
+side down +), psi is heading, clockwise from true north; they are the aerospace 3-2-1 angles (method.md section 1.1).
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ Array = Floats
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
-    """Return the direction cosine matrix C_n^b, 3x3: a vector's NED components to its FRD components.
+    """Return the direction cosine matrix C_n^b, 3x3, which converts a vector from NED to body axes (FRD).
 
-    Equation (5) of the paper, with its errata corrected: the paper has the wrong sign in the second terms of T11 and
-    T12, and the cosine of the latitude instead of cos(theta) in row 2 (method 1.3).
+    It is equation (5) of the method's paper, corrected. The paper has the wrong sign in the second terms of T11 and
+    T12, and the cosine of the latitude instead of cos(theta) in row 2 (method.md section 1.3).
     """
     sr, cr = math.sin(roll_rad), math.cos(roll_rad)
     st, ct = math.sin(pitch_rad), math.cos(pitch_rad)
@@ -55,7 +54,7 @@ def vector(values: Array) -> Vector:
 
 
 def skew(vectors: Floats) -> Floats:
-    """Return the cross-product matrices [v x], (..., 3, 3), of (..., 3)."""
+    """Return the cross-product matrices [v x], (..., 3, 3), of vectors (..., 3)."""
     found = np.zeros((*vectors.shape, 3))
     x, y, z = np.moveaxis(vectors, -1, 0)
     found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = -z, y, -x
@@ -71,13 +70,13 @@ def symmetric(beside: Floats) -> Floats:
 
 
 def symmetric_by(vector: Array) -> Matrix:
-    """Return the derivative of `symmetric(beside) @ vector` with respect to xy, xz and yz, 3x3."""
+    """Return the derivative, 3x3, of `symmetric(beside) @ vector` by the elements xy, xz and yz."""
     x, y, z = vector
     return np.array([[y, z, 0.0], [x, 0.0, z], [0.0, x, y]])
 
 
 def rotations(vectors: Floats) -> Floats:
-    """Return the matrices (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues)."""
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, by Rodrigues' formula."""
     angle2 = np.einsum("...i,...i->...", vectors, vectors)
     angle = np.sqrt(angle2)
     small = angle < 1e-4
@@ -89,7 +88,7 @@ def rotations(vectors: Floats) -> Floats:
 
 
 def running_products(turns: Floats) -> Floats:
-    """Return the running products of matrices (n, 3, 3), in a few numpy calls (Hillis and Steele's scan)."""
+    """Return the products of the first 1 to n matrices (n, 3, 3), in a few numpy calls (Hillis and Steele's scan)."""
     found, step = turns.copy(), 1
     while step < len(found):
         found[step:] = found[:-step] @ found[step:]
@@ -102,5 +101,5 @@ def wrap_deg(angle_deg: float) -> float:
 
 
 def roll_pitch_from_up(up: Array) -> tuple[float, float]:
-    """Return roll gamma and pitch theta, rad, from the up direction (3,) in the body's axes."""
+    """Return roll gamma and pitch theta, rad, from the unit vector (3,) that points up, in body axes (FRD)."""
     return math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))

@@ -1,8 +1,8 @@
-"""Laws of a gradienter's two readings.
+"""Conversion between attitude and the two readings of a gradienter (two-axis tilt sensor).
 
-Equation (1) of the paper holds only for a sensor whose outputs are the elevations of its own axes. A liquid cell
-reads the slope of the liquid's surface, and many modern devices give Euler angles. The wrong law costs 0.15 degrees
-(2.6 mg) at 10/10 degrees (method 1.2). The law is therefore a property of the sensor:
+Equation (1) of the method's paper holds only for a sensor whose outputs are the elevations of its own axes. A liquid
+cell reads the slope of the liquid's surface, and many modern devices give Euler angles. The wrong law costs 0.15
+degrees (2.6 mg) at 10/10 degrees (method.md section 1.2). The law is therefore a property of the sensor:
 
 | law     | outputs for (theta, gamma)                       | recovered by                                     |
 |---------|--------------------------------------------------|--------------------------------------------------|
@@ -10,7 +10,7 @@ reads the slope of the liquid's surface, and many modern devices give Euler angl
 | "slope" | qy = atan(tan theta / cos gamma), qx = gamma     | gamma = qx, theta = atan(tan qy cos qx)          |
 | "euler" | qy = theta, qx = gamma                           | theta = qy, gamma = qx                           |
 
-qx: right side down +; qy: nose up +; both in the sensor's own frame.
+The reading qx is positive with the right side down, qy with the nose up; both are in the sensor's own frame.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Law = Literal["axis", "slope", "euler"]
 
 
 def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float, float]:
-    """Return pitch theta and roll gamma in radians.
+    """Return pitch theta and roll gamma, rad, from a gradienter's two readings.
 
     Raises:
         ValueError: the readings are inconsistent ("axis" needs |qx| + |qy| <= 90 degrees).
@@ -47,17 +47,17 @@ def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float,
 
 
 def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
-    """Return the direction of specific force at rest (up) in the sensor's own FRD axes, (3,), unit length.
+    """Return the unit vector (3,) pointing up (specific force at rest) in the gradienter's own FRD axes.
 
     Raises:
-        ValueError: as `attitude_from_readings`.
+        ValueError: the readings are inconsistent.
     """
     theta, gamma = attitude_from_readings(law, x_deg, y_deg)
     return np.array([math.sin(theta), -math.sin(gamma) * math.cos(theta), -math.cos(gamma) * math.cos(theta)])
 
 
 def readings_from_up(law: Law, up: Floats) -> Floats:
-    """Return the readings (..., 2), degrees, for specific forces (..., 3) of any length in the sensor's axes."""
+    """Return a gradienter's readings (..., 2), degrees, for specific forces (..., 3) of any length in its own axes."""
     x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
     if law == "axis":
         return np.asarray(np.stack([np.arcsin(-y), np.arcsin(x)], axis=-1) / DEG)
@@ -67,10 +67,10 @@ def readings_from_up(law: Law, up: Floats) -> Floats:
 
 
 def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
-    """Return the Jacobian d up / d (qx, qy), (3, 2), per radian of reading.
+    """Return the derivative (3, 2) of the up vector by a gradienter's readings (qx, qy), per radian.
 
     Raises:
-        ValueError: as `attitude_from_readings`.
+        ValueError: the readings are inconsistent.
     """
     theta, gamma = attitude_from_readings(law, x_deg, y_deg)
     st, ct, sg, cg = math.sin(theta), math.cos(theta), math.sin(gamma), math.cos(gamma)

@@ -1,7 +1,7 @@
-"""Heading from a magnetic field vector, and the error that a disturbance causes.
+"""Heading from a magnetic field vector, and the heading error that a disturbance causes.
 
-`up` is the unit vector of specific force at rest, `field` the field vector in any unit, both of shape (3,) and in the
-same axes: forward, right, down of the vehicle or of the sensor. Method 3.5.
+`up` is the unit vector of specific force at rest, `field` the magnetic field in any unit, both of shape (3,). Their
+common axes are forward, right, down of the vehicle or of the sensor (method.md section 3.5).
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from companion.physics.frames import Array
 from companion.physics.units import DEG
 
 BOUND_OF_TWO: Final = 3.043
-"""95 % bound of an unknown third component, divided by the length of the two known ones, if all have the same sigma:
-Student's t with two degrees of freedom, 4.303 / sqrt(2). A direction uniform on the sphere gives the same value,
+"""95 % bound of an unknown third component over the length of the two known ones, if all have the same sigma. Student's
+t with two degrees of freedom gives it, 4.303 / sqrt(2). A direction uniform on the sphere gives the same value,
 0.95 / sqrt(1 - 0.95^2)."""
 BOUND_OF_ONE: Final = 12.71
-"""Bound if only one component is known: Student's t with one degree of freedom."""
+"""95 % bound of an unknown component over the only known one: Student's t with one degree of freedom."""
 _VERTICAL: Final = 1e-9
 
 
 def horizontal(vector: Array, up: Array) -> Array:
-    """Return the part of a vector perpendicular to `up`, (3,)."""
+    """Return the part (3,) of a vector that is perpendicular to `up`."""
     return vector - (vector @ up) * up
 
 
 def heading_rad(field: Array, up: Array) -> float:
-    """Return the heading of the first axis from magnetic north, clockwise, in (-pi, pi], with tilt compensation.
+    """Return the tilt-compensated heading of the first axis, clockwise from magnetic north, in (-pi, pi].
 
     Raises:
         ValueError: the first axis or the field is vertical: there is no heading.
@@ -42,13 +42,13 @@ def heading_rad(field: Array, up: Array) -> float:
 
 
 def heading_by_up(field: Array, up: Array) -> Array:
-    """Return the gradient (3,) of `heading_rad` by a change of `up` across itself: minus tan I along magnetic east.
+    """Return the gradient (3,) of `heading_rad` by `up`; in a level aircraft -tan I along magnetic east.
 
-    A tilt error makes the vertical field look horizontal: tan I times the tilt error about magnetic north (2.5 times
-    at 68 degrees). The definition of a heading adds tan theta times the tilt error about the heading.
+    A tilt error makes the vertical field look horizontal. With the inclination I, it turns the heading by tan I times
+    the tilt error about magnetic north (2.5 times at 68 degrees), and by tan theta times that about the heading.
 
     Raises:
-        ValueError: as `heading_rad`.
+        ValueError: the first axis or the field is vertical: there is no heading.
     """
     forward, right = _horizontal_axes(up)
     heading = heading_rad(field, up)
@@ -62,10 +62,10 @@ def inclination_rad(field: Array, up: Array) -> float:
 
 
 def inclination_by_up(field: Array, up: Array) -> Array:
-    """Return the gradient (3,) of `inclination_rad` by a change of `up` across itself: minus magnetic north.
+    """Return the gradient (3,) of `inclination_rad` by `up`: minus the unit vector of magnetic north.
 
     Raises:
-        ValueError: as `heading_rad`.
+        ValueError: the field is vertical.
     """
     across = horizontal(field, up)
     size = float(np.linalg.norm(across))
@@ -75,9 +75,9 @@ def inclination_by_up(field: Array, up: Array) -> Array:
 
 
 def deflection_bound_deg(unseen_gauss: float, horizontal_gauss: float) -> float:
-    """Return the largest turn of a compass by an unseen field across the meridian; 180 if it is as strong as the field.
+    """Return the largest turn of a compass by an unseen field across the meridian, at most 180 degrees.
 
-    `horizontal_gauss` is the measured horizontal field (method 3.5).
+    The turn is 180 degrees if the unseen field is as strong as the measured horizontal field (method.md section 3.5).
     """
     if unseen_gauss >= horizontal_gauss:
         return 180.0

@@ -1,6 +1,6 @@
-"""Quantiles of Student's t and the chi-square distribution, from closed approximations; numpy only.
+"""Quantiles of Student's t and chi-square distributions, by closed approximations; numpy only.
 
-A probability is given as the normal quantile with the same exceedance, in sigmas: 1.96 is 2.5 % on each side.
+A probability is given in sigmas, as the normal quantile with the same exceedance: 1.96 is 2.5 % on each side.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 from companion.physics.frames import Floats
 
 MAD_TO_SIGMA: Final = 1.4826
-"""Sigma of normal values over the median of their absolute deviations, 1 / 0.6745."""
+"""Ratio of the sigma of normal values to the median of their absolute deviations, 1 / 0.6745."""
 
 
 def student_quantile(sigmas: float, freedom: float) -> float:
-    """Return the Student's t quantile with the exceedance probability of `sigmas`, for `freedom` > 0.
+    """Return the quantile of Student's t that is exceeded as often as `sigmas`; `freedom` > 0 in degrees of freedom.
 
-    Wallace's approximation (Biometrika 46, 124, 1959), never below the exact value. It is at most 1.3 % too large at
+    Wallace's approximation (Biometrika 46, 124, 1959) is never below the exact value. It is at most 1.3 % too large at
     2 sigma from 3 degrees of freedom on, and at most 2.6 % at 4 sigma from 6 on.
     """
     normal = sigmas * (8.0 * freedom + 3.0) / (8.0 * freedom + 1.0)
@@ -29,8 +29,8 @@ def student_quantile(sigmas: float, freedom: float) -> float:
 def chi_square_ratio(freedom: Floats | float, sigmas: float) -> Floats:
     """Return the quantile of estimated over true variance: chi-square over its degrees of freedom.
 
-    Wilson and Hilferty's approximation (PNAS 17, 684, 1931). From 3 degrees of freedom on, it is within 0.3 % at 2.3
-    sigma and at most 7 % above the exact value at 4.5 sigma.
+    The approximation is Wilson and Hilferty's (PNAS 17, 684, 1931). With 3 or more degrees of freedom,
+    it is within 0.3 % at 2.3 sigma and at most 7 % above the exact value at 4.5 sigma.
     """
     spread = 2.0 / (9.0 * np.asarray(freedom))
     return np.asarray((1.0 - spread + sigmas * np.sqrt(spread)) ** 3)

@@ -1,4 +1,4 @@
-"""Factors from the field's units to SI, and the units in which gyros and accelerometers are shown."""
+"""Factors from customary units (degrees, mg) to SI, and the units in which biases are shown."""
 
 from __future__ import annotations
 

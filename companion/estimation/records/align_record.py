@@ -1,4 +1,4 @@
-"""Records of alignments: the gradienter's zero, accelerometers on all sides, a turn on one spot.
+"""Records of alignments: the gradienter's zero, six-position calibrations, and turns of the aircraft on one place.
 
 The keys are a public interface. An unknown figure is None, never zero.
 """
@@ -21,14 +21,15 @@ from companion.samples import Vector
 FORMAT_VERSION = 1
 _MOST_DEG = 90.0  # Limit of a gradienter's zero and of its sigma
 SAME_START_S = 30.0
-"""Drift between two clocks in weeks; a restart changes the start by at least the preceding uptime."""
+"""Difference of start times, s, within which they are one start: two clocks drift so far apart in weeks. A restart
+changes the start by at least the preceding uptime."""
 
 Pair = tuple[float, float]
 Kind = Literal["zero", "tilts"]
 
 
 class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Configuration of the gradienter during the alignment, which is not used with another configuration."""
+    """Configuration of the gradienter during an alignment; with another one, the alignment is not used."""
 
     port: str
     protocol: str
@@ -38,7 +39,10 @@ class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Determined(msgspec.Struct, frozen=True, kw_only=True):
-    """Three figures, one sigma each; `known`: the stands determine the figure, else its sigma is about the prior's."""
+    """Three figures with one sigma each.
+
+    `known` is False for a figure that the poses do not determine; its sigma is then about the prior's.
+    """
 
     value: Vector
     sigma: Vector
@@ -46,9 +50,9 @@ class Determined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Level bias of one IMU, vehicle FRD, after the offsets that the autopilot subtracts.
+    """Level bias of one IMU in vehicle axes (FRD), after the offsets that the autopilot subtracts.
 
-    It is the effective accelerometer bias when the base is level, as a level calibration measures it.
+    It is the effective accelerometer bias when the base is level, as a firmware's level calibration measures it.
     """
 
     name: str
@@ -59,10 +63,9 @@ class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
-    """One IMU aligned with a gradienter; the small misalignment is from the gradienter's axes to this IMU's.
+    """Alignment result of one IMU against a gradienter (tilt sensor).
 
     `accel_bias_mg` is the bias alone, without scale, shear and misalignment, which all look like a bias in one pose.
-    Shear: xy, xz, yz.
     """
 
     accel_bias_mg: Determined
@@ -85,7 +88,7 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
     format_version: int = FORMAT_VERSION
     measured_at: str
     slope_deg: float
-    checked: bool  # True if the stands would have revealed a spot that moved
+    checked: bool  # True if the poses would have revealed a moved parking place
     chi_square: float
     freedom: int
     stands: tuple[StandRecord, ...]
@@ -96,7 +99,7 @@ class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
     kind: Kind
     gradienter: GradienterSettings
     offset_deg: Pair
-    """Measured zero of the gradienter, x and y; it adds to the configured `gradienter.offset_deg`."""
+    """Measured zero of the gradienter on its axes x and y; it adds to the configured `gradienter.offset_deg`."""
     sigma_deg: float
     covariance_deg2: tuple[Pair, Pair]
     temperature_degc: float | None
@@ -109,9 +112,9 @@ class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
-    """Identity of one power-up of a sensor; biases change with each."""
+    """Identity of one power-up of a sensor; biases change with each power-up."""
 
-    host: str  # Identity of the companion computer's start, whose clock counts
+    host: str  # Identity of the companion computer's start; times are on its clock
     started_s: float
     up_s: float
 
@@ -120,11 +123,11 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of one IMU on all sides, in its own axes, after the offsets that the autopilot subtracts.
+    """Six-position calibration of one IMU, in its own axes, after the offsets that the autopilot subtracts.
 
-    Shear: xy, xz, yz; no firmware corrects it. `left_out`: stands, from 1, that do not fit the others. `scatter_mg`:
-    rms of the corrected readings' length minus gravity. `whole_bias_mg`: bias without any offset, as it is written;
-    None: the record is of an earlier version.
+    `left_out` numbers the positions, from 1, that do not fit the others. `scatter_mg` is the rms of the corrected
+    readings' length minus gravity. `whole_bias_mg` is the bias without any offset, as it is written; None: the record
+    is of an earlier version.
     """
 
     name: str
@@ -152,10 +155,10 @@ class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check(record: AlignmentRecord | FacesRecord) -> None:
-    """Verify that a record can be used.
+    """Verify that the figures of an alignment record are possible.
 
     Raises:
-        msgspec.ValidationError: figures that no sensor has.
+        msgspec.ValidationError: a figure that no sensor has.
     """
     if isinstance(record, FacesRecord):
         found = [(imu.accel_bias_mg.value, imu.accel_bias_mg.sigma, 1e4) for imu in record.imus]
@@ -174,7 +177,7 @@ class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Tilt of the board against the base: its attitude (roll right side down) on a level base.
+    """Tilt of the autopilot's board in the aircraft: its roll (right side down) and pitch on a level base.
 
     The accelerometers of `imu` measured it; a six-position calibration has measured their bias and scale.
     """
@@ -190,7 +193,7 @@ class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
 class TurnRecord(SpotRecord, frozen=True, kw_only=True):
     kind: Literal["turn"] = "turn"
     imus: tuple[TurnImuRecord, ...]
-    board: BoardRecord | None = None  # None where the accelerometers are not known from all sides
+    board: BoardRecord | None = None  # None without a six-position calibration
 
 
 HandRecord = AlignmentRecord | FacesRecord | TurnRecord
@@ -277,7 +280,7 @@ def completed(
     written: dict[str, dict[str, WrittenParameter]],
     level: dict[str, WrittenParameter],
 ) -> HandRecord:
-    """Return the record with its warnings and the parameters written: `written` by IMU, `level` for the board."""
+    """Return the record with warnings and the parameters written: `written` by IMU, `level` for the board's tilt."""
     replace = msgspec.structs.replace
     if isinstance(record, AlignmentRecord):
         return replace(record, warnings=warnings)

@@ -1,4 +1,4 @@
-"""Records of flights, from logs of the autopilot; SI units. Biases are residuals after the active offsets."""
+"""Records of flights, made from logs of the autopilot, in SI units; biases are residuals after the active offsets."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ HEADS: Final = {
     "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
     "vibration": "vibration", "trend": "per minute",
 }  # fmt: skip
-"""Terms of a `Split`, as tables name them (docs/flight.md)."""
+"""Column headings for the terms of a `Split` in tables (docs/flight.md)."""
 UNSEEN: Final = "accel x, y: not counted, in the air nothing tells them from tilt"
 _WORTH: Final = {"deg/h": 30.0, "mg": 1.5}  # Least bias worth a recommendation
 
 
 class Term(msgspec.Struct, frozen=True):
-    """A part of a bias with one sigma; rad/s or m/s^2."""
+    """Part of a bias with one sigma, in rad/s or m/s^2."""
 
     value: float
     sigma: float
 
 
 class Split(msgspec.Struct, frozen=True, kw_only=True):
-    """Parts of one axis' residual bias after the active offsets; None: not in the log.
+    """Residual bias of one axis after the active offsets, split into its causes; None: the log does not show it.
 
-    `in_flight`: mean from take-off to landing. `ekf`: the EKF's estimate in the latter half of the flight. `turn_on`:
-    mean while standing, before the motors start. `temperature`: change from there into the air, by the learned curve.
-    `motors`: step at the motors' start, from vibration rectification, and from temperature without a known curve.
-    `vibration`: change for each m/s^2 of vibration level. `trend`: change in a minute of flight.
+    `in_flight` is the mean from take-off to landing, `ekf` the EKF's estimate in the latter half of the flight.
+    `turn_on` is the mean at rest before the motors start, `temperature` the change from there into the air by the
+    learned curve. `motors` is the step at the motors' start: from vibration rectification, and from temperature if no
+    curve is known. `vibration` is the change per m/s^2 of vibration level, `trend` the change per minute of flight.
     """
 
     axis: str
@@ -47,7 +47,7 @@ class Split(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """Distance of free inertial navigation from the solution after a time; one start in twenty exceeds `worst_m`."""
+    """Distance of free inertial navigation from the reference after a time; one start in twenty exceeds `worst_m`."""
 
     seconds: float
     starts: int
@@ -56,7 +56,7 @@ class Drift(msgspec.Struct, frozen=True):
 
 
 class Stages(msgspec.Struct, frozen=True):
-    """Times of a flight by the autopilot's clock; None: not in the log."""
+    """Times of a flight's stages on the autopilot's clock; None: not in the log."""
 
     armed_s: float
     motors_s: float | None
@@ -67,7 +67,7 @@ class Stages(msgspec.Struct, frozen=True):
 
 
 class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """Flight result of one IMU; its active offsets, in its own axes, came from the record begun at `calibration`."""
+    """Result of one flight for one IMU; `calibration` is the start of the calibration that wrote the active offsets."""
 
     imu: int
     rate_hz: float
@@ -75,20 +75,20 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     gyro_id: int | None = None
     accel_id: int | None = None
     set_gyro_rad_s: tuple[float, ...] | None
-    set_accel_m_s2: tuple[float, ...] | None  # Offsets in force, in the IMU's own axes
+    set_accel_m_s2: tuple[float, ...] | None  # Active offsets, in the IMU's own axes
     axes: tuple[Split, ...]
-    drift: dict[str, list[Drift]]  # Drift without aid, by offsets: `flown`, `before`
+    drift: dict[str, list[Drift]]  # Drift of free navigation, by set of offsets: `flown`, `before`
     notes: tuple[str, ...]
 
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
     key: str
-    """Identity of this arming of the autopilot, equal for every file that it is read from."""
+    """Identity of this arming of the autopilot, equal for every log file that contains it."""
     system_id: int | None
     began_at: str | None
     stages: Stages
     reference: str
-    """Reference solution of the drift: "ekf", or "truth" of a simulator."""
+    """Source of the solution against which drift is measured: "ekf", or "truth" of a simulator."""
     imus: tuple[ImuFlight, ...]
     notes: tuple[str, ...]
 
@@ -116,7 +116,7 @@ def drift_lines(imu: ImuFlight) -> list[str]:
 
 
 def figure(imus: Sequence[ImuFlight]) -> str | None:
-    """Summarise a flight by the drift of its first IMU at the time nearest to 30 s; None: no IMU has one."""
+    """Summarise a flight as text: drift of its first IMU at the time nearest to 30 s; None: no IMU has a drift."""
     first = next((imu for imu in imus if imu.drift.get("flown")), None)
     if first is None:
         return None

@@ -1,10 +1,10 @@
-"""History of one IMU's biases, and the part of it that a prediction uses.
+"""History of one IMU's biases, and the choice of the points that a prediction uses.
 
-The history has whole biases as *measured*, never combined with a prior: a prior that learns from itself becomes more
-certain with every calibration. One power-up counts as one point, whatever the number of calibrations in it: they all
-include the turn-on bias of that power-up.
+The history has biases as *measured*, without autopilot offsets, and never combined with a prior: a prior that learns
+from itself becomes more certain with every calibration. One power-up counts as one point, whatever the number of its
+calibrations, because all of them include its turn-on bias.
 
-A start reads thousands of points: they are stored as arrays and not tracked by the garbage collector.
+A start of the daemon reads thousands of points: they are stored as arrays and not tracked by the garbage collector.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ import msgspec
 from companion.samples import Triad, Vector
 
 _MOST: Final = 100.0
-"""Limit of a whole bias and of its sigmas, rad/s or m/s^2: above the worst IMU's, even with a wrong scale."""
+"""Largest stored bias and sigma, rad/s or m/s^2: above the worst IMU's, even with a wrong scale."""
 _Bias = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 _Sigma = Annotated[float, msgspec.Meta(ge=0.0, le=_MOST)]
 _Sigmas = tuple[_Sigma, _Sigma, _Sigma]
 WEIGHS_FROM: Final = 5
-"""Least earlier power-ups for a prediction that takes part in the estimate."""
+"""Least number of earlier power-ups for a prediction that takes part in the estimate."""
 NEW_AFTER: Final = 3
-"""Power-ups in a row that contradict earlier ones and show a replaced sensor: they are no outliers then."""
+"""Number of consecutive power-ups contradicting earlier ones that shows a replaced sensor instead of outliers."""
 KEEP_POWER_UPS: Final = 48
 KEEP_POINTS: Final = 8  # Maximum points of a power-up
 NEAR_K: Final = 2.0  # Temperature difference below which points are redundant
 _LATEST: Final = 10
-"""Latest power-ups to keep at any temperature: a sensor ages."""
+"""Number of latest power-ups that are stored whatever their temperature, because a sensor ages."""
 SAME_START_S: Final = 60.0
-"""Two starts closer than this are the same power-up: the wall clock may have been adjusted in between."""
+"""Difference of start times, s, within which they are one power-up: the wall clock may have been adjusted."""
 
 
 class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """Start of the companion computer (`host`) and of the sensor's own device, by the wall clock.
+    """Identity of a power-up: start of the companion computer (`host`), and of the sensor's own device.
 
     Two are the same if either start matches: too few points make a prior cautious, double counting overconfident.
     """
@@ -47,20 +47,20 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
     since_unix_s: float | None  # Start of the sensor's own device, by the wall clock; None: unknown
 
     def is_same(self, other: PowerUp) -> bool:
-        """Return False only if the power was surely off in between."""
+        """Return False only if the power was certainly off between both starts."""
         return self.host == other.host or self.started_with(other)
 
     def started_with(self, other: PowerUp) -> bool:
-        """Return True if both have the same start: the power was on all the time."""
+        """Return True if the sensor's own device has the same start time in both, so that it stayed powered."""
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 
 
 class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """One triad's whole bias from the readings alone, vehicle FRD, rad/s or m/s^2.
+    """Bias of one triad from the readings alone, without autopilot offsets, in vehicle axes (FRD), rad/s or m/s^2.
 
-    `sigma_use` is that of the sensor alone, `sigma_shared` that from place and heading, without the gradienter's zero.
-    `suspect`: contradicts the prediction. `chosen`: suspect, but written on request; earlier points no longer count.
+    `sigma_use` is from the sensor alone, `sigma_shared` from place and heading, without the gradienter's zero.
+    `suspect`: contradicts its prediction. `chosen`: suspect, but written on request; earlier points no longer count.
     """
 
     bias: tuple[_Bias, _Bias, _Bias]
@@ -76,9 +76,9 @@ class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """One calibration of one IMU, or one still window that no calibration used (`started_at` is empty).
+    """Biases of one IMU from one calibration, or from a still window that no calibration used (`started_at` empty).
 
-    `up`: attitude of the accelerometer measurement, in the vehicle's axes. `zero`: identity of the gradienter's zero in
+    `up` is the up vector of the accelerometer measurement, in vehicle axes. `zero` identifies the gradienter's zero in
     use; None without a gradienter.
     """
 
@@ -102,7 +102,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
         return found
 
     def as_chosen(self, *, gyro: bool = True) -> Point:
-        """Mark a suspect point as chosen: its calibration was requested and is active. `gyro`: gyros too."""
+        """Mark suspect biases as chosen, because their calibration was requested and is active; `gyro`: gyros, too."""
         found: dict[Triad, MeasuredBias | None] = {"gyro": self.gyro if gyro else None, "accel": self.accel}
         chosen = {t: msgspec.structs.replace(one, chosen=True) for t, one in found.items() if one and one.suspect}
         return msgspec.structs.replace(self, **chosen)
@@ -121,10 +121,10 @@ def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
 
 
 def kept(points: Sequence[Point]) -> tuple[Point, ...]:
-    """Choose the points to keep, so that rare temperatures (winter) stay in the history.
+    """Choose the points to store, so that rare temperatures (winter) stay in the history.
 
-    With too many power-ups, the one with the most common temperatures is dropped; of several, the oldest. Of too many
-    points in one power-up, the latest and those at the most different temperatures stay.
+    Among too many power-ups, the oldest one with the most common temperatures is dropped. Among too many points of one
+    power-up, the latest and those at the most different temperatures stay.
     """
     groups = [_thinned(group) for group in by_power_up(points)]
     while len(groups) > KEEP_POWER_UPS:
@@ -147,9 +147,9 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
 
 
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
-    """Choose the points for a prediction of one triad, by power-up.
+    """Choose the points for a prediction of one triad, grouped by power-up.
 
-    Outliers are left out. `NEW_AFTER` in a row, or a chosen one, show a new sensor: then all before are left out.
+    Outliers are left out. `NEW_AFTER` in a row, or a chosen point, show a new sensor: earlier points are left out.
     """
     measured = [point for point in points if point.of(triad) is not None]
     start = max((k for k, point in enumerate(measured) if point.measured(triad).chosen), default=0)

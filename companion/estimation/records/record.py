@@ -1,7 +1,7 @@
 """Record of one calibration: results, sigmas, and parameters written.
 
-The keys are a public interface. A value that is unknown or does not apply is None (null in JSON), never absent
-and never zero. All axes are the vehicle's FRD.
+The keys are a public interface. A value that is unknown or does not apply is None (null in JSON), never absent and
+never zero. All axes are the vehicle's (FRD).
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Pose(msgspec.Struct, frozen=True, kw_only=True):
-    """Attitude of the aircraft: nose up, right side down, clockwise from true north."""
+    """Attitude of the aircraft: pitch theta (nose up), roll gamma (right side down), heading psi (from true north)."""
 
     theta_deg: float | None
     gamma_deg: float | None
     psi_deg: float | None
     sigma_deg: PoseSigma
-    tilt_from: TiltFrom | None = None  # "accelerometers": of an IMU that was calibrated on all sides before
+    tilt_from: TiltFrom | None = None  # "accelerometers": of an IMU with a six-position calibration
     heading_from: HeadingFrom | None = None
 
 
@@ -53,18 +53,18 @@ class SiteRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
-    """Magnetic field at the compass and the Earth's by WMM2025; inclinations down positive. None: unknown.
+    """Magnetic field at the compass and the Earth's field by WMM2025; inclinations are positive downwards.
 
-    The heading error exceeds its bound in one case of twenty; 180: the field gives no heading. `heading_from`: the
-    device's own tilt compensation, or ours from the gradienter. `device_minus_field_deg`: difference of both headings,
-    if the device sends both.
+    The heading error exceeds its bound in one case of twenty. `heading_from` is the device's own tilt compensation, or
+    ours with the gradienter. `device_minus_field_deg` is the difference of both headings, if the device sends both.
+    None: unknown.
     """
 
     heading_bound_deg: float | None
     """95 % bound of the heading error, degrees; None: field or position unknown; 180: the field gives no heading."""
     heading_from: Literal["device", "field"]
     field_gauss: float | None
-    field_expected_gauss: float | None  # Field and inclination of the Earth by WMM2025
+    field_expected_gauss: float | None  # The Earth's field and inclination are by WMM2025
     inclination_deg: float | None  # Down positive; needs a gradienter
     inclination_expected_deg: float | None
     device_minus_field_deg: float | None
@@ -91,25 +91,23 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
-    """Turn of the platform under the aircraft, about the vertical, clockwise seen from above.
+    """Turn of the platform (ground or deck) under the aircraft, about the vertical.
 
-    The turn is not subtracted; the gyros' sigma includes it. None: no source measured it, and the ground was assumed
-    fixed to the Earth. "gyros": measured against their level at an earlier rest. "earlier calibrations": against the
-    biases that these predict.
+    The turn is not subtracted; the gyros' sigma includes it.
     """
 
     platform: Literal["ground", "deck"]
     turn_deg_s: float | None
-    """About the vertical, clockwise seen from above, not subtracted; None: not measured, assumed fixed to the Earth."""
+    """Turn rate about the vertical, clockwise seen from above; None: not measured, the ground is assumed fixed."""
     turn_sigma_deg_s: float | None
     told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
-    """Source of the turn. Gyros: against their level at rest; earlier calibrations: against predicted biases."""
+    """Source of the turn rate: "gyros" compare with an earlier rest, "earlier calibrations" with predicted biases."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
     """One autopilot parameter: value before, value set, value read back.
 
-    "verified": read back and seen in the telemetry. "stored": read back, but its effect cannot be seen.
+    "verified": read back, and the effect seen in the telemetry. "stored": read back, but its effect cannot be seen.
     "failed": not set, or not restored. "rolled_back": the old value is active again.
     """
 
@@ -120,20 +118,20 @@ class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 Prior = dict[Triad, dict[str, Any] | None]
-"""Predictions for one IMU from earlier power-ups; None: fewer than three power-ups.
+"""Predicted biases of one IMU from earlier power-ups, by triad; None: fewer than three power-ups.
 
 `used`: the prediction took part in the estimate (every prediction is a plausibility gate). `power_ups`: their number.
-`temperature_model`: from a curve. `expected_rad_s` or `expected_m_s2`, with `sigma_…` of today's bias about it.
-`measured_…`: bias from the readings alone. `shift_sigma`: their difference in sigmas.
+`temperature_model`: predicted by a curve. `expected_rad_s` or `expected_m_s2`: today's bias, with `sigma_…`.
+`measured_…`: bias from the readings alone. `shift_sigma`: difference of both in sigmas.
 """
 
 
 class Effective(msgspec.Struct, frozen=True, kw_only=True):
-    """Sigma of the accelerometers' bias at another attitude, with scale errors times 1 g.
+    """Sigma of the accelerometer biases at another attitude than the calibration's, with scale errors times 1 g.
 
-    An alignment with tilts measures the scale; else 0.5 % is assumed. The bias of an axis changes by
-    `scale_sigma_m_s2`, one sigma, times the change of its share of gravity: 1 - cos(tilt) for the vertical axis of a
-    level aircraft. `sensor_sigma_m_s2` is that of the sensor's own bias, in its own axes, at any attitude.
+    The bias of an axis changes by `scale_sigma_m_s2` (one sigma) times the change of its share of gravity,
+    1 - cos(tilt) for the vertical axis of a level aircraft. `sensor_sigma_m_s2` is that of the sensor's own bias, in
+    its own axes, at any attitude.
     """
 
     scale_from: Literal["assumed", "alignment"]  # "alignment": measured with tilts; "assumed": 0.5 %
@@ -143,7 +141,7 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WhenWarm(msgspec.Struct, frozen=True):
-    """Whole biases that the curve over temperature predicts for the warm board."""
+    """Biases without autopilot offsets that the curve over temperature predicts for the warm board."""
 
     degc: float
     gyro_bias_rad_s: Vector
@@ -163,12 +161,12 @@ class TriadFigures(NamedTuple):
 
 
 class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written.
+    """Result of one IMU: whole biases (output without any offset, minus the true value), sigmas, and what was written.
 
     The covariance is 6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None for a half that was not determined.
-    sigma_use includes an invisible warm-up, which only time removes. Triads `held_back` contradict earlier calibrations
-    and were not requested explicitly. Triads `unchanged` keep their active offsets, which are as good, with the sigma
-    "in force". Device ids are the autopilot's; None: it has none, or the record is of an older version.
+    sigma_use includes an invisible warm-up. Triads `held_back` were not written: they contradict earlier calibrations,
+    and the request did not insist. Triads `unchanged` keep their active offsets, which are as good; their sigma is
+    `..._sigma_in_force_...`.
     """
 
     name: str
@@ -190,13 +188,13 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
     gyro_sigma_warm_up_rad_s: Vector | None = None
-    """Part of sigma_use from a warm-up too small to see; only time removes it."""
+    """Part of the stated sigma from a warm-up that may be too small to see in the window; only time removes it."""
     accel_sigma_warm_up_m_s2: Vector | None = None
     when_warm: WhenWarm | None = None  # None: the board was warm, or the end of its warm-up is unknown
     gyro_id: int | None = None  # Device ids in the autopilot; None: it has none, or the record is of an older version
     accel_id: int | None = None
     gyro_sigma_in_force_rad_s: Vector | None = None
-    """One sigma of the offsets that this calibration left unchanged; None if it wrote them."""
+    """One sigma of the active offsets that this calibration left unchanged; None if it wrote them."""
     accel_sigma_in_force_m_s2: Vector | None = None
 
     def of(self, triad: Triad) -> TriadFigures:
@@ -207,7 +205,7 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
         return TriadFigures(self.accel_bias_m_s2, *sigmas, self.residual_accel_m_s2, self.accel_sigma_in_force_m_s2)
 
     def sigma_in_force(self, triad: Triad) -> Vector | None:
-        """Return one sigma of the residual bias with the active offsets, for the next minutes."""
+        """Return one sigma of the bias that remains in the output with the active offsets, for the next minutes."""
         own = self.of(triad)
         if own.sigma_in_force is not None:
             return own.sigma_in_force
@@ -216,14 +214,14 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
         return _each(math.hypot, own.sigma_use, own.residual)
 
     def settled_sigma(self, triad: Triad) -> Vector | None:
-        """Return sigma_use without the warm-up, which changes the output equally with old and new offsets."""
+        """Return the stated sigma without a warm-up, which changes the output equally with old and new offsets."""
         own = self.of(triad)
         if own.sigma_use is None or own.sigma_warm_up is None:
             return own.sigma_use
         return _each(lambda use, part: math.sqrt(max(use**2 - part**2, 0.0)), own.sigma_use, own.sigma_warm_up)
 
     def confirming(self, before: ImuRecord | None) -> ImuRecord:
-        """Return this record with the sigma of the offsets that it left unchanged; `before`: record of their origin."""
+        """Add the sigma of the offsets that this calibration left unchanged; `before` is the record that wrote them."""
 
         def confirmed(triad: Triad) -> Vector | None:
             own = self.of(triad)
@@ -237,10 +235,10 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: float) -> float:
-    """Return one sigma of an offset whose sigma was `earlier`, after a second measurement with this residual.
+    """Return one sigma of an offset, `earlier` before a second measurement, which left this residual.
 
-    The residual counts by the share that its noise does not explain. The second measurement alone would give
-    hypot(sigma, residual). The sigmas are not averaged, because part of their errors is common.
+    The residual counts by the share that its noise (`averaged`) does not explain. The second measurement alone would
+    give hypot(sigma, residual). The sigmas are not averaged, because part of their errors is common.
     """
     gain = earlier**2 / max(earlier**2 + averaged**2, sys.float_info.min)
     return min(math.hypot(earlier, gain * residual), math.hypot(sigma, residual))
@@ -252,10 +250,10 @@ def _each(function: Callable[..., float], *vectors: Vector | None) -> Vector:
 
 
 class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Calibration that was active when the aircraft armed.
+    """Arming of the autopilot, and the calibration that was active then.
 
-    "calibrated": by the calibration that began at `calibration`. "checked": offsets of unknown origin that a
-    measurement confirmed. "uncalibrated": neither; `reason` gives the cause.
+    "calibrated": its offsets are from the calibration that began at `calibration`. "checked": their origin is unknown,
+    but a measurement confirmed them. "uncalibrated": neither; `reason` gives the cause.
     """
 
     armed_at: str
@@ -270,7 +268,7 @@ class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
-    """Alignment of the gradienter in use: its zero on top of the configured one, and sigma."""
+    """Alignment of the gradienter used in a calibration: measured zero, added to the configured one, and sigma."""
 
     measured_at: str
     offset_deg: tuple[float, float]
@@ -278,17 +276,17 @@ class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """One finished calibration; times are UTC, ISO 8601, by the host's clock, which may be wrong.
+    """One finished calibration; times are UTC, ISO 8601, by the companion computer's clock, which may be wrong.
 
-    `alignment` None: the gradienter's zero and sigma were those of the configuration. `armings` is empty in the file;
-    the history fills it in.
+    `alignment` is None if the gradienter's zero and sigma were those of the configuration. `armings` is empty in the
+    file; the history fills it in.
     """
 
     format_version: int = FORMAT_VERSION
     state: Literal["done", "failed", "cancelled"]
     reason: str
     warnings: tuple[str, ...]
-    started_at: str  # UTC, ISO 8601; the host's clock, which on a field computer may be wrong
+    started_at: str  # UTC, ISO 8601; by the companion computer's clock, which may be wrong
     duration_s: float
     pose: Pose | None
     site: SiteRecord | None
@@ -314,7 +312,7 @@ def to_json(record: Record) -> bytes:
 
 
 def from_json(data: bytes) -> Record:
-    """Parse a record.
+    """Parse a calibration record from JSON.
 
     Raises:
         msgspec.MsgspecError: not a record, or one of a newer companion.

@@ -1,7 +1,7 @@
-"""Validity check of the active calibration.
+"""Validity check of the active calibration, which ages after its last confirmation.
 
-A confirmed calibration (written and seen in the telemetry, or measured to be right) ages. Its limits follow from the
-error budget (method 2.2 and 3.2):
+A confirmed calibration was written and seen in the telemetry, or measured to be right. The error budget limits its
+validity (method.md sections 2.2 and 3.2):
 
 - age: the wander predicted by the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, for at most the
   configured limit (30 minutes);
@@ -32,7 +32,7 @@ from companion.samples import Triad, Vector
 DRIFT_SIGMAS: Final = 2.0
 RESIDUAL_SIGMAS: Final = 3.0
 WORTH_SIGMAS: Final = 2.0
-"""Least improvement for a new write, in sigma_use: a smaller one would mostly write noise."""
+"""Least improvement that is worth a new write, in sigmas; a smaller one would mostly write noise."""
 
 _LONGEST_S: Final = 24 * 3600.0
 _NONE: Final[Vector] = (0.0, 0.0, 0.0)
@@ -40,7 +40,7 @@ _DIGITS: Final[dict[Triad, int]] = {"gyro": 0, "accel": 2}
 
 
 class Why(enum.Enum):
-    """Reasons why a calibration does not count as good; the values are shown to operators."""
+    """Reason why the active calibration is not good enough; operators see the value as text."""
 
     NEVER = "not calibrated yet"
     UNDONE = "calibration was undone"
@@ -56,11 +56,12 @@ class Why(enum.Enum):
 
 
 class Held(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one triad of one IMU while its calibration is good; rad/s or m/s^2.
+    """State of one triad of one IMU, in rad/s or m/s^2, with which later windows are compared.
 
-    `calibrated_s` None: the offsets were only measured to be right. `sigma_use` is the stated sigma. `sigma`, for
-    comparisons, excludes the coming warm-up, which affects old and new offsets equally. `expected`: output minus truth,
-    zero if the autopilot corrects, else the whole bias. `seen`: in the telemetry. `averaged_s`: T of V(T, H).
+    `calibrated_s` is None if the offsets were only measured to be right. `sigma_use` is the stated sigma. `sigma`, for
+    comparisons, excludes the coming warm-up, which affects old and new offsets equally. `expected` is the output minus
+    the true value: zero if the autopilot corrects, else the whole bias. `seen`: in the telemetry. `averaged_s`:
+    averaging time.
     """
 
     calibrated_s: float | None
@@ -94,11 +95,11 @@ def held_of(
 
 
 class Present(msgspec.Struct, frozen=True, kw_only=True):
-    """Rolling window's output minus truth at this pose (rad/s or m/s^2, vehicle FRD); sigmas as in `Held`."""
+    """Output of the rolling window minus the true value at this pose, in vehicle axes (FRD), rad/s or m/s^2."""
 
     residual: Vector
     sigma_use: Vector
-    sigma: Vector  # Both as in `Held`
+    sigma: Vector  # `sigma_use` and `sigma` are as in `Held`
 
 
 class Objection(NamedTuple):
@@ -108,9 +109,10 @@ class Objection(NamedTuple):
 
 @functools.lru_cache(maxsize=128)
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
-    """Return the horizon H at which V(T, H) without its white part, the wander, reaches DRIFT_SIGMAS sigma_use.
+    """Return the age, s, at which the predicted wander of a bias reaches DRIFT_SIGMAS times its sigma.
 
-    At most a day, far beyond the configured limit. The smallest axis of `sigma` counts; `averaged_s` is T.
+    The wander, since a mean over `averaged_s`, excludes white noise. The smallest axis of `sigma` counts. A day is the
+    maximum, far beyond the configured limit.
     """
     horizons_s = np.geomspace(1.0, _LONGEST_S, 1200)
     drift = floor_variance(model.flicker, model.walk, averaged_s, horizons_s)
@@ -128,9 +130,9 @@ def judge(
     present: Present | None = None,
     drift: tuple[Vector, Vector] | None = None,
 ) -> list[Objection]:
-    """List the reasons against one triad's calibration; empty while it is good.
+    """List the reasons against one triad's active calibration; the list is empty while it is good.
 
-    `now_s` is on the clock of `held`; `present` is a still window, or None. `drift`: change of the bias with the
+    `now_s` is on the clock of `held`; `present` is a still window, or None. `drift` is the change of the bias with the
     temperature since `held`, and its variance; None: unknown.
     """
     name, triad = key
@@ -170,14 +172,14 @@ def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor:
 
 
 def worst_axis(held: Held, present: Present) -> float | None:
-    """Return the largest signed difference beyond RESIDUAL_SIGMAS of both sigmas combined; None: all axes agree."""
+    """Return the largest signed difference beyond RESIDUAL_SIGMAS combined sigmas; None: all axes agree."""
     return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
-    """Return whether new offsets would improve any axis by more than WORTH_SIGMAS and more than `floor`.
+    """Return True if new offsets would improve any axis by more than WORTH_SIGMAS sigmas and by more than `floor`.
 
-    The active calibration is not better than its own sigma; the floor is in the same unit.
+    The active calibration counts with its own sigma; `floor` is in rad/s or m/s^2.
     """
     expected, then = (_NONE, _NONE) if held is None else (held.expected, held.sigma)
     return bool(_off(present, expected, then, WORTH_SIGMAS, floor))

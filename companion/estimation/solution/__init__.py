@@ -1,1 +1,1 @@
-"""Biases and sigmas from a window, combined with earlier calibrations, and the record."""
+"""Estimation of biases from one still window, combination with earlier calibrations, and the result as a record."""

@@ -1,6 +1,6 @@
-"""Biases of one IMU over temperature, for the terminal, the page and reports.
+"""Biases of one IMU over temperature, for the terminal, the web page and reports.
 
-Imports no numpy: the page's process reads these types.
+This module imports no numpy, because the web page's process reads its types.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 STEP_K: Final = 1.0  # Distance between the rows of a curve
 MOST_ROWS: Final = 60
 _ENOUGH_K: Final = 5.0
-"""Least span of temperatures for a curve (method 3.3)."""
+"""Least range of measured temperatures, K, that gives a curve of bias over temperature (method.md section 3.3)."""
 _DAY_S: Final = 86400.0
 
 
 class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
-    """Biases of one still window, vehicle FRD; `started_at`: calibration that used it; empty: none did.
+    """Biases of one IMU from one still window, in vehicle axes (FRD), each with one sigma.
 
-    Power-ups count from 0. Accelerometers None: the tilt was unknown.
+    `started_at` identifies the calibration that used the window; it is empty if none did.
     """
 
     at_unix_s: float
@@ -42,7 +42,7 @@ class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expected(msgspec.Struct, frozen=True):
-    """Expected gyro biases at a temperature; one sigma."""
+    """Expected gyro biases at one temperature, each with one sigma."""
 
     degc: float
     gyro_deg_h: Vector
@@ -50,7 +50,7 @@ class Expected(msgspec.Struct, frozen=True):
 
 
 class ExpectedForces(msgspec.Struct, frozen=True):
-    """Expected accelerometer biases at a temperature; one sigma."""
+    """Expected accelerometer biases at one temperature, each with one sigma."""
 
     degc: float
     accel_mg: Vector
@@ -58,16 +58,16 @@ class ExpectedForces(msgspec.Struct, frozen=True):
 
 
 class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
-    """Biases of one IMU over temperature."""
+    """Summary of one IMU's biases over temperature: measured windows and fitted curves."""
 
     imu: str
     summary: str = ""
     power_ups: int = 0
     days: int = 0
     points: tuple[WindowBias, ...] = ()
-    curve: tuple[Expected, ...]  # Expected gyro biases of the next power-up; empty: not known yet
+    curve: tuple[Expected, ...]  # Expected gyro biases of the next power-up; empty: no curve yet
     accel_curve: tuple[ExpectedForces, ...] = ()
-    """Expected accelerometer biases of the next power-up; empty: not known yet."""
+    """Expected accelerometer biases of the next power-up, one row per temperature; empty while there is no curve."""
     needs: str | None = None  # Reason why there is no curve, and the remedy; None: there is one
     today: int | None = None  # Number of the present power-up; None: no window of it yet
     now: Expected | None = None  # Present bias: last measured in this power-up, then moved along the curve
@@ -83,9 +83,9 @@ def by_temperature(
     power_up: PowerUp | None,
     now_degc: float | None = None,
 ) -> ByTemperature:
-    """Build the summary of one IMU from its points and the curves of gyros and accelerometers.
+    """Summarise one IMU's biases over temperature from its bias history and the curves fitted to it.
 
-    `power_up`: the present one; None: unknown. `now_degc` None: temperature of the last window of this power-up.
+    `power_up` is the present power-up, None if unknown. Without `now_degc`, the temperature of its last window is used.
     """
     groups = by_power_up([point for point in points if point.temperature_degc is not None and point.gyro is not None])
     seen = [_window(point, k) for k, group in enumerate(groups) for point in group]

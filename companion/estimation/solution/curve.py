@@ -1,20 +1,20 @@
-"""Model of one triad's bias over temperature: a mean over power-ups, or one cubic common to all power-ups.
+"""Model of one sensor triad's bias over temperature, fitted to measurements of several power-ups.
 
-The bias of power-up s at the temperature T is
+The bias in power-up s at the temperature T is
 
     o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K.
 
-Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run); the cubic is
+Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run). The cubic is
 common to all. The die is as warm as its thermometer was `lag` earlier, so heating and cooling differ. The fit is
 generalised least squares over means of still seconds at one temperature. The prior of the coefficients is as wide as
-the catalogue's slopes, so the model is uncertain at temperatures that were not seen.
+catalogue slopes, so the model is uncertain at temperatures without data.
 
-Each power-up is predicted from the others at its first node. The errors select the lag and the order (cubic or mean),
-and scale tau until the actual error matches the predicted one. The change from the first node to the last is predicted
-as well: it scales the error of changes, and reveals a thermometer that is not in this IMU.
+Each power-up's first mean is predicted from the other power-ups. The errors select the lag and the order (cubic or
+mean), and scale tau until the predicted error matches the actual one. The change from the first mean to the last is
+predicted, too; the error scales the uncertainty of changes, and reveals a thermometer outside this IMU.
 
-The present rate predicts the end of a warm-up: a board that approaches its end as exp(-t / tau) still warms by
-tau dT/dt, at any air temperature. Earlier power-ups determine this time constant.
+The present rate dT/dt predicts the end of a warm-up. A board that warms towards its end as 1 - exp(-t / tau_s) still
+warms by tau_s dT/dt, at any air temperature. Earlier power-ups determine this time constant tau_s.
 """
 
 from __future__ import annotations
@@ -39,50 +39,50 @@ REFERENCE_DEGC: Final = 35.0
 UNIT_K: Final = 20.0
 LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
-"""Range beyond the temperatures seen in which the model is valid, K (method 3.3)."""
+"""Distance beyond the measured temperatures up to which the model counts as valid, K (method.md section 3.3)."""
 FEWEST: Final = 3
 _CUBIC: Final = 3
 _BETTER: Final = 0.9
-"""Largest mean square error of a cubic, as a share of that of a mean, at which the cubic is used."""
+"""Threshold of the ratio of mean square errors, cubic over mean, below which the cubic is used instead of the mean."""
 _AT_LEAST: Final = 0.5
-"""Least scatter, as a share of the mean square error: the stated noise may be too large."""
+"""Least run-to-run variance as a share of the mean square prediction error: noise may be stated too large."""
 _RANGE: Final = 18.0
-"""Half the search range for the logarithm of the scatter's variance, around that of one kelvin."""
+"""Half the search range for the log of the run-to-run variance; its centre is the squared bias change per kelvin."""
 _HALVINGS: Final = 25
-_SURELY: Final = 2.0  # Sigmas beyond which an error is not chance
+_SURELY: Final = 2.0  # Threshold in sigmas above which an error is not chance
 _LITTLE: Final = 1e-6
-"""Lower bound of variances, as a share of the squared bias change per kelvin, or of the noise variance."""
+"""Lower bound of a variance, relative to the squared bias change per kelvin or to the noise variance."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
-"""Prior sigma of each coefficient, in kelvins times the usual slope of parts."""
+"""Prior sigmas of the coefficients c1, c2 and c3, each divided by a sensor's usual bias change per kelvin."""
 _SLOWED_K_S: Final = 0.25 / 60.0  # Least decrease of the rate that determines the end of a warm-up
 _TAU_SIGMA: Final = 0.05
-"""Lower bound of the relative sigma of tau: one time constant does not fully describe a board."""
+"""Least relative sigma of a board's thermal time constant, because one constant does not fully describe a board."""
 _WARM_AFTER: Final = 5.0  # Time constants after which a board is warm
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 _END_LESS_MEAN: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
-"""Weights of start, middle and end for the end minus the mean, by Simpson's rule."""
+"""Simpson weights for a window's start, middle and end; the weighted sum is the end value minus the window's mean."""
 CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
-"""Run-to-run scatter of method 1.3."""
+"""Run-to-run scatter of biases, one sigma, as in an ADIS16405 (method.md section 1.3)."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
-"""Slope over temperature of a BMI088, the worse part in method 2.1."""
+"""Bias change per kelvin of a BMI088, the worse part in method.md section 2.1."""
 
 
 class PowerUpNodes(NamedTuple):
-    """Means of still seconds in one power-up, n rows; vehicle FRD, rad/s or m/s^2.
+    """Means of still seconds in one power-up, n rows, in vehicle axes (FRD), rad/s or m/s^2.
 
-    `states` (n, 2): temperature in degC and its rate in K/s. `variance` (n,): white noise, mean over the axes.
+    `states` (n, 2): temperature in degC and its rate in K/s. `variance` (n,): of white noise, averaged over axes.
     """
 
     states: Floats
     bias: Floats
     variance: Floats
     common_variance: float = 0.0
-    """Variance of an error common to all rows; it lowers the weight."""
+    """Variance of an error common to all rows of this power-up; it lowers the weight of the power-up in the fit."""
 
 
 class Warm(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction for the warm board: change of the bias from the window's end; vehicle FRD, rad/s or m/s^2."""
+    """Predicted bias change from a window's end until the board is warm, in vehicle axes (FRD), rad/s or m/s^2."""
 
     degc: float
     change: Vector
@@ -90,10 +90,10 @@ class Warm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Along(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one triad's bias change within one window; vehicle FRD, rad/s or m/s^2, rates per second.
+    """Predicted bias change of one triad within one window, in vehicle axes (FRD); rad/s or m/s^2, slopes per second.
 
-    `shift`: bias at the end minus the mean over the window. `warm` None: the end of the warm-up is unknown, or beyond
-    the temperatures seen.
+    `shift` is the bias at the window's end minus its mean over the window. `warm` is None if the temperature at the end
+    of the warm-up is unknown, or beyond the measured temperatures.
     """
 
     shift: Vector
@@ -105,11 +105,12 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """Model of the next power-up's bias over temperature, vehicle FRD, rad/s or m/s^2; factors and variances (3,).
+    """Model of the next power-up's bias over temperature, in vehicle axes (FRD), rad/s or m/s^2.
 
-    `order` 0: a mean; 3: a cubic. `covariance`: of the coefficients, for an axis with the usual scatter. `widening`:
-    its factor for each axis; `of_changes`: its factor for changes within a power-up. `unexplained`: share of the
-    squared changes that neither model nor chance explains. `scatter`: variance of one more power-up, with its wander.
+    `order` is 0 for a mean, 3 for a cubic. `covariance` belongs to the coefficients of an axis with the usual scatter;
+    `widening` (3,) scales it for each axis, `of_changes` (3,) for changes within a power-up. `unexplained` is the share
+    of the squared changes that neither model nor chance explains. `scatter` (3,) is the variance of one more power-up,
+    including its wander.
     """
 
     order: int
@@ -137,11 +138,11 @@ class Curve:
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
     def change(self, then: State, now: State) -> tuple[Array, Array]:
-        """Predict the change of the bias within a power-up, and its variance, (3,) each; zero for a mean."""
+        """Predict the bias change between two states of a power-up, and its variance, (3,) each; zero for a mean."""
         return self.moves([(-1.0, then), (1.0, now)])
 
     def moves(self, weighted: Iterable[tuple[float, State]]) -> tuple[Array, Array]:
-        """Predict the weighted sum of biases at several states, and its variance, (3,) each; weights add up to zero."""
+        """Predict a weighted sum of biases at several states, and its variance, (3,) each; weights add up to zero."""
         x, outside_k = np.zeros(self.order + 1), 0.0
         for weight, (degc, k_s) in weighted:
             side = 1.0 if degc > self.span_degc[1] else -1.0
@@ -151,7 +152,7 @@ class Curve:
         return x @ self.coefficients, variance
 
     def along(self, path: Path, tau_s: tuple[float, float] | None, model: AllanModel) -> Along:
-        """Predict the bias within a window; `tau_s`: time constant of the board and one sigma, or None."""
+        """Predict the bias change within a window; `tau_s`: time constant of the board and one sigma; None: unknown."""
         start, (middle_degc, k_s), end = path.states
         shift, shift_variance = self.moves(zip(_END_LESS_MEAN, path.states, strict=True))
         slope, slope_variance = self.change(start, end)
@@ -177,7 +178,7 @@ class Curve:
         return self.change((degc - 0.5, 0.0), (degc + 0.5, 0.0))[0]
 
     def _row(self, degc: float, k_s: float = 0.0) -> Array:
-        """Return the terms (1 + order,) at a temperature; linear beyond the valid range."""
+        """Return the polynomial's terms (1 + order,) at a temperature and its rate; linear outside the valid range."""
         die_degc = degc - self.lag_s * k_s
         edge_degc = min(max(die_degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
         d, power = (edge_degc - REFERENCE_DEGC) / UNIT_K, np.arange(self.order + 1)
@@ -186,9 +187,9 @@ class Curve:
 
 
 def settling(power_ups: Iterable[Sequence[State]]) -> tuple[float, float] | None:
-    """Estimate the time constant of a board and one sigma, s, from earlier power-ups; None: too few show it.
+    """Estimate a board's thermal time constant and one sigma, s, from earlier power-ups; None: too few show it.
 
-    From its fastest rise to its last state, a board's temperature rises by tau times the decrease of its rate.
+    Between its fastest rise and its last state, a board warms by the time constant times the decrease of its rate.
     """
     found = []
     for states in power_ups:
@@ -204,7 +205,7 @@ def settling(power_ups: Iterable[Sequence[State]]) -> tuple[float, float] | None
 
 
 def in_run_variance(model: AllanModel, gap_s: float = 0.0) -> float:
-    """Return the variance of a bias' wander within a power-up, over `gap_s`, at least three minutes."""
+    """Return the variance of a bias' wander within a power-up over `gap_s`, but at least over three minutes."""
     return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * max(gap_s, _SHORTEST_GAP_S)))
 
 
@@ -215,13 +216,13 @@ def fit(
     *,
     may_be_mean: bool = True,
 ) -> Curve | None:
-    """Fit the model of one triad of one IMU; None: fewer than three power-ups.
+    """Fit the bias over temperature of one triad of one IMU; return None for fewer than three power-ups.
 
     Args:
-        power_ups: at least one node each, in order of measurement.
-        in_run_variance: variance of the wander within a power-up, (rad/s)^2 or (m/s^2)^2.
-        per_kelvin: one sigma of the slope of parts, (rad/s)/K or (m/s^2)/K.
-        may_be_mean: return a mean if it predicts equally well; a mean has no change within a power-up.
+        power_ups: in order of measurement, at least one row each.
+        in_run_variance: variance of the bias' wander within a power-up, (rad/s)^2 or (m/s^2)^2.
+        per_kelvin: one sigma of a sensor's bias change per kelvin, rad/s or m/s^2.
+        may_be_mean: return a mean if it predicts equally well; a mean predicts no change within a power-up.
     """
     if len(power_ups) < FEWEST:
         return None
@@ -238,7 +239,7 @@ def fit(
 
 
 class _Fit:
-    """Fit of one order and lag. Arrays have one row for each power-up."""
+    """Least-squares fit for one polynomial order and one thermometer lag; arrays have one row per power-up."""
 
     def __init__(
         self, power_ups: Sequence[PowerUpNodes], order: int, lag_s: float, in_run_variance: float, per_kelvin: float
@@ -265,7 +266,7 @@ class _Fit:
         ) = (np.array(each) for each in zip(*rows, strict=True))  # fmt: skip
 
     def curve(self, span_degc: tuple[float, float]) -> Curve:
-        """Fit with the scatter at which the actual error of left-out power-ups matches the predicted one."""
+        """Fit with the run-to-run variance at which predicted and actual errors of left-out power-ups match."""
         scatter = self._scatter()
         error, variance = self._left_out(scatter)
         shares, normal, right = self._equations(scatter)
@@ -314,12 +315,12 @@ class _Fit:
         return weight, self._within + by * self._between, self._within_right + by * self._between_right
 
     def _left_out(self, scatter: float) -> tuple[Floats, Floats]:
-        """Return each first node minus its prediction from the other power-ups, (n, 3), and its variance, (n,)."""
+        """Return each power-up's first mean minus its prediction from the others, (n, 3), and the variance, (n,)."""
         predicted, variance = self._by_others(scatter, self._first)
         return self._first_bias - predicted, variance + self._first_variance + scatter
 
     def _by_others(self, scatter: float, rows: Floats) -> tuple[Floats, Floats]:
-        """Predict each power-up's row of terms from the other power-ups, (n, 3), and its variance, (n,)."""
+        """Predict each power-up's bias for its polynomial terms `rows` from the others: (n, 3), and variance (n,)."""
         _, normal, right = self._equations(scatter)
         others = np.concatenate([rows[:, :, None], right.sum(axis=0) - right], axis=2)
         solved = rows[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
@@ -327,7 +328,7 @@ class _Fit:
 
 
 def _over(error: Floats, variance: Floats) -> Floats:
-    """Return the actual over the predicted mean square error of each axis, (3,)."""
+    """Return the ratio of the actual to the predicted mean square error for each axis, (3,)."""
     return np.asarray((error * error / variance[:, None]).sum(axis=0) / len(error))
 
 
@@ -337,26 +338,25 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
-    """Bias over temperature in the form that firmwares use, in an IMU's own axes.
+    """Bias over temperature as a polynomial, in the form that autopilot firmwares use, in an IMU's own axes.
 
-    c0 + c1 d + c2 d^2 + c3 d^3, with d the temperature, limited to the span, minus the reference.
+    The bias is c0 + c1 d + c2 d^2 + c3 d^3; d is the temperature, limited to the span, minus the reference temperature.
     """
 
     coefficients: tuple[Vector, Vector, Vector, Vector] = (ZERO, ZERO, ZERO, ZERO)
-    """Constant first; rad/s or m/s^2 and per kelvin, square kelvin, cubic kelvin."""
+    """Coefficients c0 to c3 of three axes each, in rad/s or m/s^2 per kelvin to the power of 0 to 3."""
     reference_degc: float = REFERENCE_DEGC
     low_degc: float = -math.inf
     high_degc: float = math.inf
 
     def at(self, degc: float) -> Array:
-        """Return the bias at a temperature, (3,)."""
         d = min(max(degc, self.low_degc), self.high_degc) - self.reference_degc
         c0, c1, c2, c3 = np.array(self.coefficients)
         value: Array = c0 + (c1 + (c2 + c3 * d) * d) * d
         return value
 
     def zero_at(self, degc: float) -> Polynomial:
-        """Return the polynomial shifted by a constant, so that it is zero at this temperature."""
+        """Return the polynomial shifted by a constant, so that the bias is zero at this temperature."""
         c0, first, second, third = self.coefficients
         constant = vector(np.subtract(c0, self.at(degc)))
         return msgspec.structs.replace(self, coefficients=(constant, first, second, third))
@@ -366,13 +366,13 @@ NOTHING: Final = Polynomial()
 
 
 def of_curve(curve: Curve, orientation: Matrix, scale: Vector = (1.0, 1.0, 1.0)) -> Polynomial:
-    """Convert a curve to a polynomial over the span that was seen; zero at the reference.
+    """Convert a curve to a firmware's polynomial over the measured temperatures; it is zero at the reference.
 
-    The lag is left out: no firmware supports one.
+    The thermometer's lag is left out, because no firmware supports one.
 
     Args:
-        curve: in the vehicle's axes.
-        orientation: 3x3, the IMU's axes to the vehicle's.
+        curve: in vehicle axes.
+        orientation: rotation from the IMU's axes to the vehicle's, 3x3.
         scale: factor that the firmware applies to the IMU's output afterwards.
     """
     low, high = curve.span_degc

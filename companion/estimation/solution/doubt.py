@@ -1,8 +1,8 @@
-"""Finds contradictions to earlier calibrations, and their cause.
+"""Detection of contradictions between today's measurement and earlier calibrations, with their probable cause.
 
-All IMUs measure the same tilt, gravity and rotation. A change common to all of them comes from the gradienter (or its
-zero), from a wrong local gravity, or from a turn. If one IMU has changed while the others agree with their predictions,
-that IMU is the cause (method 2.1).
+All IMUs measure the same tilt, gravity and rotation. A change common to all of them comes from the gradienter (tilt
+sensor) or its zero, from a wrong local gravity, or from a turn of the aircraft. If one IMU has changed while the others
+agree with their predictions, that IMU is the cause (method.md section 2.1).
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from companion.samples import TRIADS, Triad
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
 TELLS: Final = 9.0
-"""Least gain in chi-square by which one explanation beats another: three sigmas."""
+"""Least decrease of chi-square by which one explanation beats another: three sigmas."""
 AGREES: Final = 11.34
-"""Chi-square of three axes that chance exceeds once in a hundred. Beyond it there is no warning yet, but the prediction
-takes no part in the estimate, because it may be of another sensor."""
+"""Chi-square of three axes that chance exceeds once in a hundred. A prediction beyond it causes no warning yet, but is
+not used in the estimate, because it may belong to another sensor."""
 _OF_ALL: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",
     "turn": "the aircraft turns",
 }
-"""Short texts for causes that affect a triad of all IMUs."""
+"""Short texts for causes that change the gyros or the accelerometers of all IMUs."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Witness:
-    """Measurement and prediction of one triad of IMU number `imu`.
+    """Measured and predicted bias of one triad (gyros or accelerometers) of IMU number `imu`.
 
-    The variance of the difference has a part of this IMU, `own_variance` (3,), and one common to all, `common` (3, 3).
+    The variance of their difference has two parts: `own_variance` (3,) of this IMU, and `common` (3, 3) of all IMUs.
     """
 
     imu: int
@@ -52,12 +52,12 @@ class Witness:
 
     @property
     def difference(self) -> Array:
-        """Measurement minus prediction, (3,)."""
+        """Measured minus predicted bias, (3,)."""
         return np.asarray(self.measured - np.array(self.expected.value))
 
     @property
     def sigma(self) -> Array:
-        """One sigma of the difference, (3,)."""
+        """One sigma of the measured minus the predicted bias, (3,)."""
         return np.sqrt(self.own_variance + np.diag(self.common))
 
     @property
@@ -76,7 +76,7 @@ class Witness:
         return float(up @ self.difference), math.sqrt(variance)
 
     def gain(self, shift: Array) -> float:
-        """Return the decrease of chi-square, with the own variance only, if a common shift is subtracted."""
+        """Return the decrease of chi-square, own variance only, if `shift` is subtracted from the difference."""
         return float(np.sum((np.square(self.difference) - np.square(self.difference - shift)) / self.own_variance))
 
     def is_explained(self, shift: Array) -> bool:
@@ -85,7 +85,7 @@ class Witness:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Doubt:
-    """A contradiction: its cause, and one line for a pilot."""
+    """Contradiction to earlier calibrations: probable cause, IMUs concerned, and one line of text for a pilot."""
 
     triad: Triad
     cause: Cause
@@ -104,10 +104,11 @@ class Doubt:
 def contradictions(
     earlier: Sequence[Witness], today: Sequence[Witness], imus: int, up: Array, by_reading: Matrix | None
 ) -> list[Doubt]:
-    """Find all contradictions to predictions from earlier power-ups and from this one; empty if there are none.
+    """List all contradictions between measured biases and their predictions.
 
-    Predictions from this power-up are the most exact; earlier ones count only without these. `imus`: number of IMUs.
-    `by_reading`: d (accelerometer bias) / d (gradienter's readings), (3, 2).
+    Predictions of `today` (this power-up) are more exact. Those of `earlier` power-ups count only if today's cover
+    fewer than `imus` IMUs and agree. `by_reading` (3, 2) is the derivative of accelerometer biases by the gradienter's
+    readings.
     """
     gravity: tuple[Cause, Matrix] = ("gravity", up[:, None])
     causes: dict[Triad, list[tuple[Cause, Matrix]]] = {
@@ -125,7 +126,7 @@ def contradictions(
 
 
 def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool) -> list[Doubt]:
-    """Explain all contradictions by one shift of all IMUs if a cause fits; else explain each alone."""
+    """Explain all contradictions by one cause common to all IMUs if one fits; otherwise explain each one alone."""
     against = [witness for witness in witnesses if witness.contradicts]
     others = [witness for witness in witnesses if not witness.contradicts]
     for cause, directions in causes if against else ():
@@ -141,7 +142,7 @@ def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]]
 
 
 def _common(witnesses: Sequence[Witness], directions: Matrix) -> tuple[Array, Array]:
-    """Fit the common shift along these directions that best explains all; return it, and its size along each."""
+    """Fit the common shift along `directions` that best explains all differences; return it and its size along each."""
     by = np.vstack([directions / np.sqrt(witness.own_variance)[:, None] for witness in witnesses])
     found = np.concatenate([witness.difference / np.sqrt(witness.own_variance) for witness in witnesses])
     size = np.asarray(np.linalg.lstsq(by, found)[0], dtype=np.float64)
@@ -177,7 +178,7 @@ def _alone(
 
 
 def _of_all(cause: Cause, size: Array, names: str, against: Sequence[Witness]) -> str:
-    """Describe a contradiction of all IMUs; `size` is the shift along the cause's directions."""
+    """Describe a contradiction of all IMUs for a pilot; `size` is the shift along the directions of its cause."""
     sensors = "accelerometers"
     if cause == "turn":
         fault, sensors = f"the aircraft turns by {float(np.linalg.norm(size)) / DEG_H:.0f} deg/h", "gyros"

@@ -1,20 +1,20 @@
-"""Combination of predictions from earlier calibrations with today's readings of all IMUs (method 3.3).
+"""Combination of predictions from earlier calibrations with today's readings of all IMUs (method.md section 3.3).
 
-If a window warmed, its estimate is first moved to its end. The curve predicts the change of the bias from the mean to
-the end, the readings' slope measures it; both are weighted by their variances. If they contradict each other, only the
-window counts.
+If an IMU warmed during the window, its estimate is first moved to the window's end. The curve over temperature predicts
+the bias change from the mean to the end, and the slope of the readings measures it. Both are weighted by their
+variances; if they contradict each other, only the readings count.
 
-Then measurements and predictions are combined. With d the biases by today's readings and p the predictions,
+Then measurements and predictions are combined. With b the true biases, d those by today's readings, p the predictions,
 
     d = b + e_d     p = b + e_p     b_MAP = d + K (p - d)     K = cov(e_d, e_d - e_p) cov(e_d - e_p)^-1
 
-The error of the gradienter's zero is the same in all IMUs. It is also in p if earlier calibrations used today's zero,
-so that it does not average out. If they used other zeros, several IMUs together determine today's tilt.
+The error of the gradienter's zero is the same in all IMUs. If earlier calibrations used today's zero, the error is also
+in p and does not average out. If they used other zeros, several IMUs together determine today's tilt.
 
-A sigma_use that is too cautious would give the prior too much weight. For K, e_d therefore includes only *known* noise:
-the rest after averaging (sigma_stat), the gradienter's scatter, the uncertainty of the platform's turn, and the sigma
-of the zero if it was measured or configured. This K is smaller than the optimum. With any K from zero to twice the
-optimum, the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
+A sigma_use (stated sigma) that is too cautious would give the prior too much weight. For K, e_d therefore includes only
+*known* noise. Known are the rest after averaging (sigma_stat), the gradienter's scatter, the platform's turn, and the
+sigma of a zero that was measured or configured. With this smaller K, or any up to twice the optimum, the estimate is no
+worse than without a prior. The covariance is that of the K used, with the whole S_d = cov(e_d).
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS, Triad, Vector, rows_of
 
 BOUNDS_RAD_S: Final = 0.1 * DEG
-"""Largest sigma of a gyro's prediction that can bound a turn."""
+"""Largest sigma of a predicted gyro bias, rad/s, at which the prediction can bound the platform's turn."""
 _CONTRADICTS: Final = 4.0  # Threshold in sigmas between the slope of the readings and that of the curve
-_WORTH_SAYING: Final = 2.0  # Least change until warm to report, in sigma_use
+_WORTH_SAYING: Final = 2.0  # Least bias change until warm that is reported, in sigma_use
 _END_OF_RAMP: Final = 0.25
-"""Variance of a mean over that of the end of a line through the same values (`RobustLine.end_leverage`)."""
+"""Variance of a mean, divided by that of the end of a line fitted to the same values (`RobustLine.end_leverage`)."""
 
 
 def weigh(solution: Solution, expectation: Expectation) -> Solution:
-    """Check a solution against earlier calibrations, and combine it with the predictions that may take part."""
+    """Check a solution against predictions from earlier calibrations, and combine it with those that agree."""
     shared, by_name = solution.shared, {each.name: each for each in expectation.imus}
     expected = [by_name.get(imu.name) or ExpectedImu(name=imu.name) for imu in solution.imus]
     ends = [at_end(imu, known, shared) for imu, known in zip(solution.imus, expected, strict=True)]
@@ -71,7 +71,7 @@ def weigh(solution: Solution, expectation: Expectation) -> Solution:
 
 
 def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[ImuSolution, tuple[Triad, ...]]:
-    """Move an estimate to the end of its window; also return the triads that followed a curve."""
+    """Move one IMU's estimate to the end of its window; also return the triads for which a curve was used."""
     shift, stat, warm_up = np.zeros(6), imu.sigma_stat.copy(), imu.warm_up_variance.copy()
     covariance, followed = imu.covariance.copy(), list[Triad]()
     for triad, bias in zip(TRIADS, imu.biases, strict=True):
@@ -92,7 +92,7 @@ def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[Imu
         shift[rows] = np.array(along.shift) + half_s * (share * more - ramp)
         covariance[at, at] = shared.covariance[at, at] + imu.warming.level_variance[rows] + variance
         stat[rows] = np.sqrt(np.square(stat[rows]) * np.where(ramp != 0.0, _END_OF_RAMP, 1.0) + variance)
-        # The slope may go on, or end now.
+        # The slope may continue after the window, or end now.
         warm_up[rows] = (np.square(slope + share * more) / 3.0 + share * of_line) * (NEXT_S / 2.0) ** 2
     moved = imu.shifted(shift)
     at_its_end = dataclasses.replace(moved, covariance=covariance, sigma_stat=stat, warm_up_variance=warm_up)
@@ -140,7 +140,6 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> Imu
 def _witnesses(
     imus: Sequence[ImuSolution], shared: Shared, expected: Sequence[ExpectedImu], *, today: bool
 ) -> list[Witness]:
-    """Pair each prediction with its measurement."""
     found = []
     for triad, (k, imu) in itertools.product(TRIADS, enumerate(imus)):
         known = (expected[k].today if today else expected[k].earlier).get(triad)
@@ -158,7 +157,7 @@ def _witnesses(
 
 
 def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: bool) -> Solution:
-    """Combine measurements with the predictions `used`, by the equations at the top of this module."""
+    """Combine measured biases with the predictions `used`, by the equations at the top of this module."""
     shared, count = solution.shared, len(solution.imus)
     if not used:
         return solution
@@ -202,10 +201,10 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
 
 
 def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Witness]) -> Solution:
-    """Bound the platform's turn by the gyros' predictions if neither a compass nor a rest has measured it.
+    """Bound the platform's turn by predicted gyro biases, unless a compass or an earlier rest has measured it.
 
-    An excess about the vertical counts as chance up to `CHANCE_SIGMAS`; a larger one adds to sigma. Only earlier
-    power-ups can show that nothing turns: today's measurements may include the turn already.
+    A rate about the vertical counts as chance up to `CHANCE_SIGMAS`; a larger one is added to sigma. Only earlier
+    power-ups can show that nothing turns, because today's measurements may include the turn already.
     """
     if solution.turn.is_told or solution.platform == "deck":
         return solution

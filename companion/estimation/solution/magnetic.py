@@ -1,10 +1,10 @@
-"""Quality of a compass heading, from its field, its steadiness and the Earth's field.
+"""Quality check of a compass heading, by its magnetic field, its steadiness and the Earth's field.
 
-A disturbance of the field has three parts. Two are visible, as errors of the strength F and of the inclination I. The
-part across the meridian turns the heading and is invisible. The visible parts bound it: if all three have the same
-unknown sigma, it exceeds `BOUND_OF_TWO` times their root sum of squares in one case of twenty. Its effect on the
-heading is dB / (F cos I) (method 3.5: 1.3 uT cause 4 degrees at I = 68 degrees; a gate of 5 % on the norm misses them).
-The uncertainty of the model WMM2025 counts as visible disturbance.
+A disturbance of the field has three components. Two are visible, as errors of the strength F and of the inclination I.
+The component across the meridian turns the heading and is invisible. If all three have the same unknown sigma, it
+exceeds `BOUND_OF_TWO` times the root sum of squares of the visible ones in one case of twenty. A disturbance dB turns
+the heading by dB / (F cos I). At I = 68 degrees, 1.3 uT turn it by 4 degrees, and a gate of 5 % on the strength misses
+them (method.md section 3.5). The uncertainty of the Earth's field model WMM2025 counts as visible disturbance.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from companion.physics.units import DEG
 
 STRENGTH_GATE: Final = 0.02
 INCLINATION_GATE_DEG: Final = 1.0
-"""Thresholds of strength and inclination for a warning (method 3.5); the sigma uses the bound instead."""
+"""Inclination error that causes a warning, as `STRENGTH_GATE` does for the field's strength (method.md section 3.5)."""
 UNIT_GATE: Final = 0.5
-"""Deviation from the Earth's field, as a share, beyond which unit or scale are wrong."""
+"""Relative deviation from the Earth's field strength beyond which the compass' unit or scale must be wrong."""
 WANDER_WARNING_DEG: Final = 1.5
 DEVICE_WARNING_DEG: Final = 3.0
-"""Three sigma of a level HMR3300."""
+"""Difference between a device's own heading and its field's that warns: three sigma of a level HMR3300."""
 USELESS_DEG: Final = 60.0
-"""Heading error beyond which the equation of the gyros cannot use the heading."""
+"""Heading error beyond which a heading is useless for subtracting the Earth's rate from the gyros."""
 _NINETY_FIVE: Final = 1.96
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassHeading:
-    """True heading, its sigma at an exact tilt, and its gradient by up (3,): zero for a device's own heading."""
+    """True heading by a compass, with its sigma, the quality of its field, and warnings."""
 
     heading_rad: float
     sigma_rad: float  # One sigma at an exact tilt; `heading_by_up` gives the effect of a tilt error
@@ -74,10 +74,10 @@ def assess(
     up_covariance: Matrix | None,
     may_turn_deg: float = 0.0,
 ) -> CompassHeading:
-    """Estimate the heading from the compass' window, and bound its error.
+    """Estimate the true heading from the compass' window, and bound its error.
 
-    `up_covariance` None: up is not from a gradienter, so the inclination is unknown. `may_turn_deg`: unseen turn of
-    the aircraft within the window.
+    Without `up_covariance` the tilt is not from a gradienter, and the inclination is unknown. `may_turn_deg` is a turn
+    of the aircraft within the window that no sensor would show.
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
     found = _MeanField() if field is None else _judge(field, compass, local, up, up_covariance)
@@ -139,7 +139,7 @@ def assess(
 def _judge(
     field: FieldWindow, compass: CompassModel, local: LocalEarth, up: Array, up_covariance: Matrix | None
 ) -> _MeanField:
-    """Bound the effect of a disturbance that would look like the mean field."""
+    """Compute strength, inclination and heading of the mean field; bound the heading error by a hidden disturbance."""
     vector = compass.vehicle_from_sensor @ np.array(field.field)
     size = float(np.linalg.norm(vector))
     strength = size if field.unit == "gauss" else None

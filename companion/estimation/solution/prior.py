@@ -1,16 +1,17 @@
-"""Prediction of today's bias from earlier calibrations (method 3.3), with a sigma.
+"""Prediction of today's bias, with a sigma, from earlier calibrations (method.md section 3.3).
 
-A MEMS bias scatters from run to run (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
-mean of the earlier power-ups, or their cubic over temperature (`curve`). Its sigma is that of *one more*
+A MEMS bias scatters from run to run (an ADIS16405's by 70 deg/h and 2 mg, method.md section 1.3). The prediction for
+today is the mean of the earlier power-ups, or their cubic over temperature (`curve`). The sigma is that of *one more*
 power-up: the scatter, widened by Student's t for few points, and the error of the mean.
 
-From three power-ups on, the prediction is a gate for the readings (`joint`); from five on, it may take part in the
-estimate. Within one power-up, the turn-on bias changes by temperature and drift only: the best gate, but no estimate.
+With three power-ups, the prediction is a gate for the readings (`joint`); with five, it may take part in the estimate.
+Within one power-up, only temperature and drift change the bias. Another calibration in the same power-up is therefore
+the best gate, but takes no part in the estimate.
 
-An accelerometer's bias depends on the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
-(`align_model`). In one pose u, scale, shear and misalignment times 1 g look like a bias. A calibration finds the
-*effective* bias at its attitude; at u' it is larger by g (S - [m x]) (u' - u). A multi-pose alignment knows S and m;
-otherwise they are as large as its priors say (method 2.3: 0.5 % of scale make 5 mg).
+An accelerometer's bias depends on the up vector u: f = (I + S) (I - [m x]) g u + b. Scale and shear S and misalignment
+m (`align_model`) times 1 g look like a bias in one pose. A calibration finds this *effective* bias at u; at u' it is
+larger by g (S - [m x]) (u' - u). A multi-pose alignment measures S and m; otherwise their priors apply (method.md
+section 2.3: 0.5 % of scale make 5 mg).
 """
 
 from __future__ import annotations
@@ -37,22 +38,22 @@ from companion.samples import Triad, Vector
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
-"""Least effect of the attitude for a warning; a wheel on a stone causes less."""
+"""Least effect of the attitude on an accelerometer bias that causes a warning; a wheel on a stone causes less."""
 _SIGMAS: Final = 2.0
 _PRIORS: Final = Priors()
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
-"""Assumed temperature change between two calibrations of one power-up without a thermometer."""
+"""Assumed temperature change between two calibrations of one power-up if there is no thermometer."""
 _KNOWN: Final = 0.5
-"""Largest sigma of a usable curve's slope, as a share of the catalogue's slope."""
+"""Largest sigma of a curve's slope, as a share of the catalogue's slope, at which the curve is used."""
 _UNEXPLAINED: Final = 0.1
-"""Largest unexplained share of the changes within power-ups. The IMU's own thermometer gives 0.05 or less (except in
-one of some hundred simulated aircraft); that of the air, a heater or a processor gives 0.1 to 1 and more."""
+"""Largest share of the changes within power-ups that a usable curve leaves unexplained. The IMU's own thermometer
+leaves 0.05 or less (except in one of some hundred simulated aircraft), another one 0.1 to 1 and more."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class PoseEffect:
-    """Matrix S - [m x] of one IMU: mean and one sigma of each element, (3, 3) each."""
+    """Scale, shear and misalignment of one IMU's accelerometers as matrices (3, 3): mean and one sigma per element."""
 
     mean: Matrix
     sigma: Matrix
@@ -61,20 +62,20 @@ class PoseEffect:
     source: Literal["assumed", "alignment"]
 
     def change(self, gravity_m_s2: float, at: Array, then: Array) -> tuple[Array, Array]:
-        """Return the bias at `at` minus the bias at `then`, and one sigma of the difference; each (3,), m/s^2."""
+        """Return the bias at up vector `at` minus that at `then`, and one sigma of the difference; (3,) each, m/s^2."""
         by = gravity_m_s2 * (at - then)
         variance = (np.square(self.sigma) + np.square(self.misalignment_sigma)) @ np.square(by)
         return (self.mean + self.misalignment_mean) @ by, np.sqrt(variance)
 
     def _variance(self, gravity_m_s2: float, by: Array) -> Array:
-        """Return the variance of the bias from a change `by` of up, (3,), without misalignment (a pure rotation).
+        """Return the variance (3,) of the bias after the up vector changes by `by`, without misalignment (a rotation).
 
-        The mean is known but not subtracted from the offsets to write, so it counts in full.
+        The mean effect is known but not subtracted from the offsets to write, so it counts in full.
         """
         return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """Make the record of sigma at other attitudes; `up` and `sigma_use_m_s2` (3,) are those of the calibration."""
+        """Make the record of sigma at other attitudes; `up` and `sigma_use_m_s2` (3,) belong to the calibration."""
         here = np.square(sigma_use_m_s2)
         scale = np.sqrt(np.diag(np.square(self.mean) + np.square(self.sigma)))
         return Effective(
@@ -85,7 +86,7 @@ class PoseEffect:
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
-        """Return a warning for a calibration of a tilted aircraft; None: it was about level."""
+        """Return a warning if the aircraft was tilted so far that its level bias differs; otherwise None."""
         moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
             return None
@@ -112,11 +113,12 @@ def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
 
 
 class Prediction(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2.
+    """Prediction of one triad's bias today, without autopilot offsets, in vehicle axes (FRD), rad/s or m/s^2.
 
-    The variance is that of today's bias about `value`, without the gradienter's zero. `limit` of the gate in sigmas: 4,
-    or one of equal probability if few points determine the scatter. `same_zero`: share measured with today's zero of
-    the gradienter, whose error is then common to both; `other_zero_rad`: one sigma of the zero's error in the rest.
+    `variance` is that of today's bias about `value`, without the error of the gradienter's zero. `limit` is the gate in
+    sigmas: 4, or more, at equal probability, if few points determine the scatter. `same_zero` is the share of points
+    measured with today's zero of the gradienter, whose error is then in prediction and measurement. `other_zero_rad` is
+    one sigma of the zero's error in the other points.
     """
 
     value: Vector
@@ -130,7 +132,7 @@ class Prediction(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
-    """Predictions for one IMU."""
+    """Predicted biases of one IMU: from `earlier` power-ups, and from this power-up (`today`)."""
 
     name: str
     earlier: dict[Triad, Prediction | None] = {}
@@ -140,11 +142,11 @@ class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """Predictions for all IMUs of a calibration."""
+    """Predicted biases of all IMUs for one calibration."""
 
     imus: tuple[ExpectedImu, ...] = ()
     zero_is_known: bool = False
-    """True if the sigma of the gradienter's zero was measured or configured; False: a cautious guess."""
+    """True if the sigma of the gradienter's zero was measured or configured; False if it is a cautious guess."""
 
 
 _ASSUMED: Final = pose_effect(None)
@@ -153,11 +155,11 @@ _ASSUMED: Final = pose_effect(None)
 def expect(
     points: Sequence[Point], triad: Triad, now: Point, effect: PoseEffect, model: AllanModel
 ) -> Prediction | None:
-    """Predict the bias in the present state, `now`, from earlier power-ups; None: too few of them."""
+    """Predict today's bias, at attitude and temperature of `now`, from earlier power-ups; None: fewer than three."""
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
-    # With a temperature missing, all count as measured at the same one.
+    # If a temperature is missing, all points count as measured at the same one.
     known = None if now.temperature_degc is None else _states(groups)
     nodes, poses = [], []
     for group, states in zip(groups, known or [np.zeros((len(group), 2)) for group in groups], strict=True):
@@ -189,9 +191,9 @@ def expect(
 def expect_today(
     last: Point, triad: Triad, now: Point, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
 ) -> Prediction | None:
-    """Predict the bias from an earlier calibration in this power-up; None: it did not measure this triad.
+    """Predict today's bias from the calibration `last` of this power-up; None: it did not measure this triad.
 
-    The `curve` predicts the change with the temperature; without one, the catalogue's slope widens the sigma.
+    The `curve` predicts the bias change with temperature; without one, the catalogue's slope widens the sigma.
     """
     found = last.of(triad)
     if found is None:
@@ -216,9 +218,9 @@ def expect_today(
 
 
 def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
-    """Fit the bias over temperature within a power-up; None: too few data.
+    """Fit the bias over temperature within a power-up; None: too few data, or they do not follow the temperature.
 
-    An accelerometer's variance grows with the change of attitude from the first point of the power-up.
+    An accelerometer's variance grows with the change of attitude since the first point of the power-up.
     """
     groups = believed(points, triad)
     known = _states(groups)
@@ -237,14 +239,14 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
 
 
 def _states(groups: Sequence[Sequence[Point]]) -> list[Floats] | None:
-    """Return temperature and rate of every point, by power-up, (n, 2) each; None: one is unknown."""
+    """Return temperature and rate of every point, one array (n, 2) per power-up; None: a temperature is unknown."""
     if any(point.temperature_degc is None for group in groups for point in group):
         return None
     return [np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64) for group in groups]
 
 
 def _here(points: Sequence[Point], triad: Triad, up: Vector, effect: PoseEffect) -> tuple[Floats, Floats, Floats]:
-    """Convert biases to the attitude `up`; also return the conversion's sigma, (points, 3), and the white variance."""
+    """Convert biases to the attitude `up`; also return the conversion's sigma, (n, 3), and the noise variance, (n,)."""
     found = [point.measured(triad) for point in points]
     bias, pose = np.array([one.bias for one in found]), np.zeros((len(points), 3))
     if triad == "accel":

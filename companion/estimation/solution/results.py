@@ -1,4 +1,4 @@
-"""Conversion of a solution to a calibration record, to points of the history, and to text."""
+"""Conversion of estimated biases to a calibration record, to points of the bias history, and to text."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def record_of(
     warnings: Sequence[str] = (),
     imus: Sequence[ImuRecord] | None = None,
 ) -> Record:
-    """Build the record of a solution; without a solution it has no IMUs.
+    """Build the calibration record of a solution; without a solution the record has no IMUs.
 
-    `reason` None: the figures as text. `imus`: records to use instead of those made from the solution.
+    Without `reason`, the record has a summary of the figures. `imus` replaces the IMU records made from the solution.
     """
     imus = imu_records(solution) if imus is None else tuple(imus)
     standing = None
@@ -107,7 +107,7 @@ def _where_known(matrix: Matrix, known: list[bool]) -> tuple[tuple[float | None,
 
 
 def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
-    """Summarise a result: the largest sigma over axes and IMUs, short enough for one STATUSTEXT."""
+    """Summarise a result for one STATUSTEXT: the largest sigma over all axes and IMUs."""
     if solution is None:
         return "nothing measured"
     parts: list[str] = []
@@ -137,7 +137,7 @@ def points(
     power_ups: Mapping[str, PowerUp],
     zero: str | None,
 ) -> dict[str, Point]:
-    """Make each IMU's point of the history from the readings alone; triads with a doubt are marked as suspect."""
+    """Make each IMU's point of the bias history, from the readings alone; triads in `doubts` are marked as suspect."""
     shared = solution.shared
     doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
     common = np.diag(shared.covariance).copy()

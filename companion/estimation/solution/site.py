@@ -1,6 +1,6 @@
 """Place of the aircraft, with gravity and the Earth's rotation there, and their sigmas.
 
-Missing data widens the sigmas; a default never replaces it silently (each gap adds a warning).
+Missing data widens the sigmas and adds a warning; no default replaces it silently.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from companion.messages import message
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
 
-# Gravity anomaly of 30 mGal, the error of Somigliana's formula (method 2.1).
+# Gravity anomaly of 30 mGal, the error of Somigliana's formula (method.md section 2.1).
 GRAVITY_MODEL_SIGMA_M_S2: Final = 3.0e-4
 GRAVITY_BY_HEIGHT_1_S2: Final = 3.086e-6
 UNKNOWN_HEIGHT_SIGMA_M: Final = 1000.0
@@ -34,7 +34,7 @@ _GRAVITY_SIGMA_M_S2: Final = 0.0155
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Remedies:
-    """Remedies for missing data: texts for a configuration, or for a command that needs an estimate."""
+    """Texts that advise how to supply missing data: by configuration keys (default), or by options of a command."""
 
     latitude: str = "set vehicle.latitude_deg or wait for GPS"
     height: str = "set vehicle.height_m or wait for GPS"
@@ -49,7 +49,7 @@ IN_CONFIGURATION: Final = Remedies()
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Whereabouts:
-    """Place and date, and their source ("configuration", "autopilot", ...)."""
+    """Place and date of a calibration, and the source of the place ("configuration", "autopilot", ...)."""
 
     latitude_deg: float | None = None
     longitude_deg: float | None = None
@@ -60,7 +60,7 @@ class Whereabouts:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class LocalEarth:
-    """Gravity, Earth rate (NED) and declination at the site, each with its sigma, and warnings on missing data."""
+    """Gravity, Earth's rotation (NED) and declination at a place, with one sigma each, and warnings on missing data."""
 
     site: SiteRecord
     gravity_m_s2: float
@@ -74,7 +74,7 @@ class LocalEarth:
     remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> tuple[Array, Matrix]:
-        """Return the rate in body axes and its covariance; with an unknown heading, its horizontal part is zero."""
+        """Return the Earth's rotation in body axes and its covariance; without a heading, the horizontal part is 0."""
         mean, covariance = self.rate_ned_rad_s, self.rate_ned_covariance
         if not heading_known:
             mean_square_north = mean[0] ** 2 + covariance[0, 0]

@@ -1,11 +1,11 @@
-"""Estimation of biases and covariances from the means of one still stretch.
+"""Estimation of biases and covariances from the means of one still window.
 
-A bias is the mean reading minus the true value from attitude, gravity and the Earth's rate. It is the effective bias at
-this pose: in one pose, a scale error times 1 g on the vertical axis looks like a bias (method 2.3). The autopilot's
-offset has to correct it, too; it is not part of sigma.
+A bias is the mean reading minus the true value, which follows from attitude, gravity and the Earth's rate. It is the
+effective bias at this pose: a scale error times 1 g on the vertical axis looks like a bias (method.md section 2.3). The
+autopilot's offset has to correct that part, too; it is not part of sigma.
 
-The equations are those of the paper with its errata corrected (method 1.3): an accelerometer's bias is mean - g * up, a
-gyro's mean - C_n^b w_ie^n. Everything is FRD and NED; `up` is the unit vector of specific force at rest.
+The equations are those of the paper with its errata corrected (method.md section 1.3). An accelerometer's bias is
+mean - g * up, a gyro's is mean - C_n^b w_ie^n. Axes are FRD and NED; `up` is the unit vector of specific force at rest.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ if TYPE_CHECKING:
     from companion.estimation.solution.doubt import Doubt
 
 Pair = tuple[Array | None, Array | None]
-"""Biases of gyro and accelerometer, (3,) each, rad/s and m/s^2; None: unknown."""
+"""Biases of gyro and accelerometer, (3,) each, in rad/s and m/s^2; None: unknown."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuSolution:
-    """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, (3,); None: not requested or unknown.
+    """Estimated bias in one IMU's output after the autopilot's offsets, in vehicle axes (FRD), with its sigmas.
 
-    The whole bias is that of the sensor without any offset: the residual plus the offsets `subtracted` by an autopilot.
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, `sigma_stat` (6,)
-    the noise after averaging. The covariance excludes a warm-up, which affects old and new offsets equally.
-    `temperature_degc` and its rate are those of the end. `drifting`: text on its drift, or on its biases when warm.
+    A bias is the mean minus the true value, (3,); None: not requested or unknown. The whole bias adds the offsets
+    `subtracted` by the autopilot. `covariance` (6x6: gyro rad/s, accelerometer m/s^2) holds for the next minutes,
+    without a warm-up, which affects old and new offsets equally. `sigma_stat` (6,) is the noise after averaging.
+    `temperature_degc` and its rate hold at the window's end. `drifting`: texts on drift, or biases when warm.
     """
 
     name: str
@@ -60,7 +60,7 @@ class ImuSolution:
     covariance: Matrix
     warnings: tuple[str, ...]
     subtracted: Array | None = None
-    """Active offsets, (6,), in the order of the covariance; None: no offset is subtracted from this output."""
+    """Offsets that the autopilot subtracts, (6,), in the covariance's order; None: it subtracts none in this output."""
     drifting: tuple[str, ...] = ()
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     k_s: float = 0.0
@@ -86,12 +86,12 @@ class ImuSolution:
 
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
-        """One sigma per axis, shape (3,)."""
+        """Stated sigma of the gyro bias for the next minutes, including a possible warm-up, (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[:3])
 
     @property
     def accel_sigma_use_m_s2(self) -> Array:
-        """One sigma per axis, shape (3,)."""
+        """Stated sigma of the accelerometer bias for the next minutes, including a possible warm-up, (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[3:])
 
     @property
@@ -101,46 +101,44 @@ class ImuSolution:
 
     @property
     def use_covariance(self) -> Matrix:
-        """Covariance with the warm-up; sigma_use is the root of its diagonal."""
+        """Covariance of the biases (6x6), including a possible warm-up; sigma_use is the root of its diagonal."""
         return self.covariance + np.diag(self.warm_up_variance)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Shared:
-    """Errors common to all IMUs of one stretch, from the one attitude, gravity and Earth's rate.
+    """Bias errors common to all IMUs of one window, because they use the same attitude, gravity and Earth's rate.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of every IMU's own, and the covariance of any two IMUs.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of each IMU's own, and couples any two IMUs.
     """
 
     up: Array
     gravity_m_s2: float
     covariance: Matrix
     by_reading: Matrix | None
-    """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    """Derivative of accelerometer biases by the gradienter's readings, per radian, (3, 2); None: no gradienter."""
     reading_sigma_rad: tuple[float, float]
     zero_sigma_rad: float  # One sigma of the gradienter's zero, the same in every calibration
 
     @property
     def by_zero(self) -> Matrix:
-        """Return one sigma of the accelerometer biases from each axis of the gradienter's zero, (3, 2)."""
+        """Return the accelerometer bias errors from one sigma of the gradienter's zero on each of its axes, (3, 2)."""
         return self.tilted(self.zero_sigma_rad)
 
     def tilted(self, sigma_rad: float | Array) -> Matrix:
-        """Return the change of the accelerometer biases for an error of each gradienter reading, (3, 2)."""
+        """Return the accelerometer bias errors from an error `sigma_rad` of each gradienter reading, (3, 2)."""
         return np.zeros((3, 2)) if self.by_reading is None else self.by_reading * sigma_rad
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Biases of all IMUs from one still stretch."""
-
     pose: Pose
     site: SiteRecord
     imus: tuple[ImuSolution, ...]
     warnings: tuple[str, ...]
     shared: Shared
     unknown: tuple[tuple[str, Triad], ...] = ()
-    """Requested triads whose readings do not determine a bias; the IMU's warnings give the reason."""
+    """Pairs of IMU and triad that were requested but have no result; the IMU's warnings give the reason."""
     magnetic: Magnetic | None = None
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
@@ -148,7 +146,7 @@ class Solution:
 
     @property
     def doubted(self) -> dict[tuple[str, Triad], Doubt]:
-        """Contradictions by IMU and triad; a tilt or a turn affects all IMUs, even those that do not show it."""
+        """Contradictions by IMU and triad; one common to all IMUs is listed for each, even if it does not show it."""
         return {
             (name, doubt.triad): doubt
             for doubt in reversed(self.doubts)
@@ -174,13 +172,12 @@ def solve(
     any_bias: bool = False,
     otherwise: Otherwise = NOTHING,
 ) -> Solution:
-    """Estimate the biases of every IMU of the window; `any_bias` allows implausibly large ones.
+    """Estimate the biases of every IMU from one still window; `any_bias` allows implausibly large ones.
 
-    `otherwise` supplies the tilt without a gradienter, and the heading without a compass.
+    `otherwise` supplies the tilt if there is no gradienter, and the heading if there is no compass.
 
     Raises:
-        CalibrationRefusedError: the readings are inconsistent, accelerometers were requested without a tilt, or gyros
-            on a deck without a heading.
+        CalibrationRefusedError: no requested bias can be determined, or the readings are inconsistent.
     """
     warnings = list(local.warnings)
     gradienter = gradienter if window.tilt is not None else None
@@ -191,7 +188,7 @@ def solve(
             raise CalibrationRefusedError(missing)
         warnings.append(missing)
     if platform == "deck":
-        # The deck turns, and the yaw has no time of validity.
+        # The deck turns, and the time at which the yaw was valid is unknown.
         otherwise = msgspec.structs.replace(otherwise, heading=None)
     truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
     unknown_heading = None
@@ -255,9 +252,9 @@ def _pose(truth: Truth) -> Pose:
 
 
 def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
-    """Return the errors common to all IMUs, from attitude, gravity, Earth's rate and platform turn (method 2.1).
+    """Return the errors common to all IMUs: of attitude, gravity, Earth's rate and turn (method.md section 2.1).
 
-    An attitude error eps causes db_a = eps x f and db_g = eps x w = -[w x] eps; one tilt error causes both.
+    An attitude error eps changes accelerometer biases by eps x f, and gyro biases by eps x w = -[w x] eps.
     """
     (rate, of_rate), up = truth.earth_rate(local), truth.up
     jacobian = np.vstack([-skew(rate + turn_rad_s), -skew(local.gravity_m_s2 * up)])
@@ -275,7 +272,7 @@ def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, 
 
 
 def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
-    """Return the correction of gyro means for the axis of a deck's turn: true up differs from the raw tilt."""
+    """Return the error (3,) in gyro means on a turning deck, because its axis was computed from the raw tilt."""
     if window.turn_rad_s is None or window.tilt is None or gradienter is None:
         return np.zeros(3)
     said = gradienter.up(window.tilt.x_deg, window.tilt.y_deg)
@@ -291,7 +288,7 @@ def _estimate(
     tipped: Array,
     powered_s: float,
 ) -> ImuSolution:
-    """Subtract the Earth's rate and gravity from the means of one IMU; combine sensor and common covariances."""
+    """Subtract the Earth's rate and gravity from one IMU's means; add up the sensor's and the common covariance."""
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
         gyro = np.array(imu.gyro_rad_s) - _earth_seen(imu, truth, local) - tipped
@@ -321,7 +318,7 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
-    """Return the Earth's rate in the gyro means: all of it, or the part that remains on a turning deck."""
+    """Return the Earth's rate in the gyro means, (3,): all of it, or the part that remains on a turning deck."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
@@ -330,7 +327,7 @@ def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
 
 
 def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
-    """Return the window with impossible triads marked useless, and cause and remedy as warnings; `up`: vehicle FRD."""
+    """Mark triads with impossible means as useless, with cause and remedy as warnings; `up` is in vehicle axes."""
     means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
     found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
     hidden = imu.hidden | {triad: f"{words}; {local.remedies.any_bias}" for triad, words in found.items()}
@@ -338,15 +335,15 @@ def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
 
 
 def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:
-    """Name the causes of a wide gyro sigma: an unknown heading, or a part that the configuration does not name.
+    """List warnings on a wide gyro sigma: its cause is an unknown heading, or a sensor model that is not configured.
 
-    `earth_covariance` (3, 3): uncertainty of the Earth's rate, (rad/s)^2; None: the heading is known.
+    `earth_covariance` (3, 3) is the uncertainty of the Earth's rate, (rad/s)^2; None: the heading is known.
     """
     earth = 0.0 if earth_covariance is None else float(np.diag(earth_covariance).max())
     by_part = [
         imu.name
         for imu in imus
-        # Skip means hidden by integers: they are the cause, and have a warning already.
+        # Skip gyros read as coarse integers: these are the cause, and a warning reports them already.
         if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
     ]
     found = [message("gyro_part_unknown", imu=name, remedy=remedies.part) for name in by_part]

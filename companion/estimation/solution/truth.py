@@ -1,8 +1,9 @@
-"""Attitude of the aircraft from all sensors except its gyros: the reference for every sensor.
+"""Attitude of the aircraft from all sensors except its gyros, as the reference for every sensor.
 
-A gradienter measures the tilt, a compass the heading. Without a gradienter, accelerometers give the tilt if their bias,
-scale and shear are known from all sides (`alignment.faces`): f = (I + S)^-1 (read - b). The length of f must equal
-gravity; this tilt includes that of the board in the aircraft. Without a compass, the autopilot's yaw is the heading.
+A gradienter measures the tilt, a compass the heading. Without a gradienter, accelerometers give the tilt if a
+six-position calibration measured their bias b, scale and shear S (module `alignment.faces`): f = (I + S)^-1 (read - b).
+The length of f must equal gravity; this tilt includes that of the board in the aircraft. Without a compass, the
+autopilot's yaw is the heading.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ from companion.physics.units import DEG, MG
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
-UNKNOWN_K: Final = 5.0  # Assumed change of an unknown temperature
+UNKNOWN_K: Final = 5.0  # Assumed change of the temperature if it is unknown
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
-"""Largest error of the measured length of gravity, in sigmas; beyond, the six-position calibration is outdated."""
+"""Largest error of gravity's measured length, in sigmas; beyond it, the six-position calibration is outdated."""
 
 
 class OwnHeading(msgspec.Struct, frozen=True):
-    """The autopilot's yaw, clockwise from true north."""
+    """Yaw estimated by the autopilot, clockwise from true north, with one sigma."""
 
     heading_deg: float
     sigma_deg: float
 
 
 class Otherwise(msgspec.Struct, frozen=True, kw_only=True):
-    """Fallbacks for a missing gradienter or compass."""
+    """Fallbacks for a missing gradienter (tilt sensor) or compass."""
 
-    sides: dict[str, Sides] = {}  # Figures of the accelerometers from all sides, by IMU
+    sides: dict[str, Sides] = {}  # Six-position calibrations of the accelerometers, by IMU
     heading: OwnHeading | None = None
 
 
@@ -59,24 +60,24 @@ NOTHING: Final = Otherwise()
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Reference for the sensors: up, heading and attitude covariance in vehicle FRD.
+    """Attitude that serves as reference: up vector, heading and attitude covariance, in vehicle axes (FRD).
 
-    `tilt_from` None: from accelerometers of unknown bias. `reading_sigma_rad`: sigma of the gradienter's means, without
-    its zero.
+    `tilt_from` is None if the tilt is from accelerometers of unknown bias. `reading_sigma_rad` is one sigma of the
+    gradienter's two mean readings, without that of its zero.
     """
 
     up: Array
     up_covariance: Matrix
     attitude_covariance_rad2: Matrix  # (3, 3) in vehicle FRD
     up_by_reading: Matrix | None
-    """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    """Derivative of the up vector by the gradienter's two readings, per radian, (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
     tilt_from: TiltFrom | None
     heading_rad: float | None = None
     heading_sigma_rad: float | None = None
     heading_from: HeadingFrom | None = None
     magnetic: Magnetic | None = None
-    """Quality of the heading by the compass' field and steadiness; None without a compass."""
+    """Quality of the compass heading, by its field and steadiness; None without a compass."""
 
     @property
     def body_from_ned(self) -> Matrix:
@@ -88,9 +89,9 @@ class Truth:
 
 
 def attitude_error_jacobian(up: Array) -> Matrix:
-    """Return the derivative (3, 3) of the attitude by `up`, at a fixed heading: eps = jacobian @ d up.
+    """Return the derivative (3, 3) of the attitude error by an error of the up vector, at a fixed heading.
 
-    Roll turns about the body's x axis, pitch about the horizontal axis (0, cos gamma, -sin gamma).
+    Roll gamma turns about the body's x axis, pitch about the horizontal axis (0, cos gamma, -sin gamma).
     """
     gamma, theta = roll_pitch_from_up(up)
     horizontal = np.hypot(up[1], up[2])
@@ -107,10 +108,10 @@ def truth_of(
     warnings: list[str],
     otherwise: Otherwise = NOTHING,
 ) -> Truth:
-    """Estimate the attitude from all sensors except the gyros; add a line to `warnings` for each gap.
+    """Estimate the attitude from all sensors except the gyros; add a line to `warnings` for each missing sensor.
 
     Raises:
-        CalibrationRefusedError: the readings are inconsistent.
+        CalibrationRefusedError: the readings are inconsistent, or the nose points up or down.
     """
     by_reading: Matrix | None = None
     reading_sigma = (0.0, 0.0)
@@ -161,7 +162,7 @@ def truth_of(
 
 
 def _up_by_gradienter(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
-    """Return up in the vehicle's axes, its derivatives by the readings, (3, 2), and its covariance, (3, 3), rad^2."""
+    """Return the up vector in vehicle axes, its derivative by the readings (3, 2), and its covariance (3, 3), rad^2."""
     x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
     try:
         up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
@@ -175,9 +176,9 @@ def _up_by_gradienter(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, 
 def _up_by_sides(
     imus: Sequence[ImuWindow], otherwise: Otherwise, local: LocalEarth, warnings: list[str]
 ) -> tuple[Array, Matrix] | None:
-    """Estimate up, and its covariance, by the first IMU that was measured on all sides and still agrees with gravity.
+    """Estimate the up vector and its covariance by the first IMU with a six-position calibration that fits gravity.
 
-    Two IMUs are not averaged: their boards may have different tilts, and the autopilot flies with the first one.
+    Two IMUs are not averaged, because their boards may tilt differently; the autopilot flies with the first one.
     """
     for imu in imus:
         known = otherwise.sides.get(imu.name)
@@ -201,7 +202,7 @@ def _up_by_sides(
 
 
 def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
-    """Return the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
+    """Return the specific force (3,) in vehicle axes by a six-position calibration, and its covariance, (3, 3)."""
     figures, turn = known.figures, known.vehicle_from_sensor
     inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])
@@ -215,14 +216,14 @@ def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
 
 
 def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> float:
-    """Estimate one sigma of the change of the accelerometers' biases since all sides were measured.
+    """Estimate one sigma of the accelerometers' bias change since their six-position calibration.
 
-    `gap_s`: time since then, None: perhaps another power-up. `kelvin`: change of the temperature.
+    `gap_s` is the time since then; None: perhaps another power-up. `kelvin` is the temperature change; None: unknown.
     """
     if gap_s is None:
         wander = CATALOGUE_SCATTER["accel"] ** 2
     else:
-        # The sigma of the stands already includes the change within minutes.
+        # The sigma of the six-position calibration already includes the change within minutes.
         late, soon = (
             floor_variance(noise.flicker, noise.walk, _MEAN_S, 2.0 * each) for each in (max(gap_s, _SOON_S), _SOON_S)
         )
