@@ -1,1 +1,1 @@
-"""Alignment of gradienter and accelerometers with the aircraft, from several stands."""
+"""Alignment of the gradienter (tilt sensor) and the accelerometers with the aircraft, from several poses."""

@@ -1,18 +1,18 @@
-"""Joint estimate from several still stands: the gradienter's zero, level, and the errors of each IMU (method 3.4).
+"""Joint estimate from several still poses: the gradienter's zero, level, and the errors of each IMU.
 
-One pose cannot tell a zero offset of the gradienter from a bias of the accelerometers; one spot seen twice, turned by
-180 degrees, can. Further tilts separate bias from scale and show how the gradienter sits against each IMU. All
-unknowns are estimated together by Gauss-Newton with priors: an unknown that the stands do not determine keeps its
-prior sigma.
+One pose cannot separate a zero offset of the gradienter from a bias of the accelerometers. Two poses at one place,
+turned by 180 degrees, can. Further tilts separate bias from scale and show the misalignment of gradienter and IMUs.
+All unknowns are estimated together by Gauss-Newton with priors (method.md section 3.4). An unknown that the poses do
+not determine keeps its prior sigma.
 
-Without a gradienter (`turned`) the same turn gives the *effective* bias of the level aircraft: the bias proper and the
-board's tilt in one. In the aircraft, the slope of the spot changes its sign after half a turn; a bias does not. The
-sigma depends on the placement on the marks (`Priors.placement_deg`) and, on a slope, on the error of the turn's angle:
-g sin(slope) / 2 for each radian of a half turn, 0.76 mg for each degree on 5 deg of slope. Quarter turns determine
-their own angles, because their readings lie on a circle.
+Without a gradienter (`turned`), the half turn gives the *effective* bias of the level aircraft: the bias plus the
+effect of the board's tilt. In the aircraft's axes, the ground's slope changes its sign after half a turn; a bias does
+not. Sigma depends on how exactly the aircraft returns to its marked place (`Priors.placement_deg`). On a slope, sigma
+also depends on the error of the turn's angle. It adds g sin(slope) / 2 for each radian of a half turn, or 0.76 mg for
+each degree on a slope of 5 deg. Quarter turns determine their own angles, because their readings lie on a circle.
 
-Inconsistent readings are refused: every residual is compared with its own sigma (Baarda's w-test). That names the
-wrong stand, and detects a spot that moved before a sum of squares would.
+Inconsistent readings are refused: every residual is compared with its own sigma (Baarda's w-test). This test names the
+wrong pose, and detects a movement of the ground earlier than a sum of squares.
 """
 
 from __future__ import annotations
@@ -50,22 +50,23 @@ from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 W_LIMIT: Final = 4.5
-"""Threshold for |w| of one residual: exceeded by chance once in some thousand alignments of a hundred readings."""
+"""Threshold for a normalised residual (Baarda's |w|). Chance exceeds it in one of 1000 alignments of 100 readings."""
 SPOT_W_LIMIT: Final = 3.9
-"""Threshold for |w| of a placement: as there are few, exceeded by chance once in some thousand alignments."""
+"""Threshold for the normalised residual of a return to the marked place (Baarda's |w|). An alignment has few returns,
+so chance exceeds this lower threshold only once in some thousand alignments, too."""
 DETERMINED: Final = 0.2
-"""A figure counts as determined if its sigma is below this share of its prior sigma."""
+"""A value counts as determined by the readings if its sigma is below this share of its prior sigma."""
 _LEAST_REDUNDANCY: Final = 1e-3
 _NINETY_NINE: Final = 2.326  # Sigmas of the one-sided 1 % point of a normal variable
 MOST_TURNED_DEG: Final = 30.0
-"""Largest rotation of an IMU against the base: a larger one means a wrong configured orientation."""
+"""Largest plausible rotation of an IMU against the aircraft's base; a larger one shows a wrong orientation setting."""
 ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
-"""Priors of uncalibrated accelerometers on a board put in by eye."""
+"""Priors for an alignment without a gradienter: uncalibrated accelerometers on a board that was mounted by eye."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Figures:
-    """Three figures, their sigmas, and flags of those that the stands determine; shapes (3,)."""
+    """Estimate of three values, their sigmas, and flags that are true where the poses determine a value; each (3,)."""
 
     value: Array
     sigma: Array
@@ -74,16 +75,15 @@ class Figures:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuAlignment:
-    """Estimate of one IMU's remaining errors, after the offsets that an autopilot subtracts; vehicle FRD.
+    """Errors of one IMU that remain after the autopilot has subtracted its offsets; vehicle axes (FRD).
 
-    The level bias (3,) is the effective one, scale and misalignment included, as a calibration of the level aircraft
-    measures it; `accel_bias_m_s2` is the bias alone. Shear: xy, xz, yz. `misalignment_rad`: rotation vector from the
-    axes of gradienter and base to those of this IMU.
+    `accel_bias_m_s2` is the bias without the effects of scale and misalignment. `misalignment_rad`: rotation vector
+    from the axes of gradienter and base to the axes of this IMU.
     """
 
     name: str
     level_bias_m_s2: Array
-    """Effective bias (3,) when level, with scale and misalignment, as a level calibration measures it."""
+    """Bias (3,) that a calibration of the level aircraft would measure: includes effects of scale and misalignment."""
     level_covariance_m2_s4: Matrix
     accel_bias_m_s2: Figures
     scale: Figures
@@ -93,7 +93,7 @@ class ImuAlignment:
 
 
 class Complaint(NamedTuple):
-    """Worst residual, in its own sigmas and in SI units."""
+    """Residual farthest beyond its threshold, in multiples of its sigma and in SI units."""
 
     label: ResidualLabel
     sigmas: float
@@ -102,15 +102,15 @@ class Complaint(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Result of an alignment: the gradienter's zero (2,), on top of the configured offset, and all IMUs.
+    """Result of an alignment: zero offset of the gradienter, and the errors of all IMUs.
 
-    `checked`: the stands would have revealed a spot that moved between them.
+    `checked`: true if the readings would have shown a movement of the ground between two poses.
     """
 
-    offset_deg: Array  # Zero of the gradienter on top of the configured offset; (2,)
+    offset_deg: Array  # Zero of the gradienter in addition to the configured offset; (2,)
     offset_covariance_deg2: Matrix
     imus: tuple[ImuAlignment, ...]
-    slope_deg: float  # Slope of the spot; 0 without one
+    slope_deg: float  # Slope of the ground at the marked place; 0 without a marked place
     attitudes: tuple[Matrix, ...]
     chi_square: float
     freedom: int
@@ -125,10 +125,10 @@ class Alignment:
 def align(
     law: Law, vehicle_from_sensor: Matrix, stands: Sequence[StandMeans], ground: Ground, priors: Priors | None = None
 ) -> Alignment:
-    """Estimate all unknowns from all stands, at least one; `vehicle_from_sensor` is the gradienter's mounting.
+    """Estimate all errors from at least one pose; `vehicle_from_sensor` is the gradienter's mounting.
 
     Raises:
-        CalibrationRefusedError: the equations cannot be solved, because the readings are inconsistent.
+        CalibrationRefusedError: no solution fits, or an IMU would be rotated by more than `MOST_TURNED_DEG`.
     """
     mounting = law, vehicle_from_sensor
     try:
@@ -146,7 +146,7 @@ def align(
         ) from None
     chi_square = float(found.residual @ found.residual)
     freedom = int((found.residual.size - np.count_nonzero(model.sigma)) - sum(model.sigma[model.damped] > 0.0))
-    # A placement is checked if the other stands predict it, which its redundancy shows.
+    # A return to the marked place is checked if the other poses predict it: its redundancy is then high.
     checked = any(
         group == "spot" and share > 0.1 for (group, *_), share in zip(model.labels, found.redundancy, strict=True)
     )
@@ -165,7 +165,7 @@ def align(
 
 
 def turned(stands: Sequence[StandMeans], ground: Ground) -> Alignment:
-    """Estimate level bias and slope from two or four headings on one spot, without a gradienter.
+    """Estimate bias when level, and slope, from two or four headings at one place, without a gradienter.
 
     Raises:
         CalibrationRefusedError: the readings are inconsistent.
@@ -193,7 +193,7 @@ _UNKNOWN: Final = "the stands do not fit what is known of the sensors ({by}): be
 
 
 def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
-    """Explain in one line why the stands are inconsistent, and what to do; `gradienter`: whether there was one."""
+    """Explain in one line why the poses are inconsistent, and what to do; `gradienter`: the aircraft has one."""
     (group, stand, name), sigmas, size = complaint
     words = _COMPLAINTS.get(group, _UNKNOWN)
     if group == "accelerometer" and not gradienter:
@@ -203,7 +203,7 @@ def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
-    """Return the ratio of actual to stated residual variance if it exceeds its 99 % point, else 1."""
+    """Return a factor for the covariance: actual over predicted variance of residuals; 1 if it may be chance (99 %)."""
     if freedom <= 0:
         return 1.0
     ratio = chi_square / freedom

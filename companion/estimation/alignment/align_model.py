@@ -1,22 +1,22 @@
-"""The model behind `align`, and the least-squares fit of every alignment.
+"""Model of all poses for `align`, and the least-squares fit that every alignment uses.
 
-A *stand* is one still window. Estimated for all stands together: the gradienter's zero; for every IMU its
-misalignment against the base, accelerometer scale, shear and bias, and gyro bias; gravity and the Earth's rate
-within the uncertainty of the place; the plane of the spot; and the attitude in each stand.
+A *stand* in the code is the still window of one pose. The fit estimates the gradienter's zero, and for every IMU its
+misalignment, accelerometer scale, shear and bias, and gyro bias. With these it estimates gravity and the Earth's rate
+within the uncertainty of the place, the plane of the ground, and the attitude C_k in each pose k.
 
-With u = C_k (0, 0, -1) (up in the vehicle), g, and the Earth's rate W in the ground frame (NED, or, without a north,
-turned about the vertical):
+Here u = C_k (0, 0, -1) is up in the vehicle's axes, and g is gravity. W is the Earth's rate in the ground frame, which
+is NED, or NED turned about the vertical if north is unknown.
 
     gradienter     reading = law(M^T u) + zero                          M: vehicle from sensor
     accelerometer  f = (I + S) exp(-[m x]) g u + b                      S: scale on the diagonal, shear beside it
     gyro           w = C_k W + b_w
     compass        heading of C_k
-    turn           (1 + s) times the turn of C_k since the last stand, about the vehicle's z     s: a gyro's scale
-    spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
+    turn           (1 + s) times the turn of C_k since the last pose, about the vehicle's z      s: a gyro's scale
+    spot           down of the vehicle, in the ground frame, is the normal n of the ground: C_k^T z = n + placement
 
-The last line is the level reversal (method 3.4): the spot's true tilt is the same in the ground frame, however the
-aircraft is turned on it. "Level" means parallel to the plane of the spot. An attitude error eps gives
-C = exp(-[eps x]) C_0, with C_0 the first guess.
+The last line is the level reversal (method.md section 3.4): the ground's true tilt is the same in the ground frame,
+however the aircraft is turned on it. "Level" means parallel to the plane of the ground at the marked place. An attitude
+error eps gives C = exp(-[eps x]) C_0, with C_0 the first guess.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ from companion.physics.units import DEG, MG
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 Group = Literal["gradienter", "accelerometer", "gyro", "compass", "turn", "spot", "zero", "prior", "nothing"]
 ResidualLabel = tuple[Group, int, str]
-"""Group of a residual, its stand (from 1; 0: none), and its IMU, if any."""
+"""Group of a residual, number of its pose (from 1; 0: none), and name of its IMU (empty: none)."""
 
 _ANYHOW_RAD: Final = 1.0
-"""Damping sigma of unknowns that have no prior: keeps the equations solvable."""
+"""Sigma that limits each step of an unknown without a prior (damping); it keeps the equations solvable."""
 PRIOR_BIAS_M_S2: Final = 100.0 * MG
 PRIOR_SCALE: Final = 0.03
 PRIOR_SHEAR: Final = 0.01
-"""One sigma of an uncalibrated part (ICM-42688-P: 0.5 %, cross axis 1 %; mounted parts are worse)."""
+"""Prior sigma of an uncalibrated part's shear. ICM-42688-P: cross axis 1 %, scale 0.5 %; mounted parts are worse."""
 _MAX_ROUNDS: Final = 30
 _CONVERGED: Final = 1e-5
 _STEP: Final = 1e-5
-"""Step of the numerical derivatives. `_CONVERGED` and `_STEP` are shares of the prior sigma of each unknown."""
+"""Step of the numerical derivatives. `_CONVERGED` and `_STEP` are multiples of each unknown's prior sigma."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class LeastSquares:
-    """Result of `fit`: unknowns, and their covariance from the sigmas of readings and priors.
+    """Result of `fit`: values of the unknowns, and their covariance from the sigmas of readings and priors.
 
-    The covariance of an unknown that is not estimated is zero. Residuals are divided by their sigmas: readings, then
-    the prior of each estimated unknown. `redundancy`: share of each residual's variance that the fit leaves in it.
+    The covariance of an unknown that is not estimated is zero. `redundancy`: share of the variance of each reading or
+    prior that remains in its residual after the fit.
     """
 
     values: Array
     covariance: Matrix
-    residual: Array  # Residuals over their sigmas: readings, then the prior of every unknown that is estimated
+    residual: Array  # Residuals over their sigmas: of the readings, then of the prior of each estimated unknown
     redundancy: Array
 
 
@@ -70,10 +70,10 @@ def fit(
     """Estimate unknowns by Gauss-Newton with priors.
 
     Args:
-        residuals: maps unknowns (m, size) to (m, readings), measured minus predicted, over sigma.
-        start: first guess, and mean of the priors, (size,).
-        sigma: sigma of each prior, (size,); 0: known, not estimated.
-        damped: unknowns that have no prior; `sigma` limits their step.
+        residuals: maps m sets of unknowns (m, size) to measured minus predicted, over sigma, (m, readings).
+        start: first guess (size,), also the mean of the priors.
+        sigma: sigma (size,) of each prior; 0: the unknown is known and not estimated.
+        damped: indices of unknowns without a prior; for these, `sigma` limits the step.
 
     Raises:
         ValueError: the iteration does not converge.
@@ -105,39 +105,39 @@ def fit(
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandMeans:
-    """Means of one still window.
+    """Means over the still window of one pose.
 
-    `tilt_deg`: gradienter readings minus the configured offset; None out of range or without a gradienter. The heading
-    counts from a north common to all stands, which need not be the true one. `counted`: the heading is that of the last
-    stand plus the turn that the gyros counted since (`seconds.counting`), not wrapped. Its sigma is then that of the
-    turn, without the gyros' scale (`Priors.turn_scale`).
+    `tilt_deg`: gradienter readings minus the configured offset; None if out of range or without a gradienter.
+    `counted`: `heading_rad` is the heading of the pose before plus the turn that the gyros counted since
+    (`seconds.counting`), not wrapped. `heading_sigma_rad` is then the sigma of that turn, without the error of the
+    gyros' scale (`Priors.turn_scale`).
     """
 
     imus: tuple[ImuWindow, ...]
     tilt_deg: tuple[float, float] | None
     tilt_sigma_deg: tuple[float, float]
-    heading_rad: float  # Heading from a north common to all stands, which need not be the true one
+    heading_rad: float  # Heading from a north common to all poses, which may differ from true north
     heading_sigma_rad: float
-    on_spot: bool  # True on the spot on which the aircraft is turned
+    on_spot: bool  # True at the marked place on which the aircraft is turned
     counted: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """Gravity and the Earth's rate at the place, with their uncertainty."""
+    """Gravity and the Earth's rotation rate at the place of an alignment, with their uncertainty."""
 
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     rate_rad_s: Array
-    """Shape (3,), in the ground frame: headings count from its x axis."""
+    """Earth's rotation rate (3,) in the ground frame; headings count from the x axis of that frame."""
     rate_covariance: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
-    """One sigma of each unknown before any reading; 0: known and not estimated (method 3.4, joint MAP covariance).
+    """Prior sigma of each unknown of an alignment; 0: known and not estimated (method.md section 3.4, joint MAP).
 
-    `placement_deg`: tilt of each placement on the spot, each axis. `turn_scale`: of all gyros that count turns.
+    `placement_deg`: tilt error, each axis, of every return to the marked place. `turn_scale`: scale of counted turns.
     """
 
     offset_deg: float = 1.0
@@ -151,14 +151,14 @@ class Priors:
 
 
 MISALIGNMENT, PART_SCALE, PART_SHEAR, ACCEL_BIAS, GYRO_BIAS = range(5)
-"""Unknowns of an IMU, three figures each: x, y, z, and of the shear xy, xz, yz."""
+"""Indices of an IMU's five groups of unknowns. A group has three values: x, y, z, or xy, xz, yz for the shear."""
 
 
 class Model:
-    """Unknowns and residuals of all stands.
+    """Model of an alignment: computes the residuals of all poses from the unknowns.
 
-    Unknowns, SI units: zero of the gradienter (2), spot (2), gravity (1), Earth's rate (3), scale of counted turns (1),
-    attitude error of each stand (3), and five parts of each IMU (3).
+    The unknowns, in SI units: zero of the gradienter (2), tilt of the ground at the marked place (2), gravity (1),
+    Earth's rate (3), scale of counted turns (1), attitude error of each pose (3), five groups (3) of each IMU.
     """
 
     offset, spot, gravity, rate, turn = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8), slice(8, 9)
@@ -187,7 +187,7 @@ class Model:
 
         angle, bias = priors.misalignment_deg * DEG, (priors.accel_bias_m_s2, priors.gyro_bias_rad_s)
         self.sigma = np.full(self._first_imu + 15 * len(names), _ANYHOW_RAD)
-        """Sigma of every unknown before any reading; 0: not estimated."""
+        """Prior sigma of every unknown; 0: not estimated."""
         self.sigma[self.offset] = priors.offset_deg * DEG if self._tilted else 0.0
         self.sigma[self.spot] = _ANYHOW_RAD if self._on_spot else 0.0
         self.sigma[self.gravity] = ground.gravity_sigma_m_s2
@@ -199,7 +199,7 @@ class Model:
         if self._on_spot:
             self.start[self.spot] = self._first_guess[self._on_spot, 2, :2].mean(axis=0)
         self.damped = [*range(2, 4), *range(self.turn.stop, self._first_imu)]
-        """Unknowns without a prior."""
+        """Indices of the unknowns without a prior."""
 
         self.labels: list[ResidualLabel] = []  # Labels of the residuals, in their order, and of the priors
         sigmas: list[float] = []
@@ -232,12 +232,12 @@ class Model:
         return slice(start, start + 3)
 
     def attitudes(self, at: Floats) -> Floats:
-        """Return body from ground in every stand, (..., stands, 3, 3)."""
+        """Return the rotation from the ground frame to the vehicle's axes in every pose, (..., poses, 3, 3)."""
         errors = at[..., self.turn.stop : self._first_imu]
         return np.asarray(rotations(-errors.reshape(*at.shape[:-1], -1, 3)) @ self._first_guess)
 
     def reading(self, at: Floats, up: Floats) -> Floats:
-        """Predict accelerometer readings (..., stands, imus, 3) from up in the vehicle, (..., stands, 3)."""
+        """Predict accelerometer readings (..., poses, imus, 3). `up` (..., poses, 3): unit vector, vehicle's axes."""
         imus = self._imus(at)
         turned = rotations(-imus[..., MISALIGNMENT, :])
         matrices = response(imus[..., PART_SCALE, :], imus[..., PART_SHEAR, :]) @ turned
@@ -245,7 +245,7 @@ class Model:
         return np.asarray(felt + imus[..., None, :, ACCEL_BIAS, :])
 
     def residuals(self, at: Floats) -> Floats:
-        """Return measured minus predicted over sigma, (m, readings), for unknowns (m, size)."""
+        """Return measured minus predicted, over sigma, (m, readings), for m sets of unknowns (m, size)."""
         attitudes = self.attitudes(at)
         up, forward = -attitudes[..., 2], attitudes[..., 0, :]
         sensed = readings_from_up(self._law, up[:, self._tilted] @ self._vehicle_from_sensor)
@@ -271,7 +271,7 @@ class Model:
 
 
 def response(scale: Floats, shear: Floats) -> Floats:
-    """Return I + S, (..., 3, 3), of scale x y z and shear xy, xz, yz."""
+    """Return the matrix I + S (..., 3, 3): scale x, y, z on the diagonal of S, shear xy, xz, yz off the diagonal."""
     return np.asarray((1.0 + scale)[..., None] * np.eye(3) + symmetric(shear))
 
 

@@ -1,16 +1,16 @@
-"""Bias, scale and shear of three accelerometers from the length of gravity, in stands of any orientation.
+"""Bias, scale and shear of three accelerometers from the length of gravity, in poses of any orientation.
 
-Only the strength of gravity has to be known: in any orientation the corrected reading has that length (Tedaldi, Pretto
-and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u of length 1, up in the sensor's axes,
+Only the strength of gravity must be known: in any orientation the corrected reading has that length (Tedaldi, Pretto
+and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u the unit vector pointing up, in the sensor's axes,
 
     f = (I + S) g u + b           S symmetric: scale on its diagonal, shear beside it
 
-so that |(I + S)^-1 (f - b)| = g in every stand. A common rotation of the axes changes no length: `mounting` finds it,
-from a turn on a spot. Unlike the triangular matrix of that paper, a symmetric one prefers no axis. Its diagonal is the
-scale that a firmware without shear correction uses.
+so that |(I + S)^-1 (f - b)| = g in every pose. A common rotation of the axes does not change the length; `mounting`
+finds that rotation from a turn at one place. Unlike the triangular matrix of Tedaldi et al., a symmetric one prefers no
+axis. Its diagonal is the scale that a firmware without shear correction uses.
 
-Each stand is weighted by the noise of its mean, gravity by the uncertainty of the place, so every figure has a sigma
-from the first stand on. A stand that does not fit is found by leaving out one after another.
+Each pose is weighted by the noise of its mean, and gravity by its uncertainty at the place. Every value therefore has a
+sigma from the first pose on. A pose that does not fit is found by leaving out one pose after another.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ BIAS: Final = slice(0, 3)
 SCALE: Final = slice(3, 6)
 SHEAR: Final = slice(6, 9)
 W_LIMIT: Final = 3.9
-"""Threshold for |w| of a stand (Baarda): exceeded by chance once in ten thousand."""
+"""Threshold for the normalised residual of one pose (Baarda's |w|): chance exceeds it once in ten thousand."""
 LEAST_SPARE: Final = 2
-"""Surplus of stands over figures that is needed to identify a wrong stand."""
+"""Least number of poses, in addition to the number of unknowns, with which a wrong pose can be identified."""
 _LEAST_REDUNDANCY: Final = 1e-3
 
 ENOUGH_BIAS_M_S2: Final = 0.15 * MG
 ENOUGH_SCALE: Final = 2e-4
 ENOUGH_WANDER: Final = 0.8
-"""Bias sigma that is good enough, as a share of the bias' wander: a dozen more stands do not improve a bad sensor."""
+"""Good enough bias sigma, as a share of the bias' own wander: a dozen more poses do not improve a bad sensor."""
 SAME_DEG: Final = 20.0
-"""Two stands within this angle add hardly more information than one."""
-FACE_DEG: Final = 30.0  # A stand within this angle of a face covers it
-_STAND_SIGMA_M_S2: Final = 0.03 * MG  # Predicted sigma of the mean of a coming stand
+"""Angle between two poses below which the second adds hardly any information."""
+FACE_DEG: Final = 30.0  # A pose within this angle of a side counts as a measurement of that side
+_STAND_SIGMA_M_S2: Final = 0.03 * MG  # Predicted sigma of the mean of the next pose
 _AXES: Final = "xyz"
 _SIDES: Final = {
     "level": (0, 0, -1),
@@ -57,32 +57,32 @@ _SIDES: Final = {
     "left side down": (0, 1, 0),
     "right side down": (0, -1, 0),
 }
-"""Up in the aircraft's axes, forward, right, down."""
+"""Unit vector pointing up, in the aircraft's axes (forward, right, down), for each of the six positions."""
 
 
 Face = tuple[Array, Array]
-"""Mean of one still stand in the sensor's axes, and one sigma per axis; m/s^2, shapes (3,)."""
+"""Mean specific force of one still pose in the sensor's axes, and one sigma per axis; m/s^2, each (3,)."""
 
 
 class Sides(msgspec.Struct, frozen=True):
-    """Errors of one IMU's accelerometers, measured on all sides, with the active offsets and scales applied.
+    """Errors of one IMU's accelerometers from six positions, with the autopilot's active offsets and scales applied.
 
-    Figures (9,) as in `FacesEstimate`, with one sigma each; time and temperature widen the sigmas of the biases.
+    Each of the nine values has one sigma. Time and temperature since the measurement widen the sigmas of the biases.
     """
 
-    figures: Array  # (9,), as in `FacesEstimate`, in the sensor's axes; m/s^2 and no unit
+    figures: Array  # (9,), as in `FacesEstimate`, in the sensor's axes: biases in m/s^2, scale and shear without unit
     sigma: Array
     vehicle_from_sensor: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class FacesEstimate:
-    """Estimate from all stands: figures (9,), bias x y z, scale x y z, shear xy xz yz.
+    """Estimate from all poses: nine figures (9,), namely bias x y z, scale x y z, shear xy xz yz.
 
-    `by_stands` (9, 9): covariance of the figures during the stands. `wander_m_s2` (3,): one sigma of the change of the
-    biases until they are used. `up` (stands, 3): in the sensor's axes, corrected. `off_m_s2` (stands,): length of each
-    corrected reading minus gravity. Stands count from 0: those `left_out` do not fit the others. One of those
-    `in_doubt` does not fit either; the next stand shows which.
+    `by_stands` (9, 9): covariance of the figures at the time of the poses. `wander_m_s2` (3,): one sigma of the biases'
+    change until they are used. `up` (poses, 3): corrected unit vector up in the sensor's axes. `off_m_s2` (poses,):
+    length of each corrected reading minus gravity. `left_out`: numbers, from 0, of poses that do not fit the others.
+    `in_doubt`: poses of which one more does not fit; the next pose will show which one.
     """
 
     figures: Array
@@ -97,7 +97,7 @@ class FacesEstimate:
 
     @property
     def covariance(self) -> Matrix:
-        """Covariance (9, 9) of the figures at the time of their use."""
+        """Covariance (9, 9) of the figures when they are used, with the wander of the biases until then."""
         both = self.by_stands.copy()
         both[BIAS, BIAS] += np.diag(self.wander_m_s2**2)
         return both
@@ -110,12 +110,12 @@ class FacesEstimate:
 def faces(
     stands: Sequence[Face], gravity_m_s2: float, gravity_sigma_m_s2: float, wander_m_s2: Array | None = None
 ) -> FacesEstimate:
-    """Estimate the figures from at least one stand; a figure that is not determined keeps its prior sigma.
+    """Estimate bias, scale and shear from at least one pose; a value that is not determined keeps its prior sigma.
 
-    `wander_m_s2` as in `FacesEstimate`; None: zero.
+    `wander_m_s2` (3,): one sigma of the biases' change until they are used; None: zero.
 
     Raises:
-        CalibrationRefusedError: readings that no accelerometer can give.
+        CalibrationRefusedError: no accelerometer can give these readings.
     """
     everyone = tuple(range(len(stands)))
     gravity = (gravity_m_s2, gravity_sigma_m_s2)
@@ -154,7 +154,7 @@ def faces(
 def _fit(
     stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]
 ) -> tuple[Array, Matrix, float, bool]:
-    """Estimate figures and gravity; return figures, covariance, chi-square, and whether every stand fits."""
+    """Estimate the nine figures; return them, their covariance (9, 9), chi-square, and true if every pose fits."""
     force, sigmas = (np.array([stands[k][part] for k in which]) for part in (0, 1))
     prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
 
@@ -176,7 +176,7 @@ def _fit(
     residual, freedom = found.residual[:count], count - FIGURES
     chi_square = float(residual @ residual)
     w = residual / np.sqrt(np.maximum(found.redundancy[:count], _LEAST_REDUNDANCY))
-    # Compare each stand with the scatter of the others if that exceeds their sigmas.
+    # Compare each pose with the scatter of the others if that exceeds their sigmas.
     others = np.maximum((chi_square - w**2) / (freedom - 1), 1.0) if freedom > 1 else np.ones(count)
     covariance = widened_by(chi_square, freedom) * found.covariance[:FIGURES, :FIGURES]
     return found.values[:FIGURES], covariance, chi_square, bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all())
@@ -185,10 +185,10 @@ def _fit(
 def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
     """Return the next pose to ask for; None once bias and scale of all axes are precise enough and checked.
 
-    `vehicle_from_sensor`: 3x3, the mounting of the accelerometers in `found`.
+    `vehicle_from_sensor` (3, 3): mounting of the accelerometers that `found` describes.
     """
     wander, gravity = ENOUGH_WANDER * found.wander_m_s2, found.gravity_m_s2
-    # Stands cannot show an error of the local gravity: the scale keeps that uncertainty.
+    # Poses cannot show an error of the local gravity: the scale keeps that uncertainty.
     scale = np.hypot(np.maximum(ENOUGH_SCALE, wander / gravity), found.gravity_sigma_m_s2 / gravity)
     sigma = np.sqrt(np.diag(found.by_stands))[: SCALE.stop]
     share = sigma / np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale])
@@ -211,9 +211,9 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
 
 
 def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:
-    """Return the index of an earlier stand in this pose; None for a new pose, or if all sides were seen.
+    """Return the index of an earlier measurement of this pose; None for a new pose, or if all sides were measured.
 
-    `up` is in the sensor's axes, (3,), of length 1; `found` is from the stands before.
+    `up` (3,): unit vector pointing up in the sensor's axes. `found`: estimate from the earlier poses.
     """
     if not _not_seen(found, vehicle_from_sensor):
         return None
@@ -259,9 +259,9 @@ def _two_digits(value: float) -> str:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """Tilt of the board against the base: the attitude that its corrected accelerometers show on a level base.
+    """Tilt of the board against the aircraft's base: attitude that its corrected accelerometers show on a level base.
 
-    Roll is right side down, pitch nose up; `sigma_rad` is one sigma of each, (2,).
+    Roll is positive right side down, pitch nose up. `sigma_rad` (2,): one sigma of roll and pitch.
     """
 
     roll_rad: float
@@ -270,9 +270,9 @@ class Mounting:
 
 
 def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting:
-    """Return the tilt of the board from its level bias and its accelerometers' bias and scale, all uncorrected.
+    """Return the tilt of the board from its bias when level, after removing the accelerometers' own bias and scale.
 
-    Shear is not corrected, because no firmware does. The attitude corrected by this tilt is right when level.
+    Shear is not removed, because no firmware corrects it. An attitude corrected by this tilt is right when level.
     """
     vehicle_from_sensor = known.vehicle_from_sensor
     read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)

@@ -1,6 +1,6 @@
 """Poses that an alignment asks for, as text and picture, and the check of a pose against the requested one.
 
-A *pose* is one way to put down or hold the aircraft; a *stand* is the still window measured in it.
+A *pose* is one way to put down or hold the aircraft. The code calls the still window measured in a pose a *stand*.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from companion.samples import Vector
 TURN_TOLERANCE_DEG: Final = 30.0
 QUARTER_DEG: Final = 90.0
 LEAST_TILT_DEG: Final = 15.0
-"""Least tilt that separates scale and misalignment from bias: their effects differ by the tilt's cosine."""
+"""Smallest tilt that separates scale and misalignment from bias: their effects differ by the cosine of the tilt."""
 APART_DEG: Final = 45.0  # The least angle between two tilts to different sides
 MOST_ASKEW_DEG: Final = 30.0
-"""Largest tilt on the base: a slope, plus an aircraft that sits on its tail, plus a board mounted by eye."""
+"""Largest tilt of an aircraft on its base: slope, plus a taildragger's attitude, plus a board mounted by eye."""
 TILTS: Final = 4
 LEVEL: Final = (0.0, 0.0, -1.0)
 _SIN, _COS = math.sin(24.0 * DEG), math.cos(24.0 * DEG)
@@ -36,21 +36,19 @@ HEADINGS: Final = 4
 LEAST_SECONDS: Final = 6
 LEANED_SIGMAS: Final = 5.0
 BY_EYE_SIGMA_DEG: Final = 10.0
-"""Sigma of a turn by hand that no sensor measured."""
+"""Sigma of a turn that somebody judged by eye, because no sensor measured it."""
 
 
 class AlignmentRequest(NamedTuple):
-    """One alignment, as the operator asked for it."""
-
     action: Literal["zero", "tilts", "turn", "faces"]
     headings: int = 2
-    """2: start, half a turn, and on in the same direction to the start; 4: every quarter turn."""
-    write: bool = False  # Write offsets (and scales, if all sides determine them) to the autopilot
+    """Headings to measure. 2: start, half a turn, and on in the same direction to the start. 4: every quarter turn."""
+    write: bool = False  # Write offsets (and scales, if six positions determine them) to the autopilot
     level: bool = False  # Write the tilt of the board as the autopilot's level
 
     @property
     def on_spot(self) -> int:
-        """Number of stands on the marked spot; a "turn", or two headings, has one more at the end, as a check."""
+        """Number of poses at the marked place. A "turn", or two headings without tilts, repeats the first as check."""
         if self.headings == 2 and self.action != "tilts":
             return 3
         return HEADINGS + (self.action == "turn")
@@ -61,27 +59,26 @@ class AlignmentRequest(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """Pose to ask for next: `up` (length 1) in the aircraft's axes, forward, right, down.
+    """Pose to request next. `up`: unit vector pointing up, in the aircraft's axes (forward, right, down).
 
-    `words` are spoken up to the first colon. `unknown`: figures that are not yet precise enough, worst first.
+    `words`: text that is spoken up to the first colon. `unknown`: texts on values not yet precise enough, worst first.
     """
 
     words: str
     up: Vector = LEVEL
-    turn_deg: float = 0.0  # Turn on its spot, clockwise from above
+    turn_deg: float = 0.0  # Turn at one place, clockwise from above
     unknown: tuple[str, ...] = ()
 
 
 class HeldPose(NamedTuple):
-    """Attitude of the aircraft in one stand: `up` (3,) in its axes.
+    """Attitude of the aircraft in one pose. `up` (3,): unit vector pointing up, in the aircraft's axes.
 
-    The heading counts from the compass' own north, else from the first stand; not wrapped if the gyros counted it.
-    `counted`: the sigma is that of the turn since the last stand.
+    `counted`: the gyros counted the turn, and `heading_sigma_deg` is the sigma of the turn since the pose before.
     """
 
     up: Array
     heading_deg: float = 0.0
-    """Heading from the compass' own north, else from the first stand; not wrapped if the gyros counted it."""
+    """Heading from the compass' own north, or, without a compass, from the first pose; not wrapped if `counted`."""
     heading_sigma_deg: float = 0.0
     counted: bool = False
 
@@ -109,7 +106,7 @@ def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> floa
 
 
 def objection(request: AlignmentRequest, poses: Sequence[HeldPose], now: HeldPose) -> str | None:
-    """Explain why this is not the requested pose, and what to do; None if it is."""
+    """Explain why pose `now` is not the requested one, and what to do; None if it is the requested one."""
     if not poses:
         askew_deg = _apart_deg(now.up, np.array(LEVEL))
         return f"tilted by {askew_deg:.0f} degrees: stand it on its base" if askew_deg > MOST_ASKEW_DEG else None
@@ -160,7 +157,7 @@ def _apart_deg(one: Array, other: Array) -> float:
 
 
 def _azimuth(level: Array, up: Array) -> float:
-    """Return the direction of the lean, degrees from the nose, right positive; `level` is up on the base."""
+    """Return the direction of the aircraft's lean, degrees from the nose, right positive; `level` is up on its base."""
     lean = up - level
     return math.degrees(math.atan2(-lean[1], -lean[0]))
 
@@ -171,10 +168,10 @@ def _side(level: Array, up: Array) -> str:
 
 
 def leaned_deg(forces_m_s2: Array) -> float:
-    """Return the largest angle of up between the thirds of a stand; 0 if it may be noise.
+    """Return the largest angle between the directions of up in the three thirds of a pose; 0 if it may be noise.
 
     Args:
-        forces_m_s2: (seconds, 3), means of an accelerometer.
+        forces_m_s2: (seconds, 3), mean specific force of each second.
     """
     if len(forces_m_s2) < LEAST_SECONDS:
         return 0.0

@@ -1,1 +1,1 @@
-"""Rolling collector: input streams, wait conditions, and the decision that a window is enough."""
+"""Rolling collector: input streams of the sensors, reasons to wait, and the decision that a window is long enough."""

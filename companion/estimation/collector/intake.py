@@ -1,9 +1,10 @@
-"""Input streams of the collector, each with its seconds, gate and verdict; and the types of the collector's state.
+"""Input streams of the collector with their gates and verdicts, and the types of the collector's state.
 
-The readings of a gradienter, or of a compass that averages, go on changing after the aircraft has stopped: they follow
-the truth with a time constant. A field gradienter's fluid keeps a tenth of its error after every second (BEI INC
-manual; sensors 2.2 and 2.7). The gate sees only the steep beginning of that. After a second that was not still by the
-IMUs, a pose sensor's seconds count again once its largest error is a tenth of its sigma; the IMUs' count meanwhile.
+The readings of a gradienter, or of a compass that averages, continue to change after the aircraft has stopped. They
+approach the true value with a time constant: in a field gradienter's fluid, the error falls to a tenth in each second
+(BEI INC manual; sensors.md sections 2.2 and 2.7). The gate detects only the steep beginning. After a movement that the
+IMUs detected, the seconds of gradienter and compass count again once the largest possible error is a tenth of sigma.
+The seconds of the IMUs count at once.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _WITHIN_S: Final = 600
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """Lengths and targets of a calibration; `math.inf`: no target."""
+    """Durations and target sigmas of a calibration; `math.inf`: no target."""
 
     min_still_s: float
     max_s: float
@@ -62,19 +63,18 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CollectorObstacle(msgspec.Struct, frozen=True):
-    """Reason why nothing can be measured now: a movement, which the operator can end, or a fault."""
+    """Reason why no measurement is possible now: a movement or a fault."""
 
     words: str
     moving: bool = False  # True for a movement, which the operator can end; False for a fault
     hold_still_s: int | None = None
-    """Remaining seconds to hold still, if nothing else is missing."""
+    """Further seconds for which the aircraft must be held still, if nothing else blocks the measurement; else None."""
 
 
 class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one source; `words` give the reason why it is not still.
+    """State of one sensor's stream; `words`: the reason why the sensor is not still.
 
-    `rate_hz` is the number of samples in its last whole second; `lost` counts missing samples, by the device's counter
-    or clock.
+    `rate_hz`: samples in the last whole second. `lost`: number of missing samples, by the device's counter or clock.
     """
 
     kind: Kind
@@ -87,12 +87,12 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of the collector; `glance` leaves out the fields that need an estimate.
+    """State of the collector; `RollingCollector.glance` leaves out the fields that need an estimate.
 
-    `still_s`: good seconds, common to all sources, of the current stretch; `steady_s`: good seconds in a row until now.
-    A window is possible after `hold_still_s` more. `enough`: more seconds would not improve the result; `progress`
-    (0..1) towards that. `measuring`: text on a measurement in progress; `left`: its part on the remaining time, if that
-    is minutes.
+    `still_s`: number of good seconds, common to all sensors, in the current still stretch. `steady_s`: number of good
+    seconds in a row until now. `hold_still_s`: seconds until a window is possible. `enough`: more seconds would not
+    improve the result. `progress`: 0 to 1, from the start to `enough`. `measuring`: text on the measurement.
+    `left`: text on the remaining time; on a deck only.
     """
 
     still_s: float
@@ -100,7 +100,7 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
     good_now: bool  # True if the latest second counts
     hold_still_s: int = 0
     obstacle: CollectorObstacle | None = None
-    """Current movement, or a silent or stuck source; with an estimate, also the reason why it waits."""
+    """Present movement, or a silent or stuck sensor; in `RollingCollector.status`, also any other reason to wait."""
     enough: bool = False
     progress: float = 0.0
     sources: tuple[SourceStatus, ...] = ()
@@ -117,16 +117,16 @@ class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def moves(self) -> str | None:
-        """Text on a movement at this moment; None if nothing moves."""
+        """Description of the present movement; None if nothing moves."""
         found = self.obstacle
         return found.words if found is not None and found.moving and found.hold_still_s is None else None
 
 
 class Thermometer:
-    """Checks an IMU's thermometer, second by second.
+    """Plausibility check of an IMU's thermometer, second by second.
 
-    A thermometer in a wrong unit, or with jumps, is ignored: the IMU then counts as having none. A constant reading is
-    no fault: a board reaches a steady temperature, and a heater keeps its IMU warm.
+    A thermometer with a wrong unit, or with jumps, is ignored, and the IMU counts as having none. A constant reading is
+    not a fault: a board reaches a steady temperature, and a heater keeps its IMU warm.
     """
 
     def __init__(self) -> None:
@@ -135,7 +135,7 @@ class Thermometer:
     def _begin(self, slot: float) -> None:
         self.none = False  # True for an IMU whose messages carry no temperature
         self.wrong = ""
-        """Reason in one line why it is ignored; empty: it is used, or there is none."""
+        """Reason, in one line, why the thermometer is ignored; empty if it is used or does not exist."""
         self._slot = slot  # Second of the latest reading, or the first second
         self._degc: float | None = None
         self._jumps: deque[float] = deque(maxlen=_JUMPS)
@@ -160,9 +160,10 @@ class Thermometer:
 
 
 class Settling:
-    """Detects the seconds in which a pose sensor still settles after a movement.
+    """Detects the seconds in which a gradienter or compass still settles after a movement.
 
-    The sensor follows the truth with the time constant `lag_s`, 0 for none. It has settled to a tenth of `sigma_deg`.
+    Its readings approach the true value with the time constant `lag_s` (0: at once). It has settled when the error is
+    a tenth of `sigma_deg`.
     """
 
     def __init__(self, lag_s: float, sigma_deg: float) -> None:
@@ -172,7 +173,7 @@ class Settling:
         self._moved: int | None = None  # Last second in which the aircraft moved
 
     def judge(self, slot: int, *, moved: bool) -> bool:
-        """Return whether a second counts; seconds must ascend. `moved`: the IMUs were not still."""
+        """Return true if the sensor has settled in this second; seconds must ascend. `moved`: IMUs detected motion."""
         if moved:
             self._moved = slot
         self.left_s = 0 if self._moved is None else max(self._moved + 1 + self._tail_s - slot, 0)
@@ -180,7 +181,7 @@ class Settling:
 
 
 class Source:
-    """Input stream with its batches, gate and last verdict."""
+    """Input stream of one sensor, with its one-second batches, its gate on motion, and the gate's last verdict."""
 
     carry = 0  # Seconds for which the last reading stays valid
 
@@ -198,9 +199,9 @@ class Source:
         return next(reversed(self.batches.batches.values()), None)
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
-        """Return True if this source did not move during one second; `moved`: the IMUs saw a movement in it.
+        """Return true if this sensor was still during one second; `moved`: the IMUs detected a movement in it.
 
-        `may_move`: a movement is allowed, and only a fault of the source counts.
+        `may_move`: movements are allowed, and only a fault of the sensor makes the result false.
         """
         batches = self.batches.batches
         batch = next((batches[at] for at in range(slot, slot - self.carry - 1, -1) if at in batches), None)
@@ -214,7 +215,7 @@ class Source:
         return self.verdict.still
 
     def accept(self, slot: int) -> None:
-        """Update the gate with a second in which every source was still."""
+        """Add a second to the gate's reference readings; every sensor was still in that second."""
         if (batch := self.batches.batches.get(slot)) is not None:
             self.gate.accept(batch)
 
@@ -244,7 +245,7 @@ class Source:
 
 
 class ImuSource(Source):
-    """Input stream of one IMU, with its thermometer, raw means and turn counter."""
+    """Input stream of one IMU, with a turn counter, and with means in floats if the stream has integers only."""
 
     gate: ImuGate
 
@@ -252,13 +253,13 @@ class ImuSource(Source):
         super().__init__("imu", imu.name, BatchSource(LIMITS_IMU, keep, steps=imu.steps), _gate(imu))
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
-        """Means in floats that arrive beside a stream of integers."""
+        """One-second batches of means in floats, which arrive beside a stream of integers."""
         self._raw_count = 0
-        self.counter: TurnCounter | None = None  # Set while turns on a spot are counted
+        self.counter: TurnCounter | None = None  # Set while the turns of an alignment are counted
         self._breaks = 0
         self._restarted_s = -math.inf
         self._up: tuple[float, float] | None = None
-        """Host time and the time since power-up then, if the device reports it."""
+        """Host time of a sample, and the time since power-up in that sample, s; None if the device reports none."""
 
     def replace(self, imu: ImuInput) -> None:
         self.imu, self.gate, self.batches.steps = imu, _gate(imu), imu.steps
@@ -292,7 +293,7 @@ class ImuSource(Source):
 
     @property
     def begun_s(self) -> float | None:
-        """Time of power-up by the device's clock, else of the first sample; None before it."""
+        """Host time of power-up by the device's clock, else of the first sample, s; None before the first sample."""
         if self.batches.begun is None:
             return None
         if self._up is not None:
@@ -304,7 +305,7 @@ class ImuSource(Source):
         return None if self._up is None else self._up[1]
 
     def forces_m_s2(self, start_s: float, end_s: float) -> list[Array]:
-        """Return the mean specific force of each second between two times, (3,) in the IMU's own axes."""
+        """Return the mean specific force (3,) of each second between two times, in the IMU's own axes."""
         batches = self.batches.batches
         return [batches[slot].mean[3:] for slot in sorted(batches) if start_s <= slot < end_s]
 
@@ -321,7 +322,7 @@ def _gate(imu: ImuInput) -> ImuGate:
 class PoseSource(Source):
     """Input stream of a gradienter (two channels) or of a compass (heading), in degrees."""
 
-    carry = 2  # a slow gradienter or compass
+    carry = 2  # Allows for a slow gradienter or compass
 
     def __init__(self, model: GradienterModel | CompassModel | None, kind: PoseKind, keep: int) -> None:
         circle = kind == "compass"
@@ -329,7 +330,7 @@ class PoseSource(Source):
         super().__init__(kind, kind, batches, PoseGate(kind))
         self._settling = Settling(0.0, 1.0) if model is None else Settling(model.lag_s, model.sigma_deg)
         self._unsettled: deque[int] = deque(maxlen=keep)
-        """Seconds in which it still settled; they count for other sources, but not for its own mean."""
+        """Seconds in which this sensor still settled; they count for other sensors, but not for its own mean."""
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
         if not self._settling.judge(slot, moved=moved):
@@ -345,7 +346,7 @@ class PoseSource(Source):
         return [batches[slot] for slot in slots if slot in batches and slot not in unsettled]
 
     def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
-        """Describe the wait until its mean over these and the next `left_s` seconds has settled; None: no wait."""
+        """Describe the wait for enough settled seconds among `slots` and the next `left_s` seconds; None: no wait."""
         unsettled = sum(slot in self._unsettled for slot in slots)
         needed -= len(slots) - unsettled
         wait_s = self._settling.left_s + needed

@@ -1,10 +1,10 @@
-"""Seconds of a window and the newest estimates of them: the interface, and its version for the ground.
+"""Interface that chooses the seconds of a window and caches its estimate, and the implementation for the ground.
 
-A stretch begins with `min_still_s` good seconds in a row. From then on, up to 20 % of a window's seconds may be
-rejected (a gust, a knock): the mean is robust. More than three in a row end it: the aircraft was moved.
+A still stretch begins with `min_still_s` good seconds in a row. After that, up to 20 % of its seconds may be rejected
+(a gust, a knock), because the mean is robust. More than three rejected seconds in a row show that the aircraft was
+moved, and end the stretch.
 
-Choosing the seconds of a window costs far less than the estimate. Estimates are cached; `Work` computes a new one in
-another thread.
+Choosing the seconds takes far less time than the estimate, so `Work` computes an estimate in another thread.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Floats
 
 MIN_BATCHES: Final = 5
-"""Least seconds of a window requested with `since_s`: fewer do not show their own scatter."""
+"""Least number of seconds in a window that begins after `since_s`; fewer do not show their own scatter."""
 MAX_REJECTED: Final = 0.20
 MAX_REJECTED_RUN: Final = 3
 _NO_ROOM: Final = 1e-300
 
 
 class Work(NamedTuple):
-    """Estimate to compute over ascending `slots`, none before `since_s` if that is given.
+    """Computation of an estimate over the seconds `slots`, ascending; all of them begin after `since_s`, if given.
 
-    `run` returns the estimate, or a refusal with the reason; another thread may call it.
+    `run` returns the estimate, or a `CalibrationRefusedError` with the reason; another thread may call it.
     """
 
     slots: Sequence[int]
@@ -46,10 +46,10 @@ class Work(NamedTuple):
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """Input of a window; immutable.
+    """Readings of one window, and the function that estimates from them; immutable.
 
-    `slots`: good seconds, ascending, at least one. `tilt` and `heading`: seconds that count of gradienter and compass,
-    None without the sensor. `begun_s`: time of power-up by IMU, if known. `estimate` returns the estimates of the IMUs,
+    `slots`: good seconds, ascending, at least one. `tilt`, `heading`: settled seconds of gradienter and compass; None
+    without the sensor. `begun_s`: time of power-up of each IMU, if known. `estimate` returns the estimates of the IMUs,
     or the whole window, or a `CalibrationRefusedError`.
     """
 
@@ -65,10 +65,10 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     turn: Turn = Turn()
 
     def window(self) -> Window:
-        """Compute the window; takes milliseconds.
+        """Compute the window, which takes milliseconds.
 
         Raises:
-            CalibrationRefusedError: a source fails its checks.
+            CalibrationRefusedError: a sensor fails its checks.
         """
         estimates = self.estimate()
         if isinstance(estimates, CalibrationRefusedError):
@@ -95,10 +95,10 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WindowSource(ABC):
-    """Chooses the seconds that count, and caches the newest estimates: of all of them, and of one other window."""
+    """Chooses the seconds of a window; caches the newest estimate, and that of one window beginning after `since_s`."""
 
     may_move = False
-    """True: a second is rejected for faults of a source only, not for a movement."""
+    """True if movements are allowed: a second is then rejected only for a fault of a sensor."""
 
     def __init__(self) -> None:
         self._kept: dict[float | None, tuple[int, Any]] = {}
@@ -106,10 +106,10 @@ class WindowSource(ABC):
 
     @abstractmethod
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
-        """Add an IMU with its seconds and those of its raw means, or restart it when its stream changes."""
+        """Add an IMU with the batches of its stream and of its means in floats; restart it if its stream changes."""
 
     def set_pose(self, kind: str, batches: BatchSource) -> None:  # noqa: B027 - not every source of windows needs it
-        """Add the seconds of a pose sensor."""
+        """Add the one-second batches of a gradienter or compass."""
 
     def forget(self, imu: str | None) -> None:
         self.clear()
@@ -119,19 +119,19 @@ class WindowSource(ABC):
 
     @abstractmethod
     def add(self, slot: int, *, good: bool) -> bool:
-        """Add a judged second; return False if the still stretch ended with it."""
+        """Add a second that the gates judged as `good` or not; return false if the still stretch ended with it."""
 
     @property
     @abstractmethod
     def stillness(self) -> CollectorStatus: ...
 
     def good_slots(self, since_s: float | None) -> list[int]:
-        """Return the good seconds; the check whether a pose sensor has settled uses them."""
+        """Return the good seconds after `since_s`, for the check that gradienter and compass have settled."""
         return []
 
     @abstractmethod
     def slots(self, since_s: float | None) -> Sequence[int]:
-        """Return the seconds of a window.
+        """Return the seconds of a window that begins after `since_s`; None: of the longest possible window.
 
         Raises:
             CalibrationRefusedError: too few seconds.
@@ -142,14 +142,14 @@ class WindowSource(ABC):
 
     @abstractmethod
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
-        """Return the progress of the newest estimate towards its targets; `waits`: an obstacle exists."""
+        """Return the progress of the newest estimate towards its targets; `waits`: something blocks the measurement."""
 
     def clear(self) -> None:
         self._kept.clear()
         self.generation += 1
 
     def known(self, last: int, since_s: float | None) -> Any:
-        """Return the cached estimate if its window ends with second `last` or later; None: not yet."""
+        """Return the cached estimate for `since_s` if its window ends with second `last` or later; else None."""
         kept = self._kept.get(since_s)
         return kept[1] if kept is not None and kept[0] >= last else None
 
@@ -161,7 +161,7 @@ class WindowSource(ABC):
         return None if self.known(slots[-1], since_s) is not None else self.work(slots, since_s)
 
     def accept(self, work: Work, found: Any) -> bool:
-        """Cache the result `found` of the work; return False if it comes too late."""
+        """Cache the result `found` of `work`; return false if it is too late, because a new stretch has begun."""
         if work.generation != self.generation:
             return False
         self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
@@ -169,12 +169,12 @@ class WindowSource(ABC):
         return True
 
     def measurement(self, since_s: float | None) -> Measurement:
-        """Return the input of a window, without the pose; raises as `slots`."""
+        """Return the readings of a window, without gradienter and compass; raises the errors of `slots`."""
         slots = self.slots(since_s)
         return Measurement(slots=slots, estimate=self.estimate_later(slots, since_s))
 
     def estimate_later(self, slots: Sequence[int], since_s: float | None, late: int = 0) -> Callable[[], Any]:
-        """Return a call that computes the estimate over `slots`, or gives a cached one that is at most `late` s old."""
+        """Return a function that computes the estimate over `slots`, or returns a cached one at most `late` s old."""
         found = self.known(slots[-1] - late, since_s)
         if found is not None:
             return lambda: found
@@ -189,7 +189,7 @@ class WindowSource(ABC):
 
 
 class Stretch:
-    """Counts good and rejected seconds, and finds the start of the still stretch."""
+    """Counts good and rejected seconds, and detects the start and the end of a still stretch."""
 
     def __init__(self, min_good: int, max_slots: int) -> None:
         self._min_good = min_good
@@ -205,7 +205,7 @@ class Stretch:
         self._steady = 0
 
     def add(self, slot: int, *, good: bool) -> bool:
-        """Add the next second; return False if the stretch ends with it."""
+        """Add the next second; return false if the still stretch ends with it."""
         self._steady = self._steady + 1 if good else 0
         self.flags.append(good)
         if good:
@@ -235,7 +235,7 @@ class Stretch:
 
 
 class GroundWindows(WindowSource):
-    """The still stretch of an aircraft on the ground."""
+    """Windows of an aircraft on the ground: good seconds of the current still stretch."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
@@ -268,7 +268,7 @@ class GroundWindows(WindowSource):
         )
 
     def good_slots(self, since_s: float | None) -> list[int]:
-        """Return the good seconds of the current stretch that lie wholly after `since_s`."""
+        """Return the good seconds of the current still stretch that begin after `since_s`; None: all of them."""
         first = -math.inf if since_s is None else since_s
         flags = self._stretch.flags
         return [slot for slot, good in enumerate(flags, self._next - len(flags)) if good and slot >= first]
@@ -304,7 +304,7 @@ class GroundWindows(WindowSource):
         return Work(slots, since_s, self.generation, run)
 
     def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
-        """Return the progress of the stretch, from an estimate that may be a second old."""
+        """Return the progress of the still stretch towards the targets, from an estimate that may be a second old."""
         stretch = self._stretch
         share = 0.0 if stretch.start is None else stretch.good / self._max_slots
         status = msgspec.structs.replace(self.stillness, progress=share, measuring=f"still for {stretch.good} s")
@@ -319,19 +319,19 @@ class GroundWindows(WindowSource):
 
 
 def is_enough(settings: Settings, found: Sequence[Estimate]) -> bool:
-    """Return whether every axis meets its target, or its white part is below 30 % of the rest (method 3.2)."""
+    """Return true if each axis meets its target or has white noise below 30 % of the rest (method.md section 3.2)."""
     return all(bool((each.white_variance <= _room(settings, each)).all()) for each in found)
 
 
 def expected_s(settings: Settings, found: Sequence[Estimate]) -> int:
-    """Predict the number of good seconds that is enough, if the noise stays as seen so far."""
+    """Predict the number of good seconds that is enough, if the noise does not change."""
     needed = [np.square(each.white) / np.maximum(_room(settings, each), _NO_ROOM) for each in found]
     longest = max((float(each.max()) for each in needed), default=0.0)
     return min(max(math.ceil(min(longest, settings.max_s)), settings.min_slots), settings.max_slots)
 
 
 def _room(settings: Settings, own: Estimate) -> Floats:
-    """Return the allowed white variance of each axis; negative for integers that need more seconds."""
+    """Return the white-noise variance (6,) that the target allows; negative for integers that need more seconds."""
     target = np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
     stays = own.use_variance - own.white_variance
     room = np.maximum(np.square(target) - stays, WHITE_SHARE * stays)

@@ -1,7 +1,7 @@
-"""Rolling collector: combines all streams into one window.
+"""Rolling collector: combines the streams of all sensors into one window (method.md sections 2.4, 3.1 and 3.2).
 
-It has no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
-if every source was still in it. Method 2.4, 3.1 and 3.2.
+The collector has no clock: the time comes with the samples and with `now_s`. All sensors share one grid of 1 s. A
+second counts if every sensor was still in it.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from companion.estimation.turning.watch import TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 _GRACE_S: Final = 1.0
-"""Time to wait after the end of a second for a silent source: the latency of a busy telemetry link."""
+"""Time to wait for a silent sensor after the end of a second: latency of a busy telemetry link."""
 _CLOSE_S: Final = 0.25
 _MARGIN: Final = 8
 
 
 class RollingCollector:
-    """Collects batches of all sources, judges stillness, and gives means of the seconds that count.
+    """Collects one-second batches of all sensors, judges stillness, and computes the means of a window.
 
-    No sample value raises an exception; dropped samples are counted by reason. Memory is bounded to `max_s` one-second
-    batches per source, plus a margin. A model of None: no such sensor. `windows` chooses the seconds that count; None:
-    those of the still stretch.
+    No sample value raises an exception; dropped samples are counted by reason. Memory is bounded to `max_s` batches per
+    sensor, plus a margin. `gradienter` or `compass` None: the sensor is missing. `windows` chooses the seconds of a
+    window; None: those of the still stretch.
 
     Raises:
-        ValueError: two IMUs of one name.
+        ValueError: two IMUs have one name.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class RollingCollector:
         self._now_s = -math.inf
         self._restarts = 0
         self.on_second: list[Callable[[], object]] = []
-        """Callbacks after each second closed by all sources; called while samples are added, so they must be quick."""
+        """Callbacks after each second that all sensors completed. They delay new samples, so they must be quick."""
         for imu in imus:
             self.set_imu(imu)
 
@@ -91,9 +91,9 @@ class RollingCollector:
             self._evaluate()
 
     def add_raw(self, name: str, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
-        """Add a mean in floats (gyro in rad/s, accelerometer in m/s^2) of an IMU whose stream is integers.
+        """Add a mean in floats (gyro in rad/s, accelerometer in m/s^2) of an IMU whose stream has integers only.
 
-        Stillness is judged by the stream alone. A window uses these means if they determine the gyros better.
+        The gates judge stillness by the stream. A window uses these means if they determine the gyro biases better.
         """
         if name in self.imus:
             self.imus[name].add_raw(t_s, row, temperature_degc)
@@ -106,14 +106,14 @@ class RollingCollector:
             self._evaluate()
 
     def add_compass(self, sample: CompassSample) -> bool:
-        """Add a heading that the device computed; return whether it is used (else the one from its field)."""
+        """Add a heading that the device computed; return false if the heading from its field is used instead."""
         counts = self._field is None or self._field.takes_own(sample)
         if counts:
             self._add_heading(sample)
         return counts
 
     def add_field(self, sample: MagSample) -> CompassSample | None:
-        """Add the compass' field; return the heading computed from it if that one is used."""
+        """Add a magnetic field of the compass; return the heading computed from the field, if that heading is used."""
         if self._heading is None or self._field is None:
             return None
         heading = self._field.add(sample)
@@ -127,9 +127,9 @@ class RollingCollector:
             self._evaluate()
 
     def tick(self, now_s: float) -> None:
-        """Close the seconds that ended before `now_s` (the samples' clock), also for silent sources.
+        """Close the seconds that ended before `now_s` (on the samples' clock), also those of silent sensors.
 
-        The caller does this a few times a second.
+        The caller must do this a few times a second.
         """
         if math.isfinite(now_s):
             self._now_s = now_s
@@ -141,10 +141,10 @@ class RollingCollector:
                 self._field.batches.close_before(now_s - _CLOSE_S)
         self._evaluate()
 
-    # --- what changes
+    # --- changes of sensors and targets
 
     def set_imu(self, imu: ImuInput) -> None:
-        """Add an IMU, or replace it when its stream changes kind; all learned data of it is dropped."""
+        """Add an IMU, or replace it when its stream changes its kind, and drop all data learned about it."""
         name, known = imu.name, self.imus.get(imu.name)
         self._turns.set_imu(name, imu.rotation, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         if known is None:
@@ -159,7 +159,7 @@ class RollingCollector:
             self.reset("another stream", name)
 
     def expect(self, *, gradienter: bool, compass: bool) -> None:
-        """Choose the pose sensors to wait for, for example after one failed; keep the IMUs' history."""
+        """Choose whether to wait for gradienter and compass, for example after one failed; keep the IMUs' history."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)
         if gradienter != (self._tilt is not None):
             self._tilt = self._pose_source("gradienter") if gradienter else None
@@ -182,9 +182,9 @@ class RollingCollector:
         )
 
     def reset(self, why: str, imu: str | None = None) -> None:
-        """Drop the readings of one IMU, or all: after arming, a write of offsets, or a restart.
+        """Drop the readings of one IMU, or of all sensors: after arming, a write of offsets, or a restart.
 
-        The current second is dropped too. The stretch begins again; learned noise stays.
+        The current second is dropped, too. The still stretch begins again. The learned noise is not dropped.
         """
         self._windows.forget(imu)
         for source in self._sources():
@@ -197,7 +197,7 @@ class RollingCollector:
         for source in self.imus.values():
             source.counter = TurnCounter() if wanted else None
 
-    # --- what is known
+    # --- state and results
 
     @property
     def begun_s(self) -> dict[str, float]:
@@ -225,14 +225,14 @@ class RollingCollector:
         return msgspec.structs.replace(self._windows.stillness, obstacle=self._obstacle(now_s))
 
     def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
-        """Return the estimate that `window` would compute now, for another thread; None if it has none to compute."""
+        """Return the computation that `window` needs now, for another thread; None if none is needed or possible."""
         return None if self._obstacle(now_s) is not None else self._windows.pending(since_s)
 
     def accept(self, work: Work, found: Any) -> None:
         self._windows.accept(work, found)
 
     def status(self, now_s: float) -> CollectorStatus:
-        """Return the state; its figures may be one second old."""
+        """Return the collector's state; its numbers may be one second old."""
         waits = self._waiting_for(now_s)
         found = self._windows.status(self._settings, waits=waits is not None)
         obstacle = waits or found.obstacle
@@ -246,18 +246,18 @@ class RollingCollector:
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
-        """Return means over the seconds that count up to the latest complete one, at most `max_s` long.
+        """Return the means over the good seconds up to the latest complete one, at most `max_s` seconds.
 
-        With `since_s` (to verify a write), only seconds that lie wholly after it count, and 5 good ones are enough;
-        `duration_s` is their number.
+        With `since_s` (to verify a write), only seconds that begin after it count, and 5 good seconds are enough.
+        `duration_s` of an IMU is the number of seconds in its means.
 
         Raises:
-            CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
+            CalibrationRefusedError: not still, not still for long enough, or a sensor fails its checks.
         """
         return self.measurement(now_s, since_s=since_s).window()
 
     def measurement(self, now_s: float, *, since_s: float | None = None) -> Measurement:
-        """Return the input of `window` before the estimate, at a fraction of its cost.
+        """Return the readings of `window` without the estimate, at a fraction of the cost.
 
         Raises:
             CalibrationRefusedError: not still, or not still for long enough.
@@ -294,7 +294,7 @@ class RollingCollector:
             source.gate.new_stretch()
 
     def _evaluate(self) -> None:
-        """Judge every second that all sources have closed, or whose wait for missing sources is over."""
+        """Judge every second that all sensors have completed, or for which the wait for silent sensors is over."""
         sources = self._sources()
         restarts = sum(source.batches.restarts for source in sources)
         if restarts > self._restarts:
@@ -341,7 +341,7 @@ class RollingCollector:
                 source.accept(slot)
 
     def _watch_turn(self, slot: int, *, good: bool) -> bool:
-        """Check a judged second for a turn; return False if the still stretch ends with it."""
+        """Check a judged second for a turn of the ground; return false if the still stretch ends with it."""
         others = self._others()
         if self._windows.may_move or any(verdict.fault for verdict in others):
             return True

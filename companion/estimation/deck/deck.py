@@ -1,6 +1,6 @@
-"""Source of windows for an aircraft on a deck, which sways and turns (`collector.measurement` has that for the ground).
+"""Choice of windows for an aircraft on a deck that sways and turns; `collector.measurement` does that for the ground.
 
-The seconds of an IMU must follow one another without a gap: during a gap, the gyro turns by an unknown angle.
+The seconds of an IMU must follow one another without a gap, because the aircraft turns by an unknown angle in a gap.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS
 
 EVERY_S: Final = {180: 10, 600: 30, MAX_S: 60}
-"""Interval between ends of windows, by the largest window length, s: long estimates cost more and change less."""
+"""Interval between two window ends, s, by maximum window length, s: long windows cost more time and change less."""
 KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
-"""Seconds kept: enough for the longest window until the next one replaces it."""
+"""Number of seconds to store: enough for the longest window until the next window replaces it."""
 LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
-_KEPT_SHOWN: Final = 4  # Seconds kept to wait for the gradienter's readings
+_KEPT_SHOWN: Final = 4  # Seconds stored until the gradienter's readings arrive
 _FALLS: Final = 2.5
-"""Assumed exponent of the white part's decay with window length, to predict the length that is enough.
+"""Assumed exponent: white-noise variance falls with window length to this power. It predicts a sufficient length.
 
 A compromise: 3 for a slope through waves, 1 for a sensor's white noise.
 """
@@ -51,7 +51,7 @@ _IN_MINUTES_S: Final = 90.0
 
 
 class Stream:
-    """Seconds of one IMU without a gap, compared with the gradienter."""
+    """Consecutive seconds of one IMU, without a gap, and their comparison with the gradienter."""
 
     def __init__(self, imu: ImuInput, gradienter: GradienterModel | None) -> None:
         self.imu, self._gradienter = imu, gradienter
@@ -68,7 +68,7 @@ class Stream:
         self._settled_s = math.inf
 
     def add(self, batch: Batch, times: Floats, rows: Floats) -> bool:
-        """Add one second of samples (n, 6): rates, forces, in the sensor's axes; return False after a gap."""
+        """Add one second of samples (n, 6), rates and specific forces, sensor's axes; return false after a gap."""
         own = np.column_stack([times, self._in_vehicle(rows)])
         last = self._last
         gap_s = max(float(np.diff(times).max(initial=0.0)), 0.0 if last is None else float(own[0, 0] - last[0]))
@@ -106,7 +106,7 @@ class Stream:
 
 
 class Deck(WindowSource):
-    """Collects the input of `DeckWindow`. Pure: time comes in with the samples."""
+    """Collects the readings of a `DeckWindow` and chooses its seconds. It has no clock: time comes with the samples."""
 
     may_move = True
 
@@ -119,7 +119,7 @@ class Deck(WindowSource):
         self._headings: dict[int, float] = {}
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
         self._reference_deg: tuple[float, float] | None = None
-        """Tilt of the last accelerometer means, to which those after a write are converted for comparison."""
+        """Tilt, deg, of the last accelerometer means; means after a write are converted to this tilt for comparison."""
         self._is_good = True
 
     def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
@@ -147,7 +147,7 @@ class Deck(WindowSource):
         return True
 
     def take_imu(self, name: str, batch: Batch, times: Floats, rows: Floats) -> None:
-        """Add the samples (n, 6) of one second of an IMU, in its own axes."""
+        """Add one second of samples (n, 6) of an IMU, in the IMU's own axes."""
         stream = self._streams[name]
         if not stream.add(batch, times, rows):
             self.clear()
@@ -155,14 +155,14 @@ class Deck(WindowSource):
             stream.compare(batch.slot, *self._tilts[batch.slot])
 
     def take_tilt(self, batch: Batch, times: Floats, rows: Floats) -> None:
-        """Add the readings (n, 2) of one second of the gradienter."""
+        """Add one second of gradienter readings (n, 2), degrees."""
         self._tilts[batch.slot] = times, rows
         _trim(self._tilts, _KEPT_SHOWN)
         for stream in self._streams.values():
             stream.compare(batch.slot, times, rows)
 
     def take_heading(self, batch: Batch, times: Floats, rows: Floats) -> None:
-        """Add the headings (n, 1) of one second, degrees."""
+        """Add one second of compass headings (n, 1), degrees."""
         self._headings[batch.slot] = float(batch.mean[0]) * DEG
         _trim(self._headings, KEPT_S)
 
@@ -176,7 +176,7 @@ class Deck(WindowSource):
         return CollectorStatus(still_s=seconds, steady_s=seconds, good_now=self._is_good)
 
     def common(self, since_s: float | None = None) -> range:
-        """Return the seconds common to all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
+        """Return the seconds that all IMUs have after `since_s`, up to the latest window end allowed by `EVERY_S`."""
         ends = [(one.seconds[0][0].slot, one.seconds[-1][0].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)
@@ -253,9 +253,9 @@ class Deck(WindowSource):
 
 
 def aim(span_s: float, known: TriadVariances, target: float) -> tuple[float, float, float]:
-    """Return sigma, goal and the predicted length of the window that reaches the goal, s.
+    """Return the present sigma, the goal for sigma, and the predicted window length, s, that reaches the goal.
 
-    The goal is the target, or the best that more time can reach. `known` is from a window of `span_s` seconds.
+    The goal is the target, or the smallest sigma that more time can reach. `known`: variances from `span_s` seconds.
     """
     use, white = known
     floor = use - white

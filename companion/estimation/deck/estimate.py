@@ -1,6 +1,6 @@
-"""Estimate of a window on a deck, as the `Window` type of the ground, so that later steps need no distinction.
+"""Estimate of a window on a deck, in the same type `Window` as on the ground, so that later steps need no distinction.
 
-The means of an IMU are converted to rest: at the gradienter's mean tilt, under the Earth's rate alone.
+The means of an IMU are converted to those of an IMU at rest: at the gradienter's mean tilt, with the Earth's rate only.
 """
 
 from __future__ import annotations
@@ -26,43 +26,43 @@ from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
 
 MIN_S: Final = 60
-"""Length of some waves: a shorter window is never enough."""
+"""Shortest window on a deck, s. Some waves last as long, so a shorter window is never enough."""
 MIN_LOOK_S: Final = 40
-"""Shortest window to verify a write; its sigma reflects the short time."""
+"""Shortest window to verify a write, s; the larger sigma of the short time is part of the result."""
 MAX_S: Final = 1200
 SCALE_SIGMA: Final = 0.003
-"""Scale and cross-axis errors of common gyros (at most 0.5 %): this share of a steady turn looks like a bias."""
+"""Sigma of scale and cross-axis errors of common gyros (at most 0.5 %): this share of a turn looks like a bias."""
 COMPASS_SHARE: Final = math.sqrt(0.5)
 """Share of a compass' sigma that changes with the heading; the rest is the same on all headings."""
 FROZEN_S: Final = 20
-"""Time after which a repeated reading of a swaying sensor is a fault."""
+"""Time, s, for which a sensor must repeat one reading, while the aircraft sways, to count as faulty."""
 _SWAYS_RAD_S: Final = 0.3 * DEG  # Least scatter of the rates of roll and pitch in that time
 _SAME: Final = 1e-9
 _SPREAD: Final = 1.5
-"""Standard deviation, in steps, beyond which swaying spreads integers enough to hide no bias."""
+"""Standard deviation of readings, in steps, from which swaying averages out their rounding to integers."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
-"""Smallest sigma of the accelerometers, from comparing them with the gradienter; `solve` adds that of its zero."""
-_MIDDLE: Final = 0.37  # Share of K^2 T
+"""Least prior sigma of an accelerometer bias after comparison with the gradienter; `solve` adds that of its zero."""
+_MIDDLE: Final = 0.37  # Share of K^2 T that a slope through the window misses
 _FLICKER_TO_COME: Final = 0.75
-"""Share of B^2 for the flicker of the next minutes, which its past does not predict. Added to the flicker within the
-window (a random walk of B / sqrt(T)), it makes the flicker's part of V(T, H)."""
+"""Share of the flicker variance B^2 for the next minutes, which past flicker does not predict. With the flicker within
+the window (a random walk of B / sqrt(T)), the sum is the flicker's part of V(T, H) (method.md section 2.2)."""
 _GRAVITY_M_S2: Final = 9.8
 
 
 TriadVariances = tuple[float, float]
-"""Largest variance among the axes of a triad, and its white part, which longer averaging reduces."""
+"""Largest variance among the axes of a triad, and the white-noise part of it, which longer averaging reduces."""
 
 
 DeckFound = tuple[Window, Sequence[TriadVariances]]
-"""A window, and the variances of gyros and accelerometers, IMU by IMU."""
+"""Estimate of a window on a deck: the window, and for each IMU the variances of gyros and of accelerometers."""
 ImuSecond = tuple[Batch, Passage]
-"""One second of one IMU; the batch is in the sensor's axes."""
+"""One second of one IMU: its batch, in the sensor's axes, and its integrated motion, in the vehicle's axes."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DeckWindow:
-    """Readings of a window on a deck, and its estimate."""
+    """Readings of one window on a deck; `run` estimates from them."""
 
     imus: Sequence[ImuInput]
     seconds: Sequence[Sequence[ImuSecond]]
@@ -73,10 +73,10 @@ class DeckWindow:
     compass: CompassModel | None
     horizon_s: float
     reference_deg: tuple[float, float] | None
-    """Tilt, in gradienter readings, to which accelerometer means are converted; None: the mean of the window."""
+    """Tilt, as gradienter readings, to which accelerometer means are converted; None: mean tilt of the window."""
 
     def run(self) -> DeckFound | CalibrationRefusedError:
-        """Compute the estimate: a third of a second for ten minutes of one IMU on a desktop."""
+        """Compute the estimate; ten minutes of one IMU take a third of a second on a desktop."""
         try:
             return self._run()
         except (CalibrationRefusedError, np.linalg.LinAlgError) as error:
@@ -118,7 +118,7 @@ class DeckWindow:
         """Return the seconds in which a sensor repeated one reading while the aircraft swayed.
 
         Raises:
-            CalibrationRefusedError: it still repeats that reading.
+            CalibrationRefusedError: the sensor still repeats that reading.
         """
         if not readings:
             return set()
@@ -229,7 +229,7 @@ class DeckWindow:
 
 
 def followed_walk(gyro: AllanModel, span_s: float) -> float:
-    """Return K of a random walk that wanders as much as the bias in a window of `span_s`, rad/s / sqrt(s)."""
+    """Return K, rad/s / sqrt(s), of a random walk that wanders as much as a gyro's bias does in `span_s` seconds."""
     return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
 
 
@@ -239,7 +239,7 @@ def _felt(
     reference: tuple[float, float] | None,
     compared: tuple[Array, Matrix] | None,
 ) -> tuple[Array, Matrix]:
-    """Return the accelerometers' mean (3,) at rest at the reference tilt, and its covariance (3, 3)."""
+    """Return the accelerometers' mean (3,) converted to rest at the reference tilt, and its covariance (3, 3)."""
     size = found.force_m_s2
     if gradienter is None or reference is None or compared is None:
         up = -found.body_to_ned[:, 2].mean(axis=0)
@@ -253,7 +253,7 @@ def _felt(
 
 
 def _hidden_steps(imu: ImuInput, batches: Sequence[Batch]) -> Array:
-    """Return the variance (6,) of quantisation that swaying does not spread, plus that of shared errors."""
+    """Return the variance (6,), vehicle axes, of rounding errors that swaying does not remove, and of shared errors."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
     means = np.array([batch.mean for batch in batches])
     spread = np.sqrt(means.var(axis=0) + np.mean([batch.variance for batch in batches], axis=0))

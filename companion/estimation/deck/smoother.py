@@ -1,14 +1,13 @@
-"""Smoother: gyro biases and the mean of "up" from minutes of a swaying, turning IMU.
+"""Smoother: gyro biases and the mean direction of up, from minutes of data of an IMU that sways and turns.
 
-The gyros, integrated from second to second, propagate the attitude. In the axes of the Earth, the mean specific force
-is gravity: the effect of waves averages out (`waves`), so a drifting level shows a bias of the horizontal gyros. The
-compass does the same for the vertical one. Near the true attitude everything is linear in the unknowns, so weighted
-least squares is iterated. For constant unknowns the result equals that of a Kalman smoother.
+The gyros, integrated from second to second, propagate the attitude. In the Earth's axes, the mean specific force is
+gravity, because the effect of waves averages out (`waves`). A drift of the level therefore shows a bias of the
+horizontal gyros; a drift against the compass shows a bias of the vertical gyro. Near the true attitude the readings are
+linear in the unknowns, so weighted least squares is iterated. For constant unknowns, a Kalman smoother gives the same.
 
-Unknowns: the attitude at the start (3), the gyro bias (3) and the error of the accelerometers' bias (3); the parts of
-the compass' error with the sine and cosine of the heading (2), which iron on the aircraft causes; and, if significant,
-a ramp of the gyro bias (3). The Earth's rotation is subtracted later, once the latitude is known; `by_earth` is its
-effect on the bias.
+Unknowns: the attitude at the start (3), the gyro bias (3), the error of the accelerometers' bias (3), and the compass
+errors with the sine and cosine of the heading (2), which iron on the aircraft causes. If significant, a ramp of the
+gyro bias (3) is added. The Earth's rotation is subtracted later, once the latitude is known; `by_earth` is its effect.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from companion.physics.frames import (
 )
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
-"""W cos L halfway between the equator and 65 degrees latitude: the remainder is small enough to be linear."""
+"""Assumed Earth's rate to the north, midway between latitudes 0 and 65 deg; the remainder has a linear effect."""
 RAMP_T: Final = 5.0
-"""Threshold in sigmas for a ramp, as at rest (`noise.lines`)."""
+"""Threshold, in sigmas, for a ramp of the gyro bias; equal to the threshold at rest (`noise.lines`)."""
 _ROUNDS: Final = 7
 _NEAR: Final = 0.1  # Convergence limit: change of the biases in the last round, in sigmas
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
@@ -45,7 +44,7 @@ _NO_RAMP: Final = 11
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Believed:
-    """Prior sigmas and noise of the worst axis: N in SI * sqrt(s), K in rad/s / sqrt(s)."""
+    """Prior values for the smoother, and the noise of the noisiest axis: white noise N and random walk K."""
 
     accel_m_s2: Array  # Accelerometer bias (3,), from the comparison with the gradienter
     accel_sigma_m_s2: float
@@ -53,7 +52,7 @@ class Believed:
     gyro_white: float  # N of the gyros, rad/s * sqrt(s): the largest of the axes
     gyro_walk: float  # K of a random walk that wanders as much as the bias in the window, rad/s / sqrt(s)
     gyro_slope: float
-    """One sigma of the slope that flicker and random walk of the bias cause without a ramp; rad/s^2."""
+    """One sigma of the slope, rad/s^2, that flicker and random walk of the gyro bias cause without a ramp."""
     compass_lag_s: float
     accel_white: float  # N of the accelerometers, m/s^2 * sqrt(s)
 
@@ -63,8 +62,8 @@ class Found:
     """Result of the smoother: means over the window and attitudes; rates (3,) in the body's axes (FRD).
 
     `gyro_rad_s`: bias at the end of the window, plus `by_earth` (3, 3) times the Earth's rate (NED). `body_to_ned`
-    (n + 1, 3, 3): attitudes at the knots, from the compass' north. `heading_sigma_rad`: at the end of the window, from
-    averaging alone.
+    (n + 1, 3, 3): attitudes at the n + 1 ends of the seconds, relative to the compass' north. `heading_sigma_rad`:
+    sigma of the heading at the end of the window, from averaging alone.
     """
 
     gyro_rad_s: Array
@@ -89,7 +88,7 @@ class _Stretch:
 
     @property
     def rate(self) -> Array:
-        """Mean gyro rate (3,), bias included; swaying averages out."""
+        """Mean gyro rate (3,) over the window, bias included; swaying averages out."""
         whole = self.turn.sum(axis=0)
         turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
         return np.asarray(turned / self.spans.sum())
@@ -100,7 +99,7 @@ class _Stretch:
         return np.asarray(earth @ running_products(np.concatenate([start[None], steps])))
 
     def forces(self, attitudes: Floats, gyro: Array, accel: Array) -> Floats:
-        """Return the mean specific force (n, 3) of every passage, NED."""
+        """Return the mean specific force (n, 3) of every second, in NED axes."""
         # Second-order effect of the bias on gravity: 0.6 mg at 3 deg/s.
         bent = np.cross(gyro, np.cross(gyro, self.velocity)) * np.square(self.spans[:, None]) / 6.0
         felt = self.velocity + self.by_bias @ gyro + bent - self.turned @ accel
@@ -108,9 +107,9 @@ class _Stretch:
 
 
 def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
-    """Estimate biases and attitudes from at least ten consecutive passages (seconds of data) without a gap.
+    """Estimate biases and attitudes from the integrated motion of at least ten consecutive seconds without a gap.
 
-    `headings_rad` (n,): compass heading in the middle of each passage, NaN if missing. `compass_forward` (3,): forward
+    `headings_rad` (n,): compass heading in the middle of each second, NaN if missing. `compass_forward` (3,): forward
     axis of the compass in the vehicle's axes.
     """
     stretch = _Stretch(passages)
@@ -152,9 +151,9 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
 
 
 def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Array:
-    """Return a coarse bias (3,), close enough to linearise: swaying averages out, and the compass gives the turn.
+    """Return a coarse gyro bias (3,), close enough to the true one to linearise.
 
-    A firmware's own calibration on a boat can leave a bias of several deg/s.
+    Swaying averages out, and the compass shows the turn. A firmware's calibration on a boat may leave several deg/s.
     """
     known = np.isfinite(headings_rad)
     if known.sum() < 2:
@@ -164,10 +163,10 @@ def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Arra
 
 
 class _System:
-    """Regressors (3, n, unknowns + 3) and readings (3, n) of three channels, rad.
+    """Linear equations of the smoother: regressors (3, n, unknowns + 3) and readings (3, n), rad, of n seconds.
 
-    The channels are the force to the north and to the east, over g, and the heading; the last three regressors are the
-    Earth's rate.
+    The three channels are the force to the north and to the east, over g, and the heading. The last three regressors
+    belong to the Earth's rate.
     """
 
     def __init__(
@@ -200,7 +199,7 @@ class _System:
     def solve(
         self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int
     ) -> tuple[Array, Matrix, Matrix]:
-        """Solve by least squares, weighted by `noise` (None: a guess); return values, covariance, effect of Earth."""
+        """Solve weighted least squares; return values, covariance, effect of Earth's rate. `noise` None: a guess."""
         wander = believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3
         level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
         # (3, n, unknowns + 4): the readings are the last column.
@@ -236,10 +235,10 @@ class _System:
 
 
 def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
-    """Return the mean of a vertical force with waves in it, and its sigma.
+    """Return the mean of the vertical specific force on waves, and its sigma.
 
-    The height of waves is a stationary series, their acceleration is not modelled as one: that would give it a power at
-    zero frequency that no sea has. The mean force is the curvature of a parabola fitted to the height.
+    The height of the waves is modelled as a stationary series. A stationary acceleration would have power at zero
+    frequency, which no sea has. The mean force is the curvature of a parabola fitted to the height.
     """
     step, ends = float(spans.mean()), np.cumsum(spans) - spans.sum()
     height = np.cumsum(np.cumsum(up * spans)) * step
@@ -251,12 +250,12 @@ def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
 
 
 class Passage(NamedTuple):
-    """One second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning.
+    """Integrated motion of an IMU over one second. The "start axes" are the body's axes (FRD) at its beginning.
 
-    `turn` (3, 3): from the body's axes at the end to those at the start, by the gyros. `turned` (3, 3): integral of
-    `turn` over time, in s; a bias b turns the start by -turned @ b. `velocity_m_s` (3,): integral of the specific force
-    in the axes of the start; `velocity_by_bias` (3, 3): its derivative by the gyro bias, m/s per rad/s. `white2`: N^2
-    of the gyros from second differences of neighbouring samples, mean of the axes.
+    `turn` (3, 3): rotation from the body's axes at the end to the start axes, by the gyros. `turned` (3, 3): integral
+    of `turn` over time, s; a gyro bias b rotates the start axes by -turned @ b. `velocity_m_s` (3,): integral of the
+    specific force in the start axes. `velocity_by_bias` (3, 3): derivative of that velocity by the gyro bias, m/s per
+    rad/s. `white2`: N^2 of the gyros, mean of the axes, from second differences of neighbouring samples.
     """
 
     span_s: float
@@ -268,7 +267,7 @@ class Passage(NamedTuple):
 
 
 def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
-    """Integrate n + 1 samples by trapezoids; the first sample is the last one of the previous passage.
+    """Integrate n + 1 samples of one second by trapezoids; the first sample is the last one of the second before.
 
     Times (n + 1,) ascend, n is at least 1; rates and forces are (n + 1, 3) in the body's axes. Rates are integrated as
     rotations, so that the result includes coning and sculling (Forster, Carlone, Dellaert, Scaramuzza, IEEE Trans.

@@ -1,12 +1,12 @@
-"""Noise of waves: its autoregressive model, whitening of a series by it, and the comparison with the gradienter.
+"""Noise of waves: autoregressive model, whitening of a series by that model, and comparison with the gradienter.
 
-Waves are narrow in frequency and average out far faster than white noise. The noise of a line through them is the
-residual of their prediction from the past. Burg's method as in Kay, Modern Spectral Estimation, 1988, section 7.3;
-whitening by a Kalman filter, which allows for gaps and the gyros' random walk of angle.
+Waves are narrow in frequency and average out far faster than white noise. The noise of a line through waves is the
+error of predicting each value from the past. The model is fitted by Burg's method (Kay, Modern Spectral Estimation,
+1988, section 7.3). A Kalman filter whitens the series; it allows for gaps and the gyros' random walk of angle.
 
-The comparison of accelerometer and gradienter uses the gradienter's law and the lag of its fluid. Both measure the
-same specific force, surge included: to first order they differ by the accelerometers' bias and the gradienter's zero.
-A wrong lag causes a difference proportional to the slope of the tilt; it is estimated as one more unknown.
+The comparison of accelerometer and gradienter uses the gradienter's law and the lag of its fluid. Both sensors measure
+the same specific force, including surge. To first order they differ by the accelerometers' bias and the gradienter's
+zero. A wrong lag adds a difference proportional to the slope of the tilt, so the lag's error is one more unknown.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from companion.physics.gradienter import readings_from_up
 
 MOST_TERMS: Final = 12
 _LEAST_LEFT: Final = 1e-6
-"""Least share of the variance that prediction may leave; below it numerical precision ends (a pure spectral line)."""
+"""Least share of the variance that a prediction may leave: less is beyond numerical precision (a pure sine)."""
 _DOUBLINGS: Final = 24
 
 
 class Waves(NamedTuple):
-    """Autoregressive model: x[k] = sum(terms[i] x[k - 1 - i]) + noise of variance `variance`."""
+    """Autoregressive model of waves: x[k] = sum over i of terms[i] x[k - 1 - i] + noise of variance `variance`."""
 
     terms: Floats
     variance: float
 
 
 def fit_waves(series: list[Floats]) -> Waves:
-    """Fit one model to series of the same spectrum, without means; Akaike's corrected criterion gives the order."""
+    """Fit one model to several zero-mean series of one spectrum; Akaike's corrected criterion selects the order."""
     forward, backward = [s.copy() for s in series], [s.copy() for s in series]
     points = sum(len(s) for s in series)
     variance = sum(float(s @ s) for s in series) / max(points, 1)
@@ -65,11 +65,11 @@ def fit_waves(series: list[Floats]) -> Waves:
 
 
 def whitened(columns: Floats, waves: Waves, wander: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Whiten columns (n, c), readings and regressors, to unit variance; a row of NaN is a gap.
+    """Whiten n rows of readings and regressors (n, c) to unit variance; a row with NaN is a gap.
 
-    `wander`: variances of the steps of two random walks, from one row to the next; both walks are zero at the last
-    row. The first is one of angle: the gyros' white noise. The second is one of rate, whose sum joins the first: the
-    gyros' bias, sought at its last value.
+    `wander`: variances of the steps from row to row of two random walks, which are zero at the last row. The first is a
+    walk of angle, caused by the gyros' white noise. The second is a walk of rate, the wander of the gyros' bias, whose
+    sum adds to the angle; the bias is estimated at the last row.
     """
     order = max(len(waves.terms), 1)
     angle, rate, size = order, order + 1, order + 2
@@ -112,7 +112,7 @@ def _stationary(move: Matrix, kick: Matrix) -> Matrix:
 
 
 class Level(msgspec.Struct, frozen=True):
-    """One second of gradienter and accelerometer; x and y (2,) in degrees, in the gradienter's axes."""
+    """Comparison of gradienter and accelerometer over one second; x and y (2,), degrees, in the gradienter's axes."""
 
     reading: Floats
     difference: Floats
@@ -121,7 +121,7 @@ class Level(msgspec.Struct, frozen=True):
 
 
 class Fluid:
-    """Model of the gradienter's lag: predicts its reading from the specific force at one IMU."""
+    """Model of the gradienter's lag: predicts the gradienter's reading from the specific force at one IMU."""
 
     def __init__(self, model: GradienterModel) -> None:
         self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
@@ -129,7 +129,7 @@ class Fluid:
         self._shown = (0.0, 0.0)
 
     def follow(self, times_s: Floats, forces_m_s2: Floats) -> Floats:
-        """Return lagged readings (n, 2) for specific forces (n, 3), vehicle FRD; exact for forces linear in time."""
+        """Predict lagged readings (n, 2), deg, from specific forces (n, 3), vehicle FRD; exact for linear changes."""
         felt = readings_from_up(self._law, forces_m_s2 @ self._turn)
         if self.lag_s <= 0.0:
             return felt
@@ -154,7 +154,7 @@ class Fluid:
 
 
 def level(times_s: Floats, shown_deg: Floats, tilt_times_s: Floats, tilts_deg: Floats) -> Level | None:
-    """Compare a second of predicted (n, 2) and actual readings (m, 2); None if they do not overlap."""
+    """Compare predicted (n, 2) and actual (m, 2) gradienter readings of a second; None if times do not overlap."""
     inside = (tilt_times_s >= times_s[0]) & (tilt_times_s <= times_s[-1])
     if not inside.any():
         return None
@@ -168,9 +168,9 @@ def level(times_s: Floats, shown_deg: Floats, tilt_times_s: Floats, tilts_deg: F
 
 
 def compare(levels: Sequence[Level]) -> tuple[Array, Matrix]:
-    """Return the mean of gradienter minus prediction from the accelerometers, and its covariance; degrees.
+    """Return the mean (2,), deg, of gradienter reading minus prediction from accelerometers, and its covariance (2, 2).
 
-    The residual waves determine the weights.
+    The waves that remain in the differences determine the weights.
     """
     difference = np.array([one.difference for one in levels])
     slope = np.array([one.slope for one in levels])

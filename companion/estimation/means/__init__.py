@@ -1,1 +1,1 @@
-"""Means over a window of seconds, with their variances: IMUs, tilt, heading, coarse integers."""
+"""Means over a window, with their variances: of IMUs, tilt, heading, and readings in coarse integers."""

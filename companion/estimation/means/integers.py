@@ -1,14 +1,14 @@
-"""Means of readings truncated to integers toward zero, by maximum likelihood; in LSB, one column per axis.
+"""Means of readings that were truncated to integers toward zero, by maximum likelihood; in LSB, one column per axis.
 
-A truncated stream shows n for every value in [n, n + 1) LSB, -n for (-n - 1, -n], and 0 for all of (-1, +1). The mean
-of the integers is wrong by up to half a step, and by up to a whole one around zero, however long it is averaged. But
-the frequencies of the integers show mean and sigma of the underlying Gaussian noise (autopilots 9.3.1 "Integer
-messages": 102 deg/h against 3.5). The log-likelihood of grouped normal data is concave in h = 1 / sigma and
-a = mean / sigma (Burridge, Biometrika 68 (1981) 41-45). Scoring with shortened steps therefore finds the one maximum.
+A truncated stream shows n for every value in [n, n + 1) LSB, -n for (-n - 1, -n], and 0 for all of (-1, +1). The plain
+mean of the integers is wrong by up to half a step, and near zero by up to a whole step, however many are averaged. But
+the frequencies of the integers show mean and sigma of the underlying Gaussian noise (autopilots.md section 9.3.1
+"Integer messages": error 3.5 instead of 102 deg/h). The log-likelihood of grouped normal data is concave in h = 1 /
+sigma and a = mean / sigma (Burridge, Biometrika 68 (1981) 41-45). Scoring with shortened steps thus finds its maximum.
 
 The fit uses the counts of all good seconds together. The influence of each integer on the fitted mean then converts the
 counts of one second to the mean of that second, to first order. Robust means, ramps and Allan deviations use these
-means like those of a stream of floats; their scatter includes noise that is correlated between readings.
+means like those of a stream of floats. The scatter of the means includes noise that is correlated between readings.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from companion.physics.statistics import MAD_TO_SIGMA
 Integers = NDArray[np.int64]
 
 MIN_BEYOND_TWO: Final = 5.0
-"""Readings outside the two most frequent integers that are needed to determine both mean and sigma. With two integers
-alone, every sigma has a mean that fits. Simulated for sigmas of 0.2 to 0.5 LSB, means of -2 to 2 and one minute: with
-five or more the error is within 15 deg/h and its rms 0.93 to 1.05 times sigma. That holds behind a 20 Hz filter, too,
-which correlates readings of 250 Hz. With one to four the rms is 0.9 to 1.3 times sigma, the error up to 17 deg/h."""
+"""Least number of readings, outside the two most frequent integers, that determines both mean and sigma. With two
+integers alone, every sigma has a mean that fits. Simulation of one minute, sigma 0.2 to 0.5 LSB, mean -2 to 2 LSB: with
+five or more, the error is within 15 deg/h, its rms 0.93 to 1.05 times sigma. That holds for 250 Hz readings behind a 20
+Hz filter, too. With one to four, the rms is 0.9 to 1.3 times sigma, and the error up to 17 deg/h."""
 EDGE_RMS: Final = 0.05
-"""Unseen displacement of the integers' edges, rms in LSB: from a sensor's own steps (2000 deg/s in 16 bits are 1.07
-mrad/s), from a filter, and from noise that is not quite Gaussian."""
+"""Assumed displacement of the edges between integers, rms in LSB. Causes: a sensor's own steps (2000 deg/s in 16 bits
+are 1.07 mrad/s), a filter, and noise that is not quite Gaussian."""
 HUBER_C: Final = 4.0
-"""Huber limit, in scales, for seconds of these streams: rare integers skew the seconds' means, and a limit of 1.345
-would cut off these integers, which determine the mean."""
+"""Huber limit, in robust sigmas, for one-second means of integer streams. Rare integers determine the mean, but skew
+the one-second means; a limit of 1.345 would cut them off."""
 BORROWED_RMS: Final = 0.1  # Relative difference between the noise of the three axes of one gyro or accelerometer
 HALF_STEP: Final = 0.5  # Sigma, LSB, of a mean that the readings do not determine
 NEAR_ZERO: Final = 1.0  # Sigma, LSB, of an undetermined mean within a step of zero, on either side
@@ -57,10 +57,10 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """Fit of Gaussian noise to truncated readings; arrays are (c,) unless stated otherwise, in LSB.
+    """Fit of Gaussian noise to truncated readings, in LSB; arrays are (c,) over the axes unless stated otherwise.
 
-    `variance` is that of `mean` from the Fisher information, for independent readings.
-    No value is NaN; figures with `identified` false are no estimate and must not be used.
+    `variance`: variance of `mean` by the Fisher information, for independent readings. No value is NaN. Where
+    `identified` is false, the values are no estimate and must not be used.
     """
 
     mean: Floats
@@ -68,14 +68,14 @@ class Fit(msgspec.Struct, frozen=True):
     variance: Floats
     identified: NDArray[np.bool_]
     influence: Floats
-    """Change of the mean by one reading in each cell, times the number of readings, (k, c). Averaging
-    (mean + influence) over a part of the readings estimates that part's mean to first order."""
+    """Change of the mean by one reading in each of the k cells, times the number of readings, (k, c). The average of
+    (mean + influence) over a part of the readings estimates the mean of that part, to first order."""
     density: Floats
     """Probability density at the edges of the cells, (k + 1, c)."""
 
 
 def truncation_edges(lowest: Integers, cells: int) -> Floats:
-    """Return the edges (cells + 1, c), LSB, of consecutive integers from `lowest` (c,) on; 0 spans two LSB."""
+    """Return the edges (cells + 1, c), LSB, of consecutive integers from `lowest` (c,) on; integer 0 spans two LSB."""
     first = lowest + np.arange(cells + 1, dtype=np.int64)[:, None]
     return np.asarray(first - (first <= 0), dtype=np.float64)
 
@@ -83,8 +83,8 @@ def truncation_edges(lowest: Integers, cells: int) -> Floats:
 def fit(edges: Floats, counts: Floats, sigma: Floats | None = None) -> Fit:
     """Estimate mean and sigma from the counts (k, c) of readings between ascending edges (k + 1, c).
 
-    `sigma` (c,): noise known from elsewhere, NaN in a column without; a wrong value is worse than none (0.33 instead
-    of 0.386 LSB causes an error of 14 deg/h, autopilots 9.3.2).
+    `sigma` (c,): noise known from another source, NaN if unknown. A wrong value is worse than none: 0.33 instead of
+    0.386 LSB causes an error of 14 deg/h (autopilots.md section 9.3.2).
     """
     given = np.full(counts.shape[1], np.nan) if sigma is None else sigma
     known = given > 0.0
@@ -129,7 +129,7 @@ def fit(edges: Floats, counts: Floats, sigma: Floats | None = None) -> Fit:
 
 
 class _State:
-    """Likelihood at one point (a, h): its gradient (by_a, by_h) and the inverse (aa, ah, hh) of its information."""
+    """Log-likelihood at one point (a, h), its gradient (by_a, by_h), and its inverse information (aa, ah, hh)."""
 
     def __init__(self, edges: Floats, counts: Floats, a: Floats, h: Floats, known: NDArray[np.bool_]) -> None:
         z = np.clip(h * edges - a, -1e4, 1e4)
@@ -155,7 +155,7 @@ class _State:
 
 
 def shape_variance(found: Fit) -> Floats:
-    """Return the variance (c,) of the mean, LSB^2, for edges displaced by `EDGE_RMS`."""
+    """Return the variance (c,) of the mean, LSB^2, that edges displaced by `EDGE_RMS` cause."""
     sensitivity = np.square(np.diff(found.influence, axis=0) * found.density[1:-1]).sum(axis=0)
     return np.asarray(EDGE_RMS**2 * sensitivity)
 
@@ -163,14 +163,14 @@ def shape_variance(found: Fit) -> Floats:
 def integer_columns(
     batches: Sequence[Batch], steps: Floats
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Estimate the means of truncated columns from their good seconds, at least one; `steps` (c,) is their LSB.
+    """Estimate the means of truncated readings from at least one good second; `steps` (c,): size of the LSB.
 
     Returns, in the unit of `steps`:
         (m, c) mean of every second;
         (c,) sigma of one second's mean, from the Fisher information;
-        (c,) sigma that averaging does not reduce: of a mean that is not identified, or from the shape of the noise;
-        (c,) whether the mean's own readings do not identify it; then the triad's other axes do, or nothing does;
-        (c,) whether, in addition, zero is among the readings: the mean can be anywhere within a step of zero.
+        (c,) sigma that averaging does not reduce: of an undetermined mean, or from the shape of the noise;
+        (c,) flags of axes whose own readings do not determine the mean; noise of the triad's other axes may;
+        (c,) flags of axes that nothing determines, with readings of zero: the mean is within a step of zero.
     """
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
@@ -213,7 +213,7 @@ def integer_columns(
 
 
 def _borrowed(own: Fit, pooled: Floats) -> Floats:
-    """Return, for axes with two integers only, the usual sigma of the triad's other axes; NaN for other axes."""
+    """Return the noise (c,) for axes with only two integers: median sigma of the triad's other axes; else NaN."""
     result = np.full(len(own.mean), np.nan)
     enough = ~own.identified & (pooled.sum(axis=0) - pooled.max(axis=0) >= MIN_BEYOND_TWO)
     for triad in (slice(start, start + 3) for start in range(0, len(result), 3)):
@@ -224,9 +224,9 @@ def _borrowed(own: Fit, pooled: Floats) -> Floats:
 
 
 def _aligned(batches: Sequence[Batch], plain: Floats, steps: Floats) -> tuple[Integers, Floats]:
-    """Convert the counts of every second to one grid of integers: (c,) lowest, (m, k, c) counts.
+    """Convert the counts of all seconds to one grid of integers; return its lowest integers (c,), counts (m, k, c).
 
-    The grid covers the range of the noise; a reading outside is a transmission fault and is dropped.
+    The grid covers the range of the noise. A reading outside the grid is a transmission fault and is dropped.
     """
     centre = np.median(plain, axis=0)
     noise = np.sqrt(np.median([batch.variance for batch in batches], axis=0)) / steps

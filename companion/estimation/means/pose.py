@@ -1,8 +1,8 @@
-"""Gradienter and compass: conversion of readings to up and heading of the vehicle, and means (method 1.2 and 3.5).
+"""Gradienter and compass: conversion of readings to up and heading, and means (method.md sections 1.2 and 3.5).
 
-The compass' own heading is used if it sends one, unless the configuration prefers the heading computed from its field
-vector and the gradienter's tilt. A field without a gradienter gives no heading: no other sensor measures the tilt well
-enough (tan I times its error, 2.5 times at 68 degrees).
+The heading that a compass sends is used, unless the configuration prefers the one computed from its field vector and
+the gradienter's tilt. A field without a gradienter gives no heading, because no other sensor measures the tilt well
+enough. The heading's error is tan I times the tilt's error: 2.5 times at a magnetic inclination I of 68 degrees.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample
 
 LEVEL_COSINE: Final = math.cos(2.0 * DEG)
-"""Cosine of the largest tilt that counts as level. Data sheets state errors "level" and "tilted", but no border."""
+"""Cosine of the largest tilt that counts as level. Data sheets give errors "level" and "tilted", without a limit."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GradienterModel:
-    """Gradienter model for up in the vehicle: law, zero offset, mounting, sigma."""
+    """Parameters of a gradienter, which measures up in the vehicle's axes: law, zero offset, mounting, sigma, lag."""
 
     law: Law
     vehicle_from_sensor: Matrix
@@ -39,7 +39,7 @@ class GradienterModel:
     lag_s: float = 0.0  # Time constant of the device
 
     def up(self, x_deg: float, y_deg: float) -> Array:
-        """Return up in the vehicle's axes, (3,), from readings minus the offset.
+        """Return the unit vector up (3,), in the vehicle's axes, from readings minus the offset.
 
         Raises:
             ValueError: the readings are inconsistent.
@@ -49,21 +49,21 @@ class GradienterModel:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassModel:
-    """Compass model for a true heading: reference, offset, mounting, sigma."""
+    """Parameters of a compass: reference north (magnetic or true), offset, mounting, sigma, lag."""
 
     magnetic: bool
     vehicle_from_sensor: Matrix
     offset_deg: float
     sigma_deg: float
     counts_per_gauss: float | None = None
-    """Unit of a field in counts; None: only its direction is known."""
+    """Counts per gauss in the readings of a field; None: only the direction of the field is known."""
     prefers_field: bool = False  # True: compute the heading from the field even if the device sends its own
     tilted_sigma_deg: float | None = None
-    """Sigma while the compass is not level; None: `sigma_deg`."""
+    """Sigma of the heading, degrees, while the compass is not level; None: equal to `sigma_deg`."""
     lag_s: float = 0.0  # Time constant of the device
 
     def sigma_at(self, up: Array) -> float:
-        """Return sigma, degrees, at a tilt; `up` (3,) is in the vehicle's axes."""
+        """Return the heading's sigma, degrees, at a tilt. `up` (3,): unit vector in the vehicle's axes."""
         upright = float(-(self.vehicle_from_sensor.T @ up)[2])
         if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
             return self.sigma_deg
@@ -71,15 +71,15 @@ class CompassModel:
 
 
 def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
-    """Return up in the vehicle's axes, (3,), from the gradienter's two readings; raises as `GradienterModel.up`."""
+    """Return the unit vector up (3,), in the vehicle's axes, from raw readings; raises as `GradienterModel.up`."""
     return model.up(x_deg - model.offset_deg[0], y_deg - model.offset_deg[1])
 
 
 def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
-    """Return the heading of the vehicle from the compass' own north (magnetic or true), not wrapped.
+    """Return the heading of the vehicle, rad, from the compass' own north (magnetic or true), not wrapped.
 
-    A compass gives the azimuth of its own forward axis. The mounting adds the azimuth of that axis, at the present
-    tilt, while the vehicle heads north.
+    A compass reports the azimuth of its own forward axis. The mounting adds the azimuth that this axis has, at the
+    present tilt, while the vehicle heads north.
     """
     gamma, theta = roll_pitch_from_up(up)
     forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
@@ -88,7 +88,7 @@ def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) ->
 
 
 class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of the gradienter in its own axes; sigmas are statistical."""
+    """Mean gradienter readings of a window, in the gradienter's axes; the sigmas are from the scatter only."""
 
     x_deg: float
     y_deg: float
@@ -98,20 +98,20 @@ class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Circular mean of the compass heading over a window, degrees in [0, 360); `sigma_deg` is statistical only."""
+    """Circular mean of the compass heading over a window, degrees in [0, 360); sigma is from the scatter only."""
 
     heading_deg: float
     sigma_deg: float
     from_field: bool = False  # True: computed from the device's field and the gradienter's tilt
     wander_deg: float | None = None
-    """Change of the heading while no other sensor showed a turn; None: not watched long enough."""
+    """Range of the heading, degrees, while no other sensor showed a turn; None: too few seconds."""
 
 
 FieldUnit = Literal["gauss", "counts"]
 
 
 class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean of the magnetic field in the compass' own axes; sigmas are statistical."""
+    """Mean magnetic field of a window, in the compass' own axes; the sigmas are from the scatter only."""
 
     field: tuple[float, float, float]
     sigma: tuple[float, float, float]
@@ -149,7 +149,7 @@ def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats
 
 
 def _resolution(batches: Sequence[Batch]) -> Floats:
-    """Return the step of a reading with fewer than 3 values: their distance, or the last printed decimal; else 0."""
+    """Return the step (c,) of readings with one or two values: their distance, or the last decimal; else 0."""
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
     few = few_distinct(np.array([batch.distinct for batch in batches]))
@@ -158,12 +158,12 @@ def _resolution(batches: Sequence[Batch]) -> Floats:
 
 OLDEST_TILT_S: Final = 1.0  # Maximum age of a tilt; the slowest gradienters send five readings in that time
 OWN_HEADING_S: Final = 2.0
-"""Time without an own heading after which a compass counts as sending its field only."""
+"""Time, s, without a heading from the device after which a compass counts as sending its field only."""
 _LIMITS: Final = (1e6,) * 3
 
 
 class FieldHeading:
-    """Computes headings of the compass' own forward axis from magnetic north, from tilts and fields."""
+    """Computes magnetic headings of the compass' own forward axis from its field and the gradienter's tilt."""
 
     def __init__(self, compass: CompassModel, gradienter: GradienterModel | None, keep: int) -> None:
         self._compass, self._gradienter = compass, gradienter
@@ -175,20 +175,20 @@ class FieldHeading:
         self.batches = BatchSource(_LIMITS, keep)
         self.from_field = False  # True: the latest heading in use was computed from the field
         self.hint = ""
-        """Reason why a needed heading cannot be computed from the field; empty if it can."""
+        """Reason why no heading can be computed from the field, although one is needed; else empty."""
 
     def take_tilt(self, sample: TiltSample) -> None:
         self._tilt = sample
 
     def takes_own(self, sample: CompassSample) -> bool:
-        """Add a heading that the device computed; return whether it is used."""
+        """Add a heading that the device computed; return true if it is used, and not the one from the field."""
         if self._compass.prefers_field:
             return False
         self._own_s, self.from_field, self.hint = sample.t_s, False, ""
         return True
 
     def add(self, sample: MagSample) -> CompassSample | None:
-        """Add a field; return the heading computed from it if that one is used."""
+        """Add a magnetic field; return the heading computed from the field, if that heading is used."""
         field = self._in_unit(sample)
         if field is None:
             return None
@@ -232,7 +232,7 @@ class FieldHeading:
         return field
 
     def _up(self, t_s: float) -> Array | None:
-        """Return the present up in the vehicle's axes; None: `hint` gets the reason."""
+        """Return the present unit vector up (3,) in the vehicle's axes, or None with the reason in `hint`."""
         if not self._compass.magnetic:
             self.hint = 'compass sends its field only, and that shows magnetic north, not reference = "true"'
         elif self._gradienter is None:

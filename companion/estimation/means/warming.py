@@ -1,8 +1,8 @@
-"""Allowance for a warm-up too slow to see within one window, and the drift that the window does show.
+"""Allowance for a warm-up that is too slow to show within one window, and the drift that the window does show.
 
-A slope s moves the mean of the next minute by s (T + 60 s) / 2 from the mean over T. The allowance is the slope
-of the window with its standard error, times that lever. The time t since power-up bounds it: a box warms by `WARM_UP_K`
-with an unknown time constant, so its rate is at most WARM_UP_K / (e t). A thermometer bounds it better.
+A slope s moves the mean of the next minute by s (T + 60 s) / 2 from the mean over a window of length T. The allowance
+uses the window's slope with its standard error. The time t since power-up limits the slope: a box warms by `WARM_UP_K`
+with an unknown time constant, so its rate is at most WARM_UP_K / (e t). A thermometer gives a lower limit.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ _LATER_S: Final = (120.0, 600.0, 3600.0)
 _WORTH_WAITING: Final = 2.0 / 3.0  # A later sigma is worth waiting for below this share of the present one
 _TEMPERATURE_WARNING_K: Final = 3.0
 UNKNOWN: Final = 1.0
-"""Variance of a slope that the window does not show, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
+"""Variance for a slope that the window is too short to show, (rad/s^2)^2 or (m/s^3)^2: larger than any warm-up."""
 _TINY: Final = float(np.finfo(float).tiny)
 _BENT_SIGMAS: Final = 3.0  # Curvature over its sigma above which the temperature is fitted by a parabola
 _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)  # Resolutions of thermometers
 
 
 State = tuple[float, float]
-"""Temperature and its rate, degC and K/s."""
+"""Temperature, degC, and its rate, K/s."""
 
 
 class Path(msgspec.Struct, frozen=True, kw_only=True):
-    """Temperature at the beginning, in the middle and at the end of a window: a line or a parabola."""
+    """Temperature over a window, fitted by a line or a parabola."""
 
     states: tuple[State, State, State]  # At the beginning, in the middle and at the end
     span_s: float
     variance: float
-    """Variance of the difference between end and mean, K^2."""
+    """Variance of the difference between the temperature at the end and the mean temperature, K^2."""
 
     @property
     def mean_degc(self) -> float:
@@ -51,13 +51,13 @@ class Path(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
-    """Straight lines through the readings of gyro and accelerometer over one window; (6,), rad/s^2 and m/s^3.
+    """Slopes of gyro and accelerometer readings (6,), rad/s^2 and m/s^3, and of the temperature in one window.
 
-    `ramp`: significant slopes, else zero; the reported mean is then the end of that line. `variance`: of the slope,
-    with the part's flicker and walk; `UNKNOWN` if the window is too short for a line. `level_variance`: of the mean
-    as a prediction of the next minutes, without a ramp. `warm_up`: bias change of gyro and accelerometer by
-    `WARM_UP_K`, rad/s and m/s^2. `rate`: rate of the temperature, K/s, and its variance, None without a thermometer;
-    `path`: None without a significant change.
+    `ramp`: significant slopes, else zero; the reported mean is then the end of the fitted line. `variance`: variance of
+    the slope, with the part's flicker and walk; `UNKNOWN` if the window is too short. `level_variance`: variance of the
+    mean as a prediction for the next minutes, without a ramp. `warm_up`: bias change of gyro and accelerometer if the
+    temperature rises by `WARM_UP_K`, rad/s and m/s^2. `rate`: rate of the temperature, K/s, and its variance; None
+    without a thermometer. `path`: None if the temperature does not change significantly.
     """
 
     slope: Floats
@@ -81,24 +81,24 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def rate_k_s(self) -> float:
-        """Significant rate of the temperature, K/s; zero if it may be chance or there is no thermometer."""
+        """Significant rate of the temperature, K/s; zero if the change may be chance, or without a thermometer."""
         return 0.0 if self.rate is None or self.path is None else self.rate[0]
 
     def ahead(self, triad: Triad) -> Floats:
-        """Return the reported mean, at the end of a ramp, minus the mean over the window; (3,)."""
+        """Return the reported mean (3,), which is the end of a ramp, minus the mean over the window."""
         return self.ramp[rows_of(triad)] * self.half_s
 
     def goes_on(self, triad: Triad) -> tuple[Floats, Floats]:
-        """Return the slope (3,) that continues for some seconds, and its sigma: a ramp, or a warm-up by thermometer."""
+        """Return the slope (3,) expected for the next seconds, from a ramp or measured warm-up, and its sigma (3,)."""
         rows, move = rows_of(triad), self.warm_up[0 if triad == "gyro" else 1]
         prior = np.square(self.rate_k_s * move / WARM_UP_K)
         share = np.where(self.ramp[rows] != 0.0, 1.0, prior / (prior + self.variance[rows] + _TINY))
         return share * self.slope[rows], np.sqrt(share * self.variance[rows])
 
     def unseen(self, powered_s: float) -> Floats:
-        """Return the variance (6,) of the next minute's biases from an unseen slope, (rad/s)^2 and (m/s^2)^2.
+        """Return the variance (6,) of the next minute's biases from an undetected slope, (rad/s)^2 and (m/s^2)^2.
 
-        `powered_s`: least time since power-up at the end of the window.
+        `powered_s`: least possible time since power-up, s, at the end of the window.
         """
         age_s = max(powered_s, 0.0)
         steepest = math.exp(-age_s / QUICKEST_S) / QUICKEST_S if age_s < QUICKEST_S else 1.0 / (math.e * age_s)
@@ -109,7 +109,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         return _mean_square(prior, self.slope - self.ramp, self.variance) * (self.half_s + NEXT_S / 2.0) ** 2
 
     def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
-        """Explain a gyro sigma that is mostly warm-up; empty if it is not. `other_variance`: (6,), the rest."""
+        """Explain that sigma of a gyro is mostly due to warm-up; empty if not. `other_variance` (6,): other causes."""
         if self.unseen(powered_s)[:3].max() <= other_variance[:3].max():
             return ""
         if self.rate_k_s:
@@ -125,13 +125,13 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _mean_square(prior: Floats | float, measured: Floats | float, variance: Floats | float) -> Floats:
-    """Return the mean square of a slope: the prior's, updated with a measurement of this variance."""
+    """Return the mean square of a slope: prior mean square, updated by a measured slope with its variance."""
     share = prior / (prior + variance + _TINY)
     return np.asarray(np.square(share * measured) + share * variance)
 
 
 def temperature(batches: Sequence[Batch]) -> tuple[tuple[float, float] | None, Path | None]:
-    """Return `rate` and `path` of a `Warming`."""
+    """Fit the temperature over a window; return the fields `rate` and `path` of a `Warming`."""
     known = [(batch.slot + 0.5, batch.temperature_degc) for batch in batches if batch.temperature_degc is not None]
     if len(known) < 3:
         return None, None
@@ -155,7 +155,7 @@ def temperature(batches: Sequence[Batch]) -> tuple[tuple[float, float] | None, P
 
 
 def _fitted(times: Floats, degc: Floats, degree: int) -> tuple[list[float], list[float]]:
-    """Fit a line or a parabola; return coefficients, highest first, and their variances."""
+    """Fit a line or a parabola to temperatures; return its coefficients, highest power first, and their variances."""
     found, covariance = np.polyfit(times, degc - degc[0], degree, cov=True)
     found[-1] += degc[0]
     half_s = (times[-1] - times[0] + 1.0) / 2.0
@@ -165,7 +165,7 @@ def _fitted(times: Floats, degc: Floats, degree: int) -> tuple[list[float], list
 
 
 def _resolution_k(degc: Floats) -> float:
-    """Return the step of a thermometer that shows at most three values; zero if it shows more."""
+    """Return the resolution, K, of a thermometer that shows at most three values; zero if it shows more."""
     values = np.unique(degc)
     if len(values) == 1:
         # Largest step that its digits allow.
@@ -174,7 +174,7 @@ def _resolution_k(degc: Floats) -> float:
 
 
 def drifting(name: str, ramps: Floats, temperatures_degc: Sequence[float]) -> tuple[str, ...]:
-    """Return the drift warnings of one IMU; `ramps` (6,): gyro rad/s^2, accelerometer m/s^3."""
+    """Return warnings about the drift of one IMU. `ramps` (6,): slopes of gyro, rad/s^2, and accelerometer, m/s^3."""
     found, size = [], np.abs(ramps)
     span = max(temperatures_degc, default=0.0) - min(temperatures_degc, default=0.0)
     if size[:3].any():

@@ -1,7 +1,7 @@
-"""Means of a still stretch with realistic sigmas, from its batches.
+"""Means over a still window with realistic sigmas, from its one-second batches.
 
-Each reading has two sigmas: `sigma_stat` is the noise that remains after averaging, `sigma_use` the expected error over
-the next H seconds. Method 2.2, 2.4, 2.5 and 3.2.
+Each mean has two sigmas: `sigma_stat` is the noise that remains after averaging, and `sigma_use` is the expected error
+over the next H seconds (method.md sections 2.2, 2.4, 2.5 and 3.2).
 """
 
 from __future__ import annotations
@@ -38,29 +38,28 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import TRIADS, Triad, Vector, rows_of
 
 WHITE_SHARE: Final = 0.09
-"""White over floor variance below which more averaging gains nothing: the white sigma is 30 % of the floor."""
+"""Ratio of white-noise variance to all other variance below which more averaging gains nothing: 30 % in sigma."""
 _ALLAN_SPANS: Final = 5
-RAW_BATCHES: Final = 10  # Seconds of floats beside integers that say enough of their own scatter
+RAW_BATCHES: Final = 10  # Least seconds of floats, beside integers, that show their own scatter
 RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
 SPOT_WALK: Final = np.repeat([0.0, 0.04 * MG], 3)
-"""Walk of an unknown accelerometer by the ground's tilt and the temperature, unit / sqrt(s), beside the part's own.
-With it sigma of a VN-100 on a desk equals its errors; that of ten Movella DOT is three times theirs."""
+"""Random walk of an unknown accelerometer due to the ground's tilt and the temperature, unit / sqrt(s), in addition to
+the part's own walk. With it, sigma equals the errors of a VN-100 on a desk and three times those of ten Movella DOT."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
-"""Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
+"""Share of the usual sample count below which a second lost samples; above it, the 1 s grid causes the shortage."""
 _GUESSED_FLOOR: Final = 2.56
-"""Margin on the variance of a slope if the floor is estimated about the line: chance slopes of ten Movella DOT stay
-below it, the warm-up of a PX4 board (sample.ulg) exceeds it."""
+"""Margin on the variance of a slope if flicker and walk are estimated from residuals of the line. Chance slopes of ten
+Movella DOT stay below the limit; the warm-up of a PX4 board (sample.ulg) exceeds it."""
 _MOST_WANDER: Final = 0.5  # Largest wander about a ramp, over the change by the ramp in the same time
 _ALLAN_SIGNIFICANT: Final = 3.0
-"""Allan variance at T/5 over that of white noise: upper 5 % point for about four degrees of freedom."""
+"""Threshold for Allan variance at T/5 over that of white noise: upper 5 % point for about four degrees of freedom."""
 
 
 class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU for the collector; `rotation` (3x3) is from the sensor to vehicle FRD.
+    """Description of one IMU for the collector; `rotation` (3, 3) is from the sensor's to the vehicle's axes (FRD).
 
-    The steps are those of integers truncated toward zero, 0 for floats; both triads are integers, or both floats.
     `clock_from_start`: the time in its samples (`t_device_s`) counts from power-up of the device.
     """
 
@@ -74,18 +73,17 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def steps(self) -> Floats | None:
-        """Quantisation step per axis, (6,), of an integer stream; None for floats."""
+        """Quantisation steps (6,), rad/s and m/s^2, of an integer stream; None for floats."""
         return np.repeat([self.gyro_step_rad_s, self.accel_step_m_s2], 3) if self.gyro_step_rad_s else None
 
 
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of one IMU over one still stretch; axes are the vehicle's FRD.
+    """Means of one IMU over one still window, in the vehicle's axes (FRD).
 
-    `sigma_use` is sqrt(V(T, H)) of the sensor alone; `solve` adds the error of the pose. A bias curve over temperature
-    may explain the warnings in `drifting`. Triads in `hidden` have too little noise to spread their integers: their
-    means are good to half a step; those in `useless` are no measurement. Only a deck has `covariance` (6x6, all axes)
-    and `by_earth` (3x3, share of the Earth's rate, ahead, right and down, in the gyro means). `mounting` has the rows
-    of the rotation from the sensor's axes.
+    `drifting`: warnings that a bias curve over temperature may explain. `hidden`: triads with too little noise to
+    spread their integers, so that a mean is good to half a step only. `useless`: triads that are no measurement. On a
+    deck only: `covariance` (6, 6) of all axes, and `by_earth` (3, 3), the share of the Earth's rate ahead, right and
+    down in the gyro means. `mounting`: rows of the rotation from the sensor's axes.
     """
 
     name: str
@@ -113,9 +111,9 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Window(msgspec.Struct, frozen=True, kw_only=True):
-    """One window; `powered_s` is the least time since power-up of each IMU, at the window's end.
+    """Means of all sensors over one window. `powered_s`: least time since power-up of each IMU, s, at its end.
 
-    `turn_rad_s` is the mean turn of a deck; the gradienter's readings, without an offset, level its axis.
+    `turn_rad_s`: mean rate of a deck's turn, about the axis that is vertical by gradienter readings without an offset.
     """
 
     start_s: float
@@ -124,7 +122,7 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     tilt: TiltWindow | None
     heading: HeadingWindow | None
     field: FieldWindow | None = None
-    """Mean field of the compass, over the good seconds that have one; None if it sends none."""
+    """Mean field of the compass, over the good seconds that have one; None if the compass sends no field."""
     turn_rad_s: Vector | None = None
     powered_s: dict[str, float] = {}
     turn: Turn = Turn()
@@ -133,10 +131,10 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """Estimate of one IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2.
 
-    `undecided`: the mean of integers is not determined yet (more seconds may bring the rare reading that does).
-    `useless`: the mean is only known to be less than a step. `half_step`: floats with fewer than 3 distinct readings.
-    `white` is the N in use: the larger of measurement and profile. More seconds reduce `white_variance`, which is part
-    of `use_variance`.
+    `undecided`: integers do not determine the mean yet; more seconds may bring the rare reading that does. `useless`:
+    the mean is only known to be less than a step. `half_step`: floats with fewer than 3 distinct readings. `white`:
+    white noise N, the larger of measurement and profile. `white_variance`: part of `use_variance` that more seconds
+    reduce.
     """
 
     mean: Floats
@@ -153,10 +151,10 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
 def estimate(
     imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float, rounding: float = 0.0
 ) -> Estimate:
-    """Estimate one IMU from at least 2 good seconds.
+    """Estimate the means of one IMU from at least 2 good seconds.
 
-    A ramp is evaluated at the end of the window, `end_s`, and never later. `horizon_s` is H of V(T, H), `rounding` the
-    step of rounded floats.
+    A ramp is evaluated at the end of the window, `end_s`, and never later. `horizon_s`: time H for which the means will
+    be used. `rounding`: step of rounded floats.
     """
     profile_white, flicker, walk = columns(imu.profile)
     slots = np.array([batch.slot for batch in batches], dtype=np.int64)
@@ -222,14 +220,14 @@ def estimate(
 
 
 def _dominates(slots: NDArray[np.int64], values: Floats, slope: Floats) -> NDArray[np.bool_]:
-    """(c,) True if a line changes more than the wander about it, over a fifth of the window; a step does not."""
+    """Return (c,) true if a line changes more than readings wander about it, in 1/5 of the window; not for a step."""
     left = values - slope * (slots - slots.mean())[:, None]
     excess, span = _excess(slots, left, white_noise(slots, left))
     return np.asarray(excess < np.square(slope * span * _MOST_WANDER))
 
 
 def _learned(slots: NDArray[np.int64], values: Floats, least: Floats) -> tuple[Floats, Floats]:
-    """Return B and K of every column of an unknown part, whose N is `least` or more."""
+    """Return flicker B and random walk K (c,) of an unknown part, whose white noise N is at least `least`."""
     white = np.maximum(white_noise(slots, values), least)
     parts = [learned_floor(slots, values[:, rows_of(triad)], white[rows_of(triad)]) for triad in TRIADS]
     flicker, walk = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -237,13 +235,13 @@ def _learned(slots: NDArray[np.int64], values: Floats, least: Floats) -> tuple[F
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
-    """Return B of every column: from the profile, or from the excess of the Allan deviation at T/5 over white noise."""
+    """Return flicker B (c,): the larger of profile and measured excess of Allan deviation at T/5 over white noise."""
     excess, _ = _excess(slots, values, white)
     return np.maximum(np.sqrt(excess) / FLOOR_OF_FLICKER, profile)
 
 
 def _excess(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, int]:
-    """Return the Allan variance at T/5 beyond that of white noise, (c,), zero if not significant; and T/5, s."""
+    """Return the excess (c,) of the Allan variance at T/5 over white noise, zero if not significant; and T/5, s."""
     span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
     if span < 2:
         return np.zeros(values.shape[1]), span
@@ -253,10 +251,10 @@ def _excess(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Fl
 
 
 def _quantisation(batches: Sequence[Batch], step: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return one sigma of the rounding error per column, and flags of columns with fewer than 3 distinct values.
+    """Return one sigma of the rounding error (c,), and flags (c,) of channels with fewer than 3 distinct values.
 
-    Half a step for fewer than 3 distinct values; else the bound for noise of that sigma, (q / pi) exp(-2 pi^2 sigma^2 /
-    q^2) (method 2.2 and 2.5), with q the `step`, 0 if unknown.
+    For these the sigma is half a step. Otherwise it is the bound for noise sigma s and `step` q (0: unknown),
+    (q / pi) exp(-2 pi^2 s^2 / q^2) (method.md sections 2.2 and 2.5).
     """
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
@@ -279,9 +277,9 @@ def imu_window(
     horizon_s: float,
     rejected: int,
 ) -> tuple[Estimate, ImuWindow]:
-    """Estimate one IMU from its good seconds: in its own axes, and in the vehicle's.
+    """Estimate the means of one IMU from its good seconds: in the IMU's own axes, and in the vehicle's axes.
 
-    `raw`: means in floats of those seconds, sent beside a stream of integers; used if they determine the gyros better.
+    `raw`: means in floats of those seconds, sent beside a stream of integers; used if their gyro variance is smaller.
 
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
@@ -366,7 +364,7 @@ def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
 
 
 def lost(batches: Sequence[Batch]) -> float:
-    """Return the share of lost samples, from the device's counter, else from the usual number in a second."""
+    """Return the share of lost samples, by the device's counter, or else by the usual number of samples per second."""
     usual = float(np.median([batch.n for batch in batches]))
     missing = came = 0.0
     for batch in batches:

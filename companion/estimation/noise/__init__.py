@@ -1,1 +1,1 @@
-"""Noise of sensors: Allan models, robust means."""
+"""Noise of sensors: Allan models, robust means and lines."""

@@ -1,12 +1,12 @@
-"""Allan models of IMU noise, and the error over the next H seconds of a mean over T seconds.
+"""Allan models of IMU noise, and the variance V(T, H) with which a mean over T seconds predicts the next H seconds.
 
 One axis has white noise N (unit * sqrt(s)), flicker B (unit; the floor of the Allan deviation is 0.664 B) and rate
-random walk K (unit / sqrt(s)). Source: method 2.2; IEEE Std 952.
+random walk K (unit / sqrt(s)). Sources: method.md section 2.2; IEEE Std 952.
 
-A recording of a sensor at rest determines all three, each with its error, by maximum likelihood of the overlapping
-Allan variances at averaging times of 1, 2, 4, ... 256 s. A calibration needs no longer times, and within them a drift
-or a bounded wander counts as it does in a calibration. The variance at t is N^2 / t + (2 ln 2 / pi) B^2 + K^2 t / 3.
-Each octave counts as length / (2 t) independent squares: those of Haar's wavelets, which hold all its information.
+A recording of a sensor at rest determines N, B and K, each with its error. The method is maximum likelihood of the
+overlapping Allan variances at averaging times t of 1, 2, 4, ... 256 s. A calibration needs no longer times, and within
+them a drift or a bounded wander has its effect on a calibration. The Allan variance at t is N^2 / t + (2 ln 2 / pi) B^2
++ K^2 t / 3. Each t counts as length / (2 t) independent squares: those of Haar's wavelets, which hold all information.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from companion.physics.units import DEG_H, MG
 FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor  # Allan deviation of pure flicker noise over B: 0.664
 
 _FLOOR_REACHED_S: Final = 1000.0
-"""Catalogues give no random walk; K is set so that it reaches the flicker floor at this time (method 2.2)."""
+"""Time, s, at which the assumed random walk K reaches the flicker floor: catalogues lack K (method.md section 2.2)."""
 WARM_UP_K: Final = 20.0  # Temperature rise of a board with processor and radio; two sigma
 WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
-"""Warm-up bias change of an unknown part: a BMI088's gyro and a BMI160's accelerometer (table in method 2.1)."""
+"""Warm-up bias change of an unknown part, from a BMI088's gyro and a BMI160's accelerometer (method.md section 2.1)."""
 
 
 def allan_model(white: float, floor: float, walk: float | None = None) -> AllanModel:
-    """Make a model of white noise N, the Allan floor A (0.664 B) and the walk K, which data sheets do not give."""
+    """Make a model from white noise N, Allan floor A (0.664 B) and random walk K; None assumes K for a data sheet."""
     walk = floor * math.sqrt(3.0 / _FLOOR_REACHED_S) if walk is None else walk
     return AllanModel(white, floor / FLOOR_OF_FLICKER, walk)
 
@@ -46,7 +46,7 @@ def _profile(
     accel_ug: tuple[float, float] | tuple[float, float, float],
     per_kelvin: tuple[float, float] | None = None,
 ) -> NoiseProfile:
-    """Make a profile of N and A, and K where it was measured; `per_kelvin` in deg/h and mg, None where unknown."""
+    """Make a profile from noise N, A and, if measured, K; `per_kelvin`: bias change in deg/h and mg per kelvin."""
     accel = [figure * 1e-3 * MG for figure in accel_ug]
     return NoiseProfile(
         name,
@@ -56,13 +56,13 @@ def _profile(
     )
 
 
-# N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug, K in ug/sqrt(s): the table of method 2.2. The ADIS16405 has the
+# N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug, K in ug/sqrt(s): method.md section 2.2. The ADIS16405 has the
 # figures measured at rest over sessions of 2.8 h: the gyro's six (upper ends), the accelerometer's three (tilt and
 # temperature of the bench included), not those of its data sheet.
-# "unknown" is for a part that nobody named. On the ground a window shows its noise, and its floors are estimated
+# "unknown" is for a part that is not configured. On the ground a window shows its noise, and its floors are estimated
 # (`learned_floor`); on a deck they are those of the worst common parts. Its white noise is that of the best: white
-# noise is measured in every window, and the larger figure counts. Temperature coefficients: method 2.1, which has none
-# of the two ADIS.
+# noise is measured in every window, and the larger figure counts. Temperature coefficients: method.md section
+# 2.1, which has none of the two ADIS.
 PROFILES: Final[dict[str, NoiseProfile]] = {
     profile.name: profile
     for profile in (
@@ -76,10 +76,10 @@ PROFILES: Final[dict[str, NoiseProfile]] = {
 
 
 def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
-    """Return a given profile, or that of a part in the catalogue; None: the cautious profile of an unknown part.
+    """Return the given profile, or the catalogue's profile of a named part; None: the cautious one of an unknown part.
 
     Raises:
-        ConfigError: no such profile.
+        ConfigError: the catalogue has no part of this name.
     """
     if isinstance(profile, NoiseProfile):
         return profile
@@ -89,14 +89,14 @@ def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
 
 
 def columns(profile: NoiseProfile) -> Floats:
-    """Return N, B and K (rows) of the gyro's and the accelerometer's axes (columns): (3, 6)."""
+    """Return white noise N, flicker B and random walk K (rows) of three gyro, three accelerometer axes: (3, 6)."""
     return np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
 
 
 def phi(ratio: Floats | float) -> Floats:
-    """Return PHI(H/T): the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method 2.2).
+    """Return PHI(H/T), the flicker's part of V(T, H) times pi / B^2; PHI(1) = 4 ln 2 (method.md section 2.2).
 
-    Uses log1p to avoid cancellation for H much longer or much shorter than T.
+    The function log1p avoids cancellation for H much longer or much shorter than T.
     """
     r = np.asarray(ratio, dtype=np.float64)
     return np.asarray(r * np.log1p(1.0 / r) + (2.0 + 1.0 / r) * np.log1p(r) - np.log(r))
@@ -105,7 +105,7 @@ def phi(ratio: Floats | float) -> Floats:
 def floor_variance(
     flicker: Floats | float, walk: Floats | float, mean_s: Floats | float, horizon_s: Floats | float
 ) -> Floats:
-    """Return V(T, H) without its white noise, the only term that averaging reduces."""
+    """Return the prediction variance V(T, H) without white noise, which is the only term that averaging reduces."""
     mean_s = np.asarray(mean_s, dtype=np.float64)
     return np.asarray(
         np.square(flicker) / math.pi * phi(horizon_s / mean_s) + np.square(walk) * (mean_s + horizon_s) / 3.0
@@ -113,28 +113,28 @@ def floor_variance(
 
 
 def predicted_sigma(model: AllanModel, mean_s: float, horizon_s: float) -> float:
-    """Predict one sigma of the bias over the next `horizon_s` from a mean over `mean_s` seconds: sqrt(V(T, H))."""
+    """Return one sigma, sqrt(V(T, H)), with which a mean over `mean_s` predicts the bias over `horizon_s` seconds."""
     floor = float(floor_variance(model.flicker, model.walk, mean_s, horizon_s))
     return math.sqrt(model.white**2 / mean_s + floor)
 
 
 def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float) -> Floats:
-    """Return the slope variance of a straight line over `mean_s` seconds from flicker and walk.
+    """Return the variance of a line's slope over `mean_s` seconds that flicker B and random walk K cause.
 
-    The line's weights are applied to the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method 2.2: the
-    double integrals are 1/16 and 1/60 of T^4 and T^5, times 144 / T^6.
+    Derivation: apply the line's weights to the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| (method.md
+    section 2.2). The double integrals are T^4 / 16 and T^5 / 60, times 144 / T^6.
     """
     return np.asarray(9.0 / math.pi * np.square(flicker / mean_s) + 1.2 * np.square(walk) / mean_s)
 
 
 def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple[Floats, float]:
-    """Compute the overlapping Allan variance of values (m, c) at ascending slots (m,) of a 1 s grid with holes.
+    """Compute the overlapping Allan variance of values (m, c) at ascending seconds (m,) of a 1 s grid with holes.
 
-    An average over `span` slots needs at least half of them.
+    An average over `span` seconds needs at least half of them.
 
     Returns:
-        (c,) variance (zero where no pair exists) and its equivalent degrees of freedom (white noise; NIST SP 1065
-        eq. for white FM; 0 where no pair exists).
+        (c,) variance, and its equivalent degrees of freedom for white noise (NIST SP 1065, equation for white FM).
+        Both are zero if no pair of averages exists.
     """
     length = int(slots[-1] - slots[0]) + 1
     if length < 2 * span:
@@ -158,14 +158,14 @@ def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple
 
 
 def student_ratio(freedom: float) -> float:
-    """Return the half width of Student's 95 % interval over the normal one; at most 3, also below one degree."""
+    """Return the ratio of Student's 95 % interval to the normal one; at most 3, also below one degree of freedom."""
     return min(student_quantile(1.96, freedom) / 1.96, 3.0) if freedom >= 1.0 else 3.0
 
 
 def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
-    """Return N of every column from the Allan deviation between neighbouring seconds, widened for few of them.
+    """Return white noise N (c,) from the Allan deviation between neighbouring seconds, widened if these are few.
 
-    Without neighbouring seconds (a gradienter slower than 1 Hz), uses the scatter of the means.
+    Without neighbouring seconds (a gradienter slower than 1 Hz), the scatter of the means is used.
     """
     variance, freedom = allan_variance(slots, values, 1)
     if freedom == 0.0:
@@ -184,11 +184,11 @@ _WALKS_S: Final = np.array([30.0, 100.0, 300.0, 1000.0])  # Averaging times at w
 
 
 def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, Floats]:
-    """Estimate B and K of a triad of an unknown part, (3,) each, from a window of its readings.
+    """Estimate flicker B and random walk K, (3,) each, of a triad of an unknown part from one window.
 
-    One ratio A / N holds for all three axes. Its prior is that of common parts; the likelihood is that of the window's
-    Allan variances. V(T, H) is linear in B^2 and K^2, so their posterior means suffice. `slots` (m,) are ascending
-    seconds, `values` (m, 3) their means, and `white` (3,) is N.
+    One ratio of Allan floor A to white noise N holds for all three axes. Its prior comes from common parts, and its
+    likelihood from the window's Allan variances. V(T, H) is linear in B^2 and K^2, so their posterior means suffice.
+    `slots` (m,): ascending seconds. `values` (m, 3): means of these seconds. `white` (3,): N.
     """
     ratio2, walk_s = (each.ravel() for each in np.meshgrid(np.square(_FLOOR_RATIOS), _WALKS_S))
     log_weight = -0.5 * np.square((np.log(ratio2) / 2.0 - math.log(_FLOOR_MEDIAN)) / _FLOOR_SPREAD)
@@ -210,7 +210,7 @@ def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tu
 # --- from recordings
 
 KNOWN_SIGMAS: Final = 2.0
-"""Least ratio of N^2, B^2 or K^2 to its standard error for a known figure: N, B or K is within 25 %."""
+"""Ratio of a squared noise figure to its standard error from which the figure counts as known, within 25 %."""
 UPPER_SIGMAS: Final = 1.645  # One-sided 95 %: upper limit of an unknown figure
 LEAST_SLOTS: Final = 8  # Least seconds of a stretch: a shorter one shows white noise only
 LONGEST_S: Final = 256
@@ -221,10 +221,10 @@ _UNBOUNDED: Final = 1e6
 
 
 class AllanCurve(NamedTuple):
-    """Allan variances of a recording at rest; k rows, one per averaging time and stretch.
+    """Allan variances of a recording at rest; k rows, one for each averaging time of each uninterrupted part.
 
-    `spans`: averaging times, s; `counts`: seconds in an average, fewer if the stretch has holes; `freedom`: independent
-    squares; (k,) each. `variance` is (k, c).
+    `spans` (k,): averaging times, s. `counts` (k,): seconds in an average, fewer if some are missing. `freedom` (k,):
+    number of independent squares. `variance` (k, c): Allan variances of c axes.
     """
 
     spans: Floats
@@ -234,10 +234,10 @@ class AllanCurve(NamedTuple):
 
 
 class AxisFit(msgspec.Struct, frozen=True):
-    """N, B and K of one axis in its unit (times sqrt(s), 1, over sqrt(s)); `known`: the recordings determine it.
+    """Noise N, B, K of one axis, fitted to recordings; in the axis' unit times sqrt(s), 1, and over sqrt(s).
 
-    `sigmas` are the standard errors of the squares N^2, B^2, K^2; `upper` the one-sided 95 % limits, infinite if the
-    recordings are too short.
+    `sigmas`: standard errors of the squares N^2, B^2, K^2. `upper`: one-sided 95 % limits of N, B, K, infinite if the
+    recordings are too short. `known`: true for each of N, B, K that the recordings determine.
     """
 
     figures: tuple[float, float, float]  # N, B, K; none is negative
@@ -247,7 +247,7 @@ class AxisFit(msgspec.Struct, frozen=True):
 
 
 def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> AllanCurve:
-    """Compute the Allan variances from the means (m, c) of ascending seconds (m,) of each stretch.
+    """Compute the Allan variances of several stretches; each is ascending seconds (m,) and their means (m, c).
 
     Raises:
         ValueError: every stretch is too short.
@@ -269,10 +269,10 @@ def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> AllanCurve:
 
 
 def fit_axis(found: AllanCurve, column: int) -> AxisFit:
-    """Estimate N, B and K of one column.
+    """Estimate white noise N, flicker B and random walk K of one axis, `column`.
 
     Raises:
-        ValueError: the column never changes.
+        ValueError: the readings of this axis never change.
     """
     spans, counts, freedom, every = found
     variance = every[:, column]
@@ -289,7 +289,7 @@ def fit_axis(found: AllanCurve, column: int) -> AxisFit:
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.diag(1e-12 * np.diag(information))))))
 
     def upper(which: int) -> float:
-        """Find the square for which an estimate this low has a probability of 5 %; a larger one scatters more."""
+        """Find the upper 95 % limit of one square: if it were true, so low an estimate would have 5 % probability."""
         limit = theta.copy()
         for _ in range(_UPPER_ROUNDS):
             before = limit[which]

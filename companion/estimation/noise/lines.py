@@ -1,16 +1,16 @@
-"""Robust means and lines through the seconds of a reading, and slopes with a sigma.
+"""Robust means and lines through one-second means of a reading, and slopes with a sigma.
 
-Huber's M-estimator over batch means, plus one MM step: c = 1.345 keeps 95 % of the efficiency on clean data; the scale
-is the median absolute deviation. It uses batch means, never samples: a median of quantised samples is worse than the
-mean (method 2.4). Sources: Huber, Annals of Mathematical Statistics 35 (1964) 73-101; the step, Yohai, Annals of
-Statistics 15 (1987) 642-656, with the weights of Beaton and Tukey, Technometrics 16 (1974) 147-185.
+The robust mean is Huber's M-estimator plus one MM step. With c = 1.345 it has 95 % efficiency on clean data; its scale
+is the median absolute deviation. It uses one-second means, never samples, because a median of quantised samples is
+worse than their mean (method.md section 2.4). Sources: Huber, Annals of Mathematical Statistics 35 (1964) 73-101;
+Yohai, Annals of Statistics 15 (1987) 642-656 (the step); Beaton and Tukey, Technometrics 16 (1974) 147-185 (weights).
 
-A line's slope may be a warm-up, whose end is the best estimate, or chance and the part's own wander (method 2.4). An
+A line's slope may be a warm-up, whose end is the best estimate, or chance and the part's own wander (section 2.4). An
 untested line costs more than it gains: its end has four times the variance of a mean, and a wandering bias returns. A
-slope must therefore exceed both the effect of white noise and that of the part's flicker and walk.
+slope must therefore exceed both the effect of white noise and the effect of the part's flicker and random walk.
 
-The slope of a turn (`fit_slope`) has three uncertainties (method 2.6): the white noise of the seconds; slow wander,
-known from the Allan deviation of the readings; coarse steps, which may hide a slope.
+The slope of a turn (`fit_slope`) has three uncertainties (method.md section 2.6): white noise of the one-second means,
+slow wander, and coarse steps, which may hide a slope. The Allan deviation of the readings shows the slow wander.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from companion.physics.statistics import MAD_TO_SIGMA, student_quantile
 
 HUBER_C: Final = 1.345
 BIWEIGHT_C: Final = 6.0
-"""Scales beyond which a value does not count at all in `robust_mean`. Simulated, 60 values: clean data lose
-2.2 % of variance (with Huber's mean alone 5 %). A knock in 5 % of the values costs 4 % of sigma instead of 26 %."""
-STANDS_OUT: Final = 4.5  # Scales from Huber's mean from which a value may be a knock
+"""Distance from the centre, in robust sigmas, from which `robust_mean` ignores a value. Simulation of 60 values: clean
+data lose 2.2 % of variance (Huber's mean: 5 %). A knock in 5 % of the values costs 4 % of sigma instead of 26 %."""
+STANDS_OUT: Final = 4.5  # Distance from Huber's mean, in robust sigmas, from which a value may be a knock
 _MEAN_ABS_TO_SIGMA: Final = 1.2533
 _EQUAL: Final = 1e-6
 _ROUNDS: Final = 30
 _CONVERGED: Final = 1e-4
 
 RAMP_T: Final = 5.0
-"""Threshold for |t| of a ramp; higher in a short window. On sensors without a ramp, a lower threshold costs more than
-it gains (method 2.4)."""
+"""Threshold for the t statistic of a slope that counts as a ramp; higher in a short window. On sensors without a ramp,
+a lower threshold costs more than it gains (method.md section 2.4)."""
 RAMP_FLOORS: Final = 3.0
-"""Threshold for a ramp, in sigmas of the slope from the part's flicker and walk. In a minute of an ADIS16405's
-accelerometers flicker alone makes 8 % of slopes exceed |t| = 5; the ends of these lines add 12 % to the rms error."""
+"""Threshold for a ramp, in sigmas of the slope that the part's flicker and random walk cause. In one minute of an
+ADIS16405's accelerometer, flicker alone makes 8 % of slopes exceed |t| = 5; their ends add 12 % to the rms error."""
 RAMP_BATCHES: Final = 8  # Least seconds for a line
 _ONE_IN_10000: Final = 3.8906  # Two-sided normal quantile for one case in 10 000
 
 FEWEST: Final = 3
 _SPANS: Final = 5
 _WALKS: Final = 2.5
-"""Threshold for a walk: Allan variance over that of white noise; white noise exceeds it once in forty."""
+"""Allan variance over that of white noise from which a random walk is assumed; white noise exceeds it once in 40."""
 _LINE_TAKES: Final = 1.6  # Allan variance of a random walk at T/5, before over after subtraction of a line
 
 
@@ -62,7 +62,7 @@ _LINE_TAKES: Final = 1.6  # Allan variance of a random walk at T/5, before over 
 
 
 def _scale(residual: Floats) -> Floats:
-    """Return a robust sigma of every column; the mean deviation if most values are equal except for rounding."""
+    """Return a robust sigma (c,) of residuals (m, c); the mean deviation if most are equal except for rounding."""
     size = np.abs(residual)
     mad = MAD_TO_SIGMA * np.median(size, axis=0)
     mean = _MEAN_ABS_TO_SIGMA * size.mean(axis=0)
@@ -77,9 +77,9 @@ def _weights(residual: Floats, scale: Floats, c: Floats | float) -> Floats:
 
 
 def huber_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | float = 0.0) -> Floats:
-    """Return Huber's location (c,) of every column of (m, c), m >= 1, in the unit of the values.
+    """Return Huber's robust mean (c,) of m >= 1 values in each column of (m, c).
 
-    Beyond `c` scales, a value has less weight; the scale is at least `least`. Both are scalars or (c,).
+    A value farther than `c` robust sigmas has less weight. The robust sigma is at least `least`. Both: scalar or (c,).
     """
     centre = np.median(values, axis=0)
     scale = np.maximum(_scale(values - centre), least)
@@ -95,10 +95,10 @@ def huber_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | floa
 
 
 def robust_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | float = 0.0) -> Floats:
-    """Mean of every column of (m, c): the plain one where no value stands out, else one that ignores those that do.
+    """Return the mean (c,) of each column of (m, c): the plain mean if no value is an outlier, else a robust mean.
 
-    The robust one is a step from Huber's mean with weights that reach zero at `BIWEIGHT_C` / `HUBER_C` times `c`
-    scales. Arguments and result are those of `huber_mean`.
+    The robust mean is one step from Huber's mean, with weights that reach zero at `BIWEIGHT_C` / `HUBER_C` times `c`
+    robust sigmas. The arguments are those of `huber_mean`.
     """
     centre = huber_mean(values, c, least)
     residual = values - centre
@@ -112,9 +112,9 @@ def robust_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | flo
 
 
 class RobustLine(msgspec.Struct, frozen=True):
-    """Robust straight lines through c columns, (c,) each; slope per second.
+    """Robust straight lines through c columns of m values; `end`: value at the window's end; each (c,).
 
-    `end_leverage`: variance of `end` over the variance of one value, about 4/m; a mean has 1/m.
+    `end_leverage`: variance of `end` over the variance of one value, about 4 / m; a mean has 1 / m.
     """
 
     end: Floats
@@ -126,9 +126,9 @@ class RobustLine(msgspec.Struct, frozen=True):
 def huber_line(
     times_s: Floats, values: Floats, end_s: float, c: Floats | float = HUBER_C, least: Floats | float = 0.0
 ) -> RobustLine:
-    """Fit Huber's line to every column of (m, c), m >= 3, and evaluate it at the window's end, never later.
+    """Fit Huber's robust line to each column of (m, c), m >= 3, and evaluate it at the window's end, never later.
 
-    `c` and `least` as in `huber_mean`.
+    `c` and `least` are those of `huber_mean`.
     """
     count = values.shape[0]
     time = (times_s - times_s.mean())[:, None]
@@ -164,16 +164,16 @@ def huber_line(
 
 
 def is_ramp(line: RobustLine, count: int, wander: Floats) -> NDArray[np.bool_]:
-    """Return (c,) flags of slopes that are ramps; `wander`: variance of a slope from the part's flicker and walk."""
+    """Return (c,) true for slopes that are ramps; `wander`: variance of a slope that flicker and walk may cause."""
     chance = np.abs(line.t_statistic) > slope_limit(count)
     return np.asarray(chance & (np.abs(line.slope) > RAMP_FLOORS * np.sqrt(wander)))
 
 
 def slope_limit(count: int) -> float:
-    """Return the |t| threshold for the slope through `count` values, at least 3: `RAMP_T`, or more for few values.
+    """Return the threshold for |t| of a slope through at least 3 values: `RAMP_T`, or more if `count` is small.
 
-    In 0.36 % of windows of 10 values, |t| > 5 by chance, and the end of such a line is far off. Student's t with a
-    probability of 1 in 10 000 is 7.2 for 10 values; from 20 values on it is below 5.
+    In 0.36 % of windows of 10 values, |t| exceeds 5 by chance, and the line's end is then far off. Student's t with a
+    probability of 1 in 10 000 is 7.2 for 10 values; from 20 values on, it is below 5.
     """
     return max(RAMP_T, student_quantile(_ONE_IN_10000, count - 2.0))
 
@@ -182,7 +182,7 @@ def slope_limit(count: int) -> float:
 
 
 class Slope(msgspec.Struct, frozen=True):
-    """Slopes of lines through c columns of m values, with variance and white noise about the line; each (c,)."""
+    """Slopes of lines through c columns of values, with variance of the slope, and white noise about the line; (c,)."""
 
     per_s: Floats
     variance: Floats
@@ -198,9 +198,9 @@ def fit_slope(
     walk: Floats | float = 0.0,
     hidden: Floats | float = 0.0,
 ) -> Slope:
-    """Fit the slope of every column of one-second means, (m, c), at m >= `FEWEST` ascending slots.
+    """Fit the slope of each column of one-second means (m, c), at m >= `FEWEST` ascending seconds `slots`.
 
-    White noise N, flicker B and walk K are lower limits, scalars or (c,); `hidden`: largest rounding error, +/-.
+    `white`, `flicker`, `walk`: lower limits for N, B, K, scalars or (c,). `hidden`: largest rounding error, +/-.
     """
     length_s = float(slots[-1] - slots[0] + 1)
     time = slots - np.add.reduce(slots) / len(slots)
@@ -225,10 +225,10 @@ def plain_slope(times: NDArray[np.int64], values: Floats) -> float:
 
 
 def _wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Floats, Floats]:
-    """Estimate B or K of the residuals, (c,), from the excess of the Allan deviation at T/5 over white noise.
+    """Estimate flicker B, or else random walk K, of residuals (c,) from the Allan deviation at T/5 over white noise.
 
-    The result is widened for few spans. No sigma includes a walk too small to show in one window: K = 0.1 N per s
-    doubles the error of a minute's slope, while its Allan variance is half that of the white noise.
+    The result is widened if spans are few. No sigma includes a walk too small to show in one window. For example, K =
+    0.1 N per s doubles the error of a minute's slope, while its Allan variance is half that of the white noise.
     """
     span = int(slots[-1] - slots[0] + 1) // _SPANS
     if span < 2:
@@ -243,9 +243,10 @@ def _wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[F
 
 
 def hidden_by_steps(step: float, variance: float, *, enough: bool = True) -> float:
-    """Bound the error (+/-) of the mean of readings rounded to `step` (0 for floats), from their variance.
+    """Return the largest error (+/-) of the mean of readings rounded to `step` (0 for floats), from their variance.
 
-    (q / pi) exp(-2 pi^2 sigma^2 / q^2) (method 2.5), at most half a step. Too few values (not `enough`): half a step.
+    It is (q / pi) exp(-2 pi^2 sigma^2 / q^2) for step q (method.md section 2.5), at most half a step. If values are too
+    few (not `enough`), it is half a step.
     """
     if step <= 0.0 or not enough:
         return max(step, 0.0) / 2.0

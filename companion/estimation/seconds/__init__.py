@@ -1,1 +1,1 @@
-"""Samples gathered into batches of one second."""
+"""One-second batches of samples, and turns counted from samples."""

@@ -1,7 +1,7 @@
-"""One-second batches: the summary of a stream that is kept.
+"""One-second batches: the summary of a stream that is stored instead of its samples.
 
-Batches lie on one grid for all sources: slot k holds k <= t < k + 1 s of the host's clock. Samples are plain tuples
-until a slot is over; then numpy summarises them once.
+All streams share one grid of seconds: slot k holds the samples with k <= t < k + 1 s of the host's clock. Samples are
+plain tuples until a slot is over; then numpy summarises them once.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from companion.physics.frames import Floats
 
 MAX_SAMPLES: Final = 4096  # Maximum samples of one slot, ten times the fastest stream; more are dropped and counted
 MAX_LEVELS: Final = 1024
-"""Largest range of integers in one second for which a histogram is kept; at rest the range is a tenth of this."""
+"""Largest range of integers in one second for which a histogram is stored; at rest the range is a tenth of this."""
 
 _EVEN: Final = 1.4999  # Counter steps within this ratio of each other count as one sample each
 _OFF_BEAT: Final = 0.25
-"""Largest distance of a step from a multiple of the usual one that shows a loss: lost samples skip whole steps."""
+"""Largest distance of a counter step, in usual steps, from a whole number: lost samples skip whole steps."""
 _MOST_OFF_BEAT: Final = 0.2
-"""Largest share of irregular steps; beyond, stamps show no losses, because the sender sends only some samples."""
+"""Share of irregular steps above which stamps do not show losses, because the sender sends only some samples."""
 _LEAST_OF_A_PART: Final = 3
 _FINEST: Final = 5  # Halvings of a second, down to 1/32 s; anything faster is vibration
 _PINNED_SIGMAS: Final = 4.0
@@ -40,20 +40,20 @@ _MAX_DECIMALS: Final = 4
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """Histogram of one second: counts (k, c) of the integers from `lowest` (c,) on, in steps."""
+    """Histogram of one second of integers. `table` (k, c): counts of the k integers from `lowest` (c,) on."""
 
     lowest: NDArray[np.int64]
     table: NDArray[np.int32]  # (k, c), k at most `MAX_LEVELS`
 
 
 class Batch(msgspec.Struct, frozen=True):
-    """One second of one source; arrays are (c,) over its channels, in the source's units.
+    """Summary of one second of one stream; arrays are (c,) over the channels, in the stream's units.
 
-    `white`: half the mean square of successive differences (von Neumann), the white part of the variance. `missing`:
-    samples lost, from the device's counter or clock; None without one that counts samples. `counts`: histogram of
-    integers; None for floats, and for a second that spans more than `MAX_LEVELS`. `allan`: (k, c) Allan variances at
-    averaging times of 1/2, 1/4 ... 1/32 of the second, each of three samples or more. `shared_variance`: (6,)
-    variance of an error that all samples of an IMU have in common, in this second and others.
+    `white`: white-noise part of the variance, half the mean square of successive differences (von Neumann). `missing`:
+    number of lost samples by the device's counter or clock, None if neither counts samples. `counts`: histogram of
+    integers; None for floats, and for a range above `MAX_LEVELS`. `allan` (k, c): Allan variances at averaging times of
+    1/2, 1/4 ... 1/32 s, if that is three samples or more. `shared_variance` (6,): variance of an error that all samples
+    of an IMU share, in this second and others.
     """
 
     slot: int
@@ -84,7 +84,7 @@ def summary(
     steps: Floats | None = None,
     shared_variance: Floats | None = None,
 ) -> Batch:
-    """Summarise at least one row (n, c) of one second; `circle`: unroll angles; `steps`: of an integer stream."""
+    """Summarise the rows (n, c), n >= 1, of one second. `circle`: unrolled angles. `steps` (c,): LSB of integers."""
     n = len(rows)
     ordered = np.sort(rows, axis=0)
     distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
@@ -111,7 +111,7 @@ def summary(
 
 
 def _allan_within(off: Floats) -> Floats:
-    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of three rows or more each."""
+    """Return Allan variances (k, c) of one second's rows (n, c): over 1/2, 1/4 ... of it, at least 3 rows each."""
     firsts, sizes = _parts_of(len(off))
     depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))
@@ -125,7 +125,7 @@ def _allan_within(off: Floats) -> Floats:
 
 @functools.lru_cache(maxsize=64)
 def _parts_of(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Divide n samples into k parts, a power of two; return each part's first sample, (k,), and size, (k, 1)."""
+    """Divide n samples into k parts, k a power of two; return each part's first sample (k,) and size (k, 1)."""
     depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
     edges = np.arange((1 << depth) + 1) * n >> depth
     return edges[:-1], np.diff(edges)[:, None]
@@ -144,7 +144,7 @@ def _counts(rows: Floats, steps: Floats) -> Counts | None:
 
 
 def unrolled(rows: Floats) -> Floats:
-    """Unroll angles in degrees, (n, 1), from the first finite one."""
+    """Unroll angles (n, 1), degrees, to within 180 degrees of the first finite one."""
     finite = rows[np.isfinite(rows[:, 0]), 0]
     if len(finite) == 0:
         return rows
@@ -153,9 +153,9 @@ def unrolled(rows: Floats) -> Floats:
 
 
 def _fresh(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
-    """Mark rows, (n,), that do not repeat both stamp and values of an earlier one (a packet over a second route).
+    """Return (n,) false for rows that repeat stamp and values of an earlier row, as if sent over a second route.
 
-    A stamp alone is not enough: counters wrap, and some devices' clocks do not advance.
+    An equal stamp alone is not enough: counters wrap, and some devices' clocks do not advance.
     """
     if (stamps[1:] > stamps[:-1]).all():
         return np.ones(len(rows), dtype=np.bool_)
@@ -164,10 +164,10 @@ def _fresh(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
 
 
 def _missing(stamps: Floats) -> int | None:
-    """Count lost samples from the steps of a counter or of a clock in seconds.
+    """Count lost samples from the steps of a counter, or of a clock in seconds; None if stamps do not count samples.
 
-    The step is learned, because some devices count at an internal rate; a step down, as after a restart, is no loss.
-    None if stamps do not count samples: PX4 sends the newest sample (every 4 ms) whenever a message is due.
+    The usual step is learned, because some devices count at an internal rate. A step down, as after a restart, is no
+    loss. PX4's stamps do not count samples: it sends the newest sample (every 4 ms) whenever a message is due.
     """
     steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
@@ -181,11 +181,11 @@ def _missing(stamps: Floats) -> int | None:
 
 
 def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
-    """Return whether a channel's lowest or highest value is by far its most frequent one.
+    """Return true if a channel's lowest or highest value is by far its most frequent one: the end of its range.
 
-    Noise gets rare towards its extremes, so a pile there shows the end of the range. Few distinct values prove nothing:
-    the quantised stream of a still sensor has few. Of 50 integers, the lowest is sometimes the most frequent by chance,
-    so its count must exceed the next by four standard deviations.
+    Noise rarely reaches its extremes, so many equal values there show the end of the range. Few distinct values prove
+    nothing: the quantised stream of a still sensor has few. Of 50 integers, the lowest is sometimes the most frequent
+    by chance, so its count must exceed the next by four standard deviations.
     """
     if len(ordered) <= _PINNED_SAMPLES:
         return False
@@ -203,7 +203,7 @@ def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
 
 
 def decimal(low: Floats, high: Floats) -> Floats:
-    """Find the unit of the last printed decimal, (c,), from lowest and highest readings of seconds, (..., c)."""
+    """Return the unit of the last printed decimal (c,), such as 0.01, from lowest and highest readings (..., c)."""
     ends = np.vstack((low, high))
     found = np.full(ends.shape[1], 10.0**-_MAX_DECIMALS)
     for digits in range(_MAX_DECIMALS - 1, -1, -1):
@@ -213,15 +213,15 @@ def decimal(low: Floats, high: Floats) -> Floats:
 
 
 def few_distinct(distinct: Floats | NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (c,) flags of channels with at most two values in every second (m, c): noise does not spread them."""
+    """Return (c,) true if noise does not spread a channel: at most 2 values a second, by their number (m, c)."""
     return np.asarray(distinct.max(axis=0) < 3)
 
 
 class BatchSource:
-    """Collects one stream into batches. No sample value raises an exception; dropped samples are counted by reason.
+    """Collects one stream into one-second batches. No sample value raises an exception; dropped samples are counted.
 
-    Values beyond `limits` (c,) are dropped; `keep` batches are kept. `circle`: the single channel is an angle in
-    degrees. `steps` (c,): resolution of an integer stream, for which every batch has a histogram.
+    Values beyond `limits` (c,) are dropped; the latest `keep` batches are stored. `circle`: the single channel is an
+    angle in degrees. `steps` (c,): resolution of an integer stream, for which every batch has a histogram.
     """
 
     def __init__(
@@ -230,17 +230,17 @@ class BatchSource:
         self.dropped: Counter[str] = Counter()
         self.batches: dict[int, Batch] = {}
         self.closed_through: int | None = None
-        """Last closed slot: no batch of it or of an earlier slot will follow."""
+        """Last closed second: no batch of that second or of an earlier one will follow."""
         self.last_s: float | None = None
         self.begun: int | None = None
-        """First second of the stream since its last pause of more than `_PAUSE_S`."""
+        """First second of the stream after its last pause of more than `_PAUSE_S`."""
         self.lost = 0  # Samples lost since the beginning, by the device's counter or clock
         self.restarts = 0  # Number of times that the clock went back and everything was dropped
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
-        """Plausibility check of a second's temperature: takes slot and degC, returns the temperature, or None."""
+        """Plausibility check of temperatures: receives second and degC, returns the temperature to use, or None."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
-        """Callback for every second: batch, times (n,) and rows (n, c), before these are dropped."""
+        """Callback for every second: receives the batch, and times (n,) and rows (n, c) of its samples."""
         self._restart()
 
     def _restart(self) -> None:
@@ -264,7 +264,7 @@ class BatchSource:
         self._shared_variance: tuple[float, ...] | None = None
 
     def forget(self) -> None:
-        """Drop all batches and the current second; counts stay."""
+        """Drop all batches and the current second, but not the counts of lost and dropped samples."""
         self.batches.clear()
         if self._slot is not None:
             self.closed_through = self._slot
@@ -278,7 +278,7 @@ class BatchSource:
         stamp: float | None = None,
         shared_variance: tuple[float, ...] | None = None,
     ) -> bool:
-        """Add one sample; return True if it closes a second, or shows a clock set back."""
+        """Add one sample; return true if it completes a second, or shows that the clock was set back."""
         ended = False
         if not self._newest <= t_s < self._slot_end:
             if not self._newest <= t_s < _MAX_TIME_S:

@@ -1,8 +1,8 @@
-"""Turn of an aircraft on its spot, from its gyro samples integrated as rotations.
+"""Turn of an aircraft at its place, from gyro samples integrated as rotations.
 
-Turning an aircraft by hand tilts it, too. In half a turn, the integral of rates about down alone is wrong by 0.5 deg
-at a tilt of 4 deg, and by 5 deg at 12 deg; with all three axes by 0.05 and 0.1 deg (simulated: scales of 1 %, axes
-0.5 deg from square). The gyros' scale error remains, 1.8 deg in half a turn; a closed circle shows it (`align_model`).
+Somebody who turns an aircraft also tilts it. Simulated for half a turn, scales of 1 % and axes 0.5 deg from square, the
+integral of the rate about down is wrong by 0.5 deg at a tilt of 4 deg, by 5 deg at 12 deg. With all three axes it is
+wrong by 0.05 and 0.1 deg. The gyros' scale error of 1.8 deg remains; a closed circle shows it (`align_model`).
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ import numpy as np
 from companion.physics.frames import Array, Floats, Matrix, rotations, running_products
 from companion.samples import ImuSample
 
-MAX_SAMPLES: Final = 60_000  # Ten minutes at 100 Hz, 2.4 MB, since the last stand; a longer turn is not counted
+MAX_SAMPLES: Final = 60_000  # Ten minutes at 100 Hz, 2.4 MB, since the last pose; a longer turn is not counted
 LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
-"""Longest gap beyond the stream's interval: a turn by hand at 60 deg/s makes 3 degrees in it."""
+"""Longest gap beyond the sample interval, s: an aircraft that is turned at 60 deg/s moves 3 degrees in that time."""
 AT_REST_S: Final = 0.5  # Longest gap at rest: a turn from rest to rest takes longer
 LATE_S: Final = 0.05
-"""Largest delay of a sample; a larger difference of the clocks shows a wrong rate, as of a slow simulator."""
+"""Largest delay of a sample, s. If the clocks differ by more, their rates are unequal, as with a slow simulator."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
-"""Error of each turn besides scale and time stamps: non-orthogonal axes while the aircraft is tilted."""
+"""Sigma of each turn from non-orthogonal gyro axes while the aircraft is tilted; without scale and time stamps."""
 
 
 class Counted(NamedTuple):
-    """Turn about the vehicle's z axis, clockwise from above, not wrapped, and one sigma besides the gyros' scale."""
+    """Turn about the vehicle's z axis, clockwise from above, not wrapped, with one sigma without the gyros' scale."""
 
     angle_rad: float
     sigma_rad: float
 
 
 class TurnCounter:
-    """Buffers the latest rates of one IMU and integrates the turn between two times."""
+    """Stores the latest rates of one IMU and integrates the turn between two times."""
 
     def __init__(self) -> None:
         self._samples = array("d")
@@ -50,9 +50,9 @@ class TurnCounter:
     def counted(
         self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix, cut_rad_s: float = 0.0
     ) -> Counted | None:
-        """Integrate the turn between two times at rest; None if samples are missing. Drops older samples.
+        """Integrate the turn between two times at rest, and drop older samples; None if samples are missing.
 
-        `bias_rad_s` (3,) is in the vehicle's axes; `cut_rad_s` is the step of integers truncated toward zero.
+        `bias_rad_s` (3,): gyro bias in the vehicle's axes. `cut_rad_s`: step of integers truncated toward zero.
         """
         rows = np.array(self._samples).reshape(-1, 5)
         old = int(np.searchsorted(rows[:, 0], start_s))
@@ -87,7 +87,7 @@ class TurnCounter:
 
 
 def _turned_rad(times_s: Floats, rates_rad_s: Floats) -> float:
-    """Return the twist about z, not wrapped, of the rotation by rates (n, 3), integrated by trapezoids."""
+    """Return the angle about z, not wrapped, of the rotation by rates (n, 3), which are integrated by trapezoids."""
     vectors = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0 * np.diff(times_s)[:, None]
     turns = running_products(rotations(vectors))
     return float(np.unwrap(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))[-1])

@@ -1,1 +1,1 @@
-"""Stillness of the aircraft: gates, learned noise and the still stretch."""
+"""Stillness of the aircraft: gates on motion, learned noise, and checks of readings at rest."""

@@ -1,10 +1,10 @@
-"""Gates on the motion of the aircraft: one verdict per second and source, with a text that names the device.
+"""Gates on the motion of the aircraft: one verdict per second and sensor, with a text that names the device.
 
 Motion of an aircraft is slow compared with the sampling; sensor noise is mostly white. Half the mean square of
-successive differences measures the white part within the batch. A gate on the rest of the variance therefore works for
-a sensor of any noise from its first second on. Noise behind a filter is learned (`own_noise`). Every gate is widened
-by the chance error for the batch's number of samples. Gates on the means, and `turning`, detect a slow steady turn.
-One set of constants serves all sensors; none is tuned to a recording.
+successive differences measures the white part of a second's variance. A gate on the rest of the variance therefore
+works for a sensor of any noise, from its first second on. Noise behind a filter is learned (`own_noise`). Every gate is
+widened by the chance error for the number of samples. Gates on the means, and `turning`, detect a slow steady turn. One
+set of constants serves all sensors; none is tuned to a recording.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 GYRO_MOTION_RAD_S: Final = 0.10 * DEG
-"""Limit for the rms of the slow part of the rate in one second. 0.1 deg/s over 10 s is an attitude error of the order
-of the gradienter's own. Handling and walking cause 10 to 1000 times more, sensors at rest less than half."""
+"""Limit for the rms of slow changes of the gyro rate in one second. 0.1 deg/s over 10 s is an attitude error as large
+as the gradienter's own. Handling and walking cause 10 to 1000 times more; sensors at rest show less than half."""
 
 ACCEL_MOTION_M_S2: Final = 10.0 * MG
-"""Limit for the rms of the slow part of specific force: 10 mg is a tilt of half a degree within a second."""
+"""Limit for the rms of slow changes of specific force in one second: 10 mg is a tilt by half a degree."""
 
 GYRO_VIBRATION_RAD_S: Final = 1.0 * DEG
 ACCEL_VIBRATION_M_S2: Final = 50.0 * MG
-"""Limit for the total rms (another gate covers the slow part): three times the noisiest common sensor at its full rate.
-More shows a running motor; accelerometers rectify its vibration, so their mean is not the bias."""
+"""Limit for the total rms of specific force: three times the noisiest common sensor at its full rate. More shows a
+running motor, whose vibration accelerometers rectify: their mean is not the bias. Slow changes have their own limit."""
 
 GYRO_STEP_RAD_S: Final = 0.05 * DEG
-"""Limit for a second's mean minus the last good ones. A warm-up at 3 (deg/h)/s, more than ever seen, changes the rate
-by 0.004 deg/s over their mean age of 5 s."""
+"""Limit for the change of a second's mean rate against the last good seconds. A warm-up of 3 (deg/h)/s, more than ever
+observed, changes the rate by 0.004 deg/s over their mean age of 5 s."""
 
 ACCEL_STEP_M_S2: Final = 5.0 * MG
-"""Limit for a second's mean minus the start of the stretch: a tilt of 0.3 deg. 10 K of warming make 2 mg at most."""
+"""Limit for the change of mean force since the stretch began: a tilt of 0.3 deg. 10 K of warming cause 2 mg at most."""
 
 GYRO_BIAS_RAD_S: Final = 10.0 * DEG  # Above any turn-on bias specified for a modern part (typically 0.5 to 3 deg/s)
 
 GRAVITY_M_S2: Final = 9.81
 GRAVITY_GATE_M_S2: Final = 1.5
-"""Uncalibrated parts are off by up to 0.1 g; a larger error shows a wrong unit, a dead axis or a centrifuge."""
+"""Limit for the error of gravity's size: uncalibrated parts have 0.1 g, more is a wrong unit, dead axis, centrifuge."""
 
 TILT_MOTION_DEG: Final = 0.10
 TILT_STEP_DEG: Final = 0.10  # Ten times a field gradienter's noise, and 1.7 mg on a horizontal accelerometer
@@ -59,7 +59,7 @@ HEADING_STEP_DEG: Final = 3.0  # Accuracy class of field compasses; 3 deg cause 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
 _LEAST_RANGE: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
-"""Least range of any part: a pile of integers below it comes from swaying, at its turning points or at rest."""
+"""Smallest measuring range of any part. Many equal integers below it come from rest, or turning points of swaying."""
 STUCK_SAMPLES: Final = 10  # Least equal samples of a stuck sensor; fewer may be chance on a quiet one with coarse steps
 STUCK_S: Final = 60  # Seconds after a change in steps during which a coarse stream may show one value
 
@@ -75,15 +75,15 @@ _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
 _CHANCE_OF_FIVE: Final = 3.5  # The same for the largest of five averaging times
 COMMON: Final = (0.045 * DEG, 0.7 * MG)
-"""Density of the noisiest common gyro and accelerometer (ADIS16405), times sqrt(s): accepted from the first second."""
+"""Noise N of the noisiest common gyro and accelerometer (ADIS16405), SI * sqrt(s): accepted from the first second."""
 _LEAST_HALVINGS: Final = 4  # Of a second: 1/16 s of three samples or more, from 48 Hz on
 _STATIONARY: Final = 2.0  # Largest ratio of noise at rest to its usual variance
 
 
 class GateVerdict(msgspec.Struct, frozen=True):
-    """Verdict of one gate on one second; `words` name the device; empty: still.
+    """Verdict of one gate on one second. `words`: reason, with the device's name, why it is not still.
 
-    `fault`: the device, not the aircraft, blocks the calibration. `what`: the text without figures, for counting.
+    `fault`: the device, not the aircraft, blocks the calibration. `what`: reason without numbers, to count verdicts.
     """
 
     still: bool
@@ -96,7 +96,7 @@ STILL: Final = GateVerdict(still=True)
 
 
 def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> GateVerdict:
-    """Format a verdict as in 'gyro fc moves 0.31 deg/s, max 0.10', with enough digits to show the difference."""
+    """Make a verdict with a text as in 'gyro fc moves 0.31 deg/s, max 0.10'; enough digits show the difference."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
@@ -109,10 +109,10 @@ def _fault(words: str) -> GateVerdict:
 
 
 def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, float]) -> tuple[float, float]:
-    """Return the rms of the slow part over the channels, and its limit: the gate, widened for chance.
+    """Return the rms of slow changes over the channels, and the limit for it: the gate, widened for chance.
 
-    The difference of the two variance estimates of white noise has a variance of about sigma^4 / n per channel. Here
-    sigma^2 is the batch's own white part, limited to `bounds`, because fast motion looks partly white.
+    For white noise, variance minus `Batch.white` has a variance of about sigma^4 / n per channel. Here sigma^2 is the
+    second's own `white`, limited to `bounds`, because fast motion looks partly white.
     """
     white = batch.white[channels]
     chance = _CHANCE * float(np.clip(white.mean(), *bounds)) / math.sqrt(batch.n * len(white))
@@ -120,10 +120,10 @@ def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, 
 
 
 def _slow_by_density(batch: Batch, channels: slice, gate: float, density: float) -> tuple[float, float]:
-    """Return the rms of the slow part over the channels, and its limit, from the Allan variances within the second.
+    """Return the rms of slow changes over the channels, and the limit for it, from Allan variances in the second.
 
-    Noise behind a filter above some 10 Hz has one density, Allan variance times averaging time, at all times. Behind a
-    lower one it falls towards short times. Motion adds to the long ones.
+    Density is Allan variance times averaging time. Behind a filter above some 10 Hz, noise has one density at all
+    times; behind a lower filter, its density falls towards short times. Motion adds density at long times.
     """
     parts = parts_of_second(len(batch.allan))
     noise = density * parts
@@ -135,14 +135,14 @@ def _slow_by_density(batch: Batch, channels: slice, gate: float, density: float)
 
 
 def _shortest_density(batch: Batch) -> Floats:
-    """Return the density (6,) at the shortest averaging time: N^2 if no filter acts on it."""
+    """Return the noise density (6,) at the shortest averaging time, which is N^2 unless a filter reduces it."""
     return batch.allan[-1] / 2.0 ** len(batch.allan) if len(batch.allan) >= _LEAST_HALVINGS else batch.white / batch.n
 
 
 class ImuGate:
-    """Gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes.
+    """Gate on the motion of one IMU. Its six channels are gyro, rad/s, then accelerometer, m/s^2, in any fixed axes.
 
-    `steps`: resolution of a stream of integers, 0 for floats; `own`: its learned noise, if any.
+    `steps`: resolution of a stream of integers, 0 for floats. `own`: learned noise of this IMU, if any.
     """
 
     def __init__(
@@ -157,21 +157,21 @@ class ImuGate:
         self._white = profile.gyro.white, profile.accel.white
         self._is_float = np.repeat(steps, 3) == 0.0
         self._few_levels_s = np.zeros(6, dtype=np.int64)
-        """Seconds with few levels since the last one with many, for each channel."""
+        """Number of seconds (6,) with few distinct readings since the last second with many."""
         self._coarse_slot = [-math.inf, -math.inf]
-        """Latest second in which the gyro, or the accelerometer, changed in coarse steps."""
-        self._densities: deque[Floats] = deque(maxlen=_RECENT)  # of seconds without motion
+        """Latest seconds in which gyro and accelerometer changed in coarse steps, one for each triad."""
+        self._densities: deque[Floats] = deque(maxlen=_RECENT)  # Noise densities of seconds without motion
         self._density = np.zeros(6)
-        """Density of the noise, N^2, from these seconds; zero before the first."""
+        """Noise density N^2, median of the latest seconds without motion; zero before the first of them."""
         self.new_stretch()
 
     def new_stretch(self) -> None:
-        """End the still stretch: restart the references, but keep the learned noise."""
+        """End the still stretch: drop the reference readings, but not the learned noise."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
 
     def forget_level(self) -> None:
-        """Drop references after a write of offsets or a restart: later readings cannot be compared with them."""
+        """Drop the reference readings after a write of offsets or a restart, which may change all later readings."""
         self._own.clear()
         self.new_stretch()
 
@@ -203,10 +203,10 @@ class ImuGate:
         return None
 
     def _watch_steps(self, batch: Batch) -> None:
-        """Detect a coarse stream of floats: some logs round, some parts have few digits.
+        """Detect a stream of floats with coarse steps: some logs are rounded, and some parts have few digits.
 
-        If noise is smaller than a step, seconds without a change, or toggling between two values, are both rest. One
-        second of few values may be a frozen sensor; several are not.
+        If the noise is smaller than a step, a still sensor shows one value or toggles between two. One second with few
+        values may come from a frozen sensor; several seconds show coarse steps.
         """
         levels = batch.distinct
         few = (levels >= 2) & (levels <= _FEW_LEVELS) & (levels * _TIMES_EACH <= batch.n)
@@ -259,7 +259,7 @@ class ImuGate:
             return _words(f"gyro {name} turns or is biased by", turns / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         if not self._recent:
             return None
-        # A few samples say little about their own scatter; what is known says more.
+        # A few samples hardly show their own scatter; the learned noise does.
         scatter = np.maximum(batch.variance / batch.n, self._density)
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
@@ -275,13 +275,13 @@ class ImuGate:
 
 
 def _beyond(values: Floats, reference: Sequence[Floats], chance: Floats) -> float:
-    """Return the largest difference of a channel from the mean of the reference, beyond chance."""
+    """Return the largest difference of a channel from the mean of the reference, minus the difference by chance."""
     scatter = math.sqrt(1.0 + 1.0 / len(reference))  # sigma of the difference over that of one mean
     return float((np.abs(values - np.mean(reference, axis=0)) - scatter * chance).max())
 
 
 class PoseGate:
-    """Gate of the gradienter (two channels, deg) or of the compass (one channel on the circle, deg)."""
+    """Gate on the motion of the gradienter (two channels, deg) or of the compass (one channel on the circle, deg)."""
 
     def __init__(self, name: Literal["gradienter", "compass"]) -> None:
         self._name = name

@@ -1,17 +1,17 @@
-"""Noise of a still sensor of any spectrum, learned from its stream and distinguished from motion by physics.
+"""Noise of a still sensor with any spectrum: learned from its stream, and distinguished from motion by physics.
 
-Behind a low-pass filter, the noise of a still sensor is as slow and as large as the motion of an aircraft. Four facts
-distinguish them:
+Behind a low-pass filter, the noise of a still sensor can be as slow and as large as the motion of an aircraft. Four
+facts distinguish noise from motion:
 
-- Noise behind any filter is flat down to zero frequency, or rises there (flicker): its density, the Allan variance
+- Noise behind any filter is flat down to zero frequency, or rises there (flicker). Its density, the Allan variance
   times the averaging time, never grows towards shorter times. A standing aircraft only rocks: its angle is bounded, so
-  its rate has no power at zero frequency and a peak at the rocking frequency. The same holds for acceleration.
+  its rate has no power at zero frequency, but a peak at the rocking frequency. Its acceleration is alike.
 - Noise is steady: no second is an outlier among the others.
 - Noise has no favourite axis.
 - No part on the market exceeds a known density.
 
-The density at averaging times of a second and more gives the chance error of a second's mean. With the variance, it
-gives the number of independent values in a second, which is smaller than that of samples behind a filter.
+The density at averaging times of one second and more gives the chance error of a one-second mean. Variance over density
+is the number of independent values in a second; behind a filter, it is smaller than the number of samples.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 LEARN_S: Final = 30
-"""Seconds, without motion beyond any noise, needed to learn the noise: some 70 degrees of freedom in three axes."""
+"""Seconds of rest needed to learn the noise: they give some 70 degrees of freedom in three axes."""
 KEPT_S: Final = 60
 EVERY_S: Final = 5  # Period of learning until both triads are known, then `LEARN_S`
 MOST: Final = (0.07 * DEG, 1.0 * MG)
-"""Largest plausible density of gyro and accelerometer, times sqrt(s): 250 deg/h (the noisiest common gyro has 150), and
-three times the noisiest common accelerometer."""
+"""Largest plausible noise N of gyro and accelerometer, SI * sqrt(s): 250 deg/h * sqrt(s) (the noisiest common gyro has
+150), and three times the noisiest common accelerometer."""
 RED: Final = 2.0
-"""Largest density ratio between averages of several seconds and of one, or of one and half a second. Flicker, warm-up
-and a 1 Hz filter raise it; slow rocking makes it 8 at twice the time."""
+"""Largest ratio of noise densities at averaging times of several seconds and of one, or of one and of half a second.
+Flicker, warm-up and a 1 Hz filter raise the ratio; slow rocking makes it 8 at twice the time."""
 WHITE: Final = 0.8
-"""Share of the variance in successive differences above which noise is white, without a filter."""
+"""Share of the variance in successive differences above which noise counts as white, that is, unfiltered."""
 ROUND: Final = 40.0
-"""Limit for largest over smallest variance of steps in any direction: some axes are three times as noisy as others."""
+"""Limit for the ratio of noise variances in the noisiest and quietest direction: axes' sigmas differ up to 3 times."""
 _SIGMAS: Final = 2.5
 _OUTLIER_SIGMAS: Final = 4.5
 _BEYOND: Final = 1.6  # Limit in multiples of the largest density, beyond which a second is motion
@@ -52,14 +52,14 @@ _NAMED: Final = 1.5  # Margin over the density of a part that the configuration 
 _AT_REST: Final = 3.0
 _HINT_S: Final = 5  # Seconds without motion beyond any noise after which a hint may say that it is noise
 _SHARPEST: Final = 1.5
-"""Relative variance of a second's variance, v / N^2: 1 for white noise or 1 pole, 1.5 for 2 poles, 2 for a wall."""
+"""Variance of a second's variance v, over v N^2: 1 for white noise or one filter pole, 1.5 for 2 poles, 2 for many."""
 
 
 class Known(msgspec.Struct, frozen=True):
-    """Noise of the three axes of one triad at rest, in squares of its unit.
+    """Learned noise of the three axes of one triad at rest, in squares of the triad's unit; each (3,).
 
-    `variance` is that of one sample, `white` its part in successive differences (`Batch.white`), `density` the N^2 at
-    low frequencies: the variance of a second's mean.
+    `variance`: of one sample. `white`: the part of it in successive differences (`Batch.white`). `density`: N^2 at low
+    frequencies, which is the variance of a one-second mean.
     """
 
     variance: Floats
@@ -68,25 +68,25 @@ class Known(msgspec.Struct, frozen=True):
 
     @property
     def chance(self) -> float:
-        """Return the standard deviation of a second's variance, mean of the three axes."""
+        """Return the standard deviation of one second's variance, averaged over the three axes."""
         return math.sqrt(_SHARPEST * float(self.variance @ self.density)) / 3.0
 
     @property
     def freedom(self) -> float:
-        """Return the number of independent values per axis in a second."""
+        """Return the number of statistically independent values per axis in one second."""
         return max(float(self.variance.sum() / self.density.sum()) / _SHARPEST, 1.0)
 
 
 class OwnNoise:
-    """Learns the noise of one IMU from its seconds, moving or not; gives no result before it is certain.
+    """Learns the noise of one IMU from its seconds, at rest or not; has no result until it is certain.
 
-    `white`: N of the profile, gyro and accelerometer; a named part may be noisier than common ones. `at_rest`: the
-    operator confirms rest, so three times as much noise is accepted.
+    `white`: the profile's white noise N of gyro and accelerometer; a configured part may be noisier than common parts.
+    `at_rest`: the operator confirms rest, so three times as much noise is accepted.
     """
 
     def __init__(self, white: tuple[float, float] = (0.0, 0.0), *, at_rest: bool = False) -> None:
         self.known: list[Known | None] = [None, None]
-        """Learned noise of gyro and accelerometer; each stays until a newer one is learned."""
+        """Learned noise of gyro and of accelerometer; unchanged until newer noise is learned. None: not learned yet."""
         believed = [max(_AT_REST * m if at_rest else m, _NAMED * n) for m, n in zip(MOST, white, strict=True)]
         self._most2 = np.repeat(np.square(believed), 3)
         self._at_rest = at_rest
@@ -94,13 +94,13 @@ class OwnNoise:
         self.clear()
 
     def clear(self) -> None:
-        """Drop readings that later ones cannot be compared with; keep the learned noise."""
+        """Drop readings with which later ones cannot be compared, but not the learned noise."""
         self._seconds.clear()
         self._since = 0
         self._too_much = [False, False]
 
     def hint(self, triad: int) -> str:
-        """Return a hint that the motion of gyro (0) or accelerometer (1) may be noise; empty if it is not."""
+        """Return a hint that apparent motion of gyro (0) or accelerometer (1) may be noise; else empty."""
         if self._at_rest or self.known[triad] is not None:
             return ""
         if self._too_much[triad]:
@@ -176,7 +176,7 @@ def _noise(seconds: list[Batch], part: slice) -> Known | None:
 
 
 def _ratio(first: float, second: float) -> float:
-    """Return the largest chance ratio of two estimates of one variance, from their degrees of freedom."""
+    """Return the largest ratio, by chance, of two estimates of one variance, from their degrees of freedom."""
     return math.exp(_SIGMAS * math.sqrt(2.0 / max(first, 1.0) + 2.0 / max(second, 1.0)))
 
 
@@ -185,5 +185,5 @@ def parts_of_second(depth: int) -> Floats:
 
 
 def freedom_of(parts: Floats) -> Floats:
-    """Return the degrees of freedom of the Allan variance for a number of parts of a second."""
+    """Return the degrees of freedom of an Allan variance within a second that is divided into `parts` averages."""
     return np.maximum(0.75 * parts - 1.0, 1.0)

@@ -1,7 +1,7 @@
 """Detection of readings at rest that no bias explains: gravity along the wrong axis, or biases beyond any part's.
 
-The cause is a wrong mounting, exchanged axes or a wrong unit; the text names it with its remedy. The gates, the
-estimate and `companion check` use this.
+The cause is a wrong mounting, exchanged axes or a wrong unit. The text names the cause and the remedy. The gates, the
+estimate and `companion check` use this module.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from companion.samples import Triad
 MOST_GYRO_RAD_S: Final = 30.0 * DEG
 MOST_ACCEL_M_S2: Final = 0.3 * G  # Several times the worst power-up bias in data sheets
 _TILTED_RAD: Final = math.radians(20.0)
-"""Angle between gravity by the IMU and by the tilt; the largest bias turns it by 17 degrees."""
+"""Largest plausible angle between gravity by IMU and by tilt sensor: the largest bias turns gravity by 17 degrees."""
 _COMMON_BIAS_M_S2: Final = 0.05 * G  # Most parts' bias at power-up is below: 0.02 to 0.05 g in data sheets
 _EXPLAINED: Final = 0.3  # Largest error left, over the error before, if a turned tilt sensor explains it
 _FITS_M_S2: Final = 0.2 * G
 _AS_WELL_M_S2: Final = 0.02 * G
-"""Difference below which mountings fit equally, as ROLL_180 and PITCH_180 do when level; the simplest counts."""
+"""Difference below which two mountings fit equally, as ROLL_180 and PITCH_180 do when level; choose the simplest."""
 _AXES: Final = "xyz"
 _UNITS: Final = {"g": G, "mg": 1e-3 * G, "cm/s^2": 0.01, "ft/s^2": 0.3048}
 _GRAVITY_M_S2: Final = (8.3, 11.3)
@@ -44,10 +44,10 @@ def implausible(
     sensor_to_vehicle: Matrix,
     remedy: str,
 ) -> dict[Triad, str]:
-    """Return, by triad, the reason why means of one IMU over a still stretch cannot be biased readings.
+    """Return, for each implausible triad of a still IMU, the reason why no bias explains its mean readings.
 
-    The means and `expected_m_s2`, the specific force from the tilt, are (3,) in vehicle FRD; `remedy` is the text on
-    how to configure another mounting, with {} for its name.
+    The means and `expected_m_s2`, the specific force by the tilt sensor, are (3,), vehicle axes (FRD). `remedy`: text
+    on how to configure another mounting, with {} for the name of that mounting.
     """
     if words := misplaced(name, force_m_s2, expected_m_s2, sensor_to_vehicle, remedy):
         return {"gyro": words, "accel": words}
@@ -69,7 +69,7 @@ def implausible(
 
 
 def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehicle: Matrix, remedy: str) -> str | None:
-    """Explain gravity along another axis than the tilt gives; None if it agrees. Arguments as in `implausible`."""
+    """Explain why gravity differs from the tilt; None if both agree. The arguments are those of `implausible`."""
     sizes = float(np.linalg.norm(force_m_s2)), float(np.linalg.norm(expected_m_s2))
     if min(sizes) == 0.0:
         return None
@@ -93,7 +93,7 @@ def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehi
 
 
 def _turned(force_m_s2: Array, expected_m_s2: Array) -> int | None:
-    """Return the turn of the tilt sensor about z, deg, that explains an error larger than a common bias, or None."""
+    """Return the turn of the tilt sensor about z, deg, that explains an error above a common bias; None without one."""
     off = float(np.linalg.norm(force_m_s2 - expected_m_s2))
     if off > _COMMON_BIAS_M_S2:
         for deg in (180, 90, 270):

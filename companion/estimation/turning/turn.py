@@ -1,7 +1,8 @@
 """Angular rate of the platform under a standing aircraft: an estimate with a sigma, not an assumption.
 
-A significant rate blocks a calibration. A smaller one is not subtracted, because the ground does not turn, but adds to
-the sigma of every gyro. The slope of gravity adds to the level axes; the gates refuse a larger tilt.
+A significant rate blocks a calibration. A smaller rate is not subtracted, because the ground usually does not turn, but
+adds to the sigma of every gyro. A slow tilting of gravity's direction adds to the sigma of level axes; the gates refuse
+a faster one.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 LEAST_RAD_S: Final = 0.005 * DEG
-"""Least rate that blocks: a compass warms up and wanders by some tenths of a degree in a minute."""
+"""Least rate that blocks a calibration: a warming compass wanders by some tenths of a degree in a minute."""
 LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
-"""Least rate that blocks without a compass: a gyro that warms up unevenly can show this much."""
+"""Least rate that blocks a calibration without a compass: a gyro that warms up unevenly can show as much."""
 SIGNIFICANT: Final = 4.0
-"""Threshold in sigmas for a rate, checked every second; chance exceeds 3 in one of a hundred still minutes."""
+"""Threshold, in sigmas, for a rate that is checked every second; chance exceeds 3 in one of 100 still minutes."""
 CHANCE_SIGMAS: Final = 2.0
 EVEN: Final = 0.25  # Share of the rate that each half of the headings must show; a jump shows in one half only
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True):
-    """Angular rate of the platform during a window: clockwise about the vertical, and tilting (level, vehicle FRD).
+    """Angular rate of the platform during a window: about the vertical, and tilting about level axes.
 
-    `by` None: no sensor measures it, and the platform counts as fixed to the Earth. `noise_rad_s`: sigma of the gyros
-    without warm-up. `step_rad_s`: error of the window's mean if a turn may have begun within it. `is_vouched`: a
-    compass has confirmed the gyros' level at rest; else that level may contain a turn.
+    `by` None: no sensor measures the rate. `noise_rad_s`: sigma of the gyros without warm-up. `step_rad_s`: error of
+    the window's mean from a turn that may have begun within it. `is_vouched`: a compass has confirmed that the gyros'
+    reference rate at rest contains no turn.
     """
 
     rate_rad_s: float = 0.0  # About the vertical, clockwise seen from above; never subtracted
@@ -64,7 +65,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_told(self) -> bool:
-        """True if the rate is measured; else the ground counts as fixed to the Earth."""
+        """True if sensors measure the rate; else the ground counts as fixed to the Earth."""
         return self.by is not None and self.is_vouched
 
     @property
@@ -73,7 +74,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def variance(self) -> float:
-        """Return the variance of a vertical gyro's error from the turn, (rad/s)^2.
+        """Return the variance, (rad/s)^2, that the turn adds to the error of a vertical gyro.
 
         Without a compass, the ground counts as fixed unless the gyros show more than chance.
         """
@@ -83,7 +84,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
         return known**2 + self.step_rad_s**2
 
     def covariance(self, up: Array) -> Matrix:
-        """Return the covariance (3, 3) of every gyro's error from the turn; vehicle FRD, `up` (3,) is the vertical."""
+        """Return the covariance (3, 3), vehicle FRD, that the turn adds to the gyros' errors. `up` (3,): vertical."""
         level = np.eye(3) - np.outer(up, up)
         tilting = level @ np.array(self.tilting_rad_s)
         return np.outer(up, up) * self.variance + np.outer(tilting, tilting) + level * self.tilting_sigma_rad_s**2
@@ -93,7 +94,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def by_compass(headings: Sequence[Batch]) -> Turn | None:
-    """Estimate the rate from the slope of the heading; a jump is never significant."""
+    """Estimate the platform's rate from the slope of the heading; a jump of the heading is never significant."""
     if len(headings) < FEWEST:
         return None
     slots = np.array([batch.slot for batch in headings], dtype=np.int64)
@@ -115,7 +116,7 @@ def by_compass(headings: Sequence[Batch]) -> Turn | None:
 
 
 def by_gyros(turns: Sequence[Turn]) -> Turn | None:
-    """Return the most precise rate of several IMUs, unless another IMU stays at its level."""
+    """Return the most precise rate of several IMUs, or, of those that contradict it, the one nearest to no turn."""
     if not turns:
         return None
     best = min(turns, key=lambda one: one.sigma_rad_s)
@@ -124,7 +125,7 @@ def by_gyros(turns: Sequence[Turn]) -> Turn | None:
 
 
 def by_both(gyros: Turn | None, seen: Turn | None) -> Turn:
-    """Combine gyros and compass; if they contradict each other, gyros at their level are right."""
+    """Combine gyros and compass; if they contradict each other, use gyros that show no turn, or else the compass."""
     if gyros is None or seen is None:
         return gyros or seen or Turn()
     if not gyros.is_vouched:

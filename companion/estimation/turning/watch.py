@@ -1,12 +1,13 @@
-"""Detection of a turn of the ground, second by second, from two sources.
+"""Detection of a turn of the ground, second by second, from compass and gyros.
 
-The sources are the slope of the heading since the last movement, and the gyros relative to their level at rest. If the
-heading turns while the gyros stay at their level, the magnetic field changes. If the gyros leave their level while the
-heading is constant, their bias has changed. One gyro without a compass cannot distinguish a turn from a new bias.
+The compass shows a turn as a slope of the heading since the last movement. The gyros show it relative to their level,
+the mean rate at rest. If the heading turns while the gyros stay at their level, the magnetic field changes. If the
+gyros leave their level while the heading is constant, their bias has changed. One gyro without a compass cannot
+distinguish a turn from a new bias.
 
-A gyro's bias does not jump; the rate of a platform that begins to turn does. The mean rate at rest before the current
-window therefore bounds the turn within it. The bound depends on the part: white noise of both means, flicker and random
-walk in between, and warm-up, from the thermometer or from the slope of the rates.
+A gyro's bias does not jump; the rate of a platform that begins to turn does. The level before the current window limits
+the turn within it. The limit depends on white noise of both means, flicker and random walk in between, and warm-up (by
+the thermometer or by the slope of the rates).
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from companion.physics.units import DEG, DEG_H
 
 LEVEL_S: Final = 5  # Least seconds at rest for a level
 RESTED_S: Final = 20
-"""Least seconds before a step within a window: just after power-up, a warm-up looks like a step."""
+"""Least number of seconds in a window before a step: just after power-up, a warm-up looks like a step."""
 NOISE_KNOWN_S: Final = 20
-"""Least seconds that show the white noise of their means; before that, the noise of the last window is used."""
-PER_K_RAD_S: Final = 54.0 * DEG_H  # Bias of a common gyro per kelvin (BMI088, method 2.1)
+"""Least number of seconds that show their white noise; in a shorter window, the noise of the last one is used."""
+PER_K_RAD_S: Final = 54.0 * DEG_H  # Bias of a common gyro per kelvin (BMI088, method.md section 2.1)
 PER_G_RAD_S: Final = 0.1 * DEG  # Sensitivity of an uncompensated MEMS gyro to gravity: the level depends on the tilt
 EARTH_RAD_S: Final = 15.04 * DEG_H
 WARMING_S: Final = 120.0
-"""Time for which a visible warm-up may have been twice as steep before; an invisible one has ended after it."""
+"""Assumed duration of a warm-up, s. A visible one was at most twice as steep before; an invisible one has ended."""
 WARMING_RAD_S2: Final = 0.5 * DEG_H  # Drift of an older level without thermometer, at most by `WARMED_RAD_S`
 WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
 RAMP_SIGMAS: Final = 1.5
 STEP_SIGMAS: Final = 5.0
 STEP_CHI_SQUARE: Final = 12.0  # Threshold of chi-square by which a step fits better than a cubic (a warm-up)
 ACROSS_SHARE: Final = 0.25
-"""Share of a vertical turn that appears in the level plane if the vertical is wrong by some degrees."""
+"""Share of a turn about the vertical that appears on level axes if the vertical is wrong by some degrees."""
 STEADY_SIGMAS: Final = 2.5  # Seconds farther off do not join the level, else a slow turn would become the level
 CLEARED_S: Final = 10  # Seconds at the level after which the latest movement has not started a turn
 SMOOTHED_OVER: Final = 5  # Headings in one value of the wander, so that noise does not look like wander
@@ -59,15 +60,15 @@ _TURNED: Final = 8  # Variance of the platform's rate by the compass, for second
 
 
 class ImuLevel:
-    """Seconds of one IMU in the current window, and its level: the seconds at rest before that.
+    """Comparison of one IMU's rates in the current window with its level: the mean over the seconds at rest before.
 
-    `rotation`: sensor to vehicle FRD; `steps`: resolution of its stream, rad/s and m/s^2, 0 for floats.
+    `rotation`: from sensor to vehicle FRD. `steps`: resolution of an integer stream, rad/s and m/s^2; 0 for floats.
 
-    Results of `look`: `turn`, the rate about the vertical above the level, None without a level. `has_changed`: part of
-    that rate lies in the level plane, which no turn of the ground causes, so the sensor has changed. `tilting_rad_s`:
-    rotation of the direction of gravity, (3,) horizontal, vehicle FRD. `began`: first second after a step of the rate
-    that neither the part's noise nor a warm-up explains. `step_rad_s`: error of the window's mean from the likeliest
-    step, 0 if it is chance. `white`: white noise N about the vertical.
+    `look` computes the results. `turn`: rate about the vertical, relative to the level; None without a level.
+    `has_changed`: the sensor has changed, because a rate about level axes differs, which no turn of the ground causes.
+    `tilting_rad_s` (3,): rate at which gravity's direction tilts, vehicle FRD. `began`: first second after a step of
+    the rate that neither noise nor warm-up explains. `step_rad_s`: error of the window's mean from the likeliest step;
+    0 if that step may be chance. `white`: white noise N about the vertical.
     """
 
     def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
@@ -75,7 +76,7 @@ class ImuLevel:
         self._rotation = np.kron(np.eye(2), rotation)
         self._least = columns(profile)  # N, B and K of its six channels
         self._white = np.zeros(6)
-        """White noise N of the gyros in the last window that was long enough to show it."""
+        """White noise N (6,) in the last window that was long enough to show it; zero for the accelerometers."""
         self.window: deque[Floats] = deque()
         self.rest: deque[Floats] = deque(maxlen=2 * span)
         self.turn: Turn | None = None
@@ -87,16 +88,16 @@ class ImuLevel:
         self.white = 0.0
 
     def add(self, slot: int, batch: Batch, turned: float | None) -> None:
-        """Add a still second; the second that leaves the window joins the level, with `turned` as in `end_window`."""
+        """Add a still second to the window; the second that leaves it joins the level. `turned`: see `end_window`."""
         degc = math.nan if batch.temperature_degc is None else batch.temperature_degc
         self.window.append(np.array([slot, *self._rotation @ batch.mean, degc, math.nan]))
         self._variance = batch.variance
         self.end_window(turned, self._span)
 
     def end_window(self, turned: float | None, kept: int = 0) -> None:
-        """End the window except for the latest `kept` seconds; the others join the level.
+        """End the window, except for its latest `kept` seconds; the earlier seconds join the level.
 
-        `turned`: variance of the platform's rate by compass, NaN without one; None: it turns, so no second joins.
+        `turned`: variance of the platform's rate by compass, NaN without a compass; None: no second may join.
         """
         while len(self.window) > kept:
             second = self.window.popleft()
@@ -109,7 +110,7 @@ class ImuLevel:
             self.rest.append(second)
 
     def split(self, slot: int) -> None:
-        """Make the seconds before a step the level; drop those after it."""
+        """Make the window's seconds before a step the new level, and drop the seconds after the step."""
         turned = self._usual()
         self.rest.clear()
         while self.window and self.window[-1][_SLOT] >= slot:
@@ -120,7 +121,7 @@ class ImuLevel:
         return sum(float(second[_TURNED]) for second in self.rest) / len(self.rest) if self.rest else math.nan
 
     def look(self) -> bool:
-        """Compare the window with the level, if any, and with gravity; return False while it is too short."""
+        """Compare the window with the level, if any, and with gravity; return false while the window is too short."""
         if len(self.window) < FEWEST:
             return False
         window = np.array(self.window)
@@ -154,7 +155,7 @@ class ImuLevel:
         return True
 
     def _above_level(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn, bool]:
-        """Return the vertical rate above the level, and whether a horizontal rate above it is significant."""
+        """Return the turn relative to the level, and true if a rate about level axes differs significantly from it."""
         count, weight = len(window), len(self.rest)
         level, now = np.array(self.rest).mean(axis=0), window.mean(axis=0)
         off = now[_RATES] - level[_RATES]
@@ -190,7 +191,7 @@ class ImuLevel:
 
 
 def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tuple[int | None, float]:
-    """Return `began` and `step_rad_s` for one-second means (m,), m >= `RESTED_S` + `LEVEL_S`."""
+    """Find the likeliest step in one-second means (m,), m >= `RESTED_S` + `LEVEL_S`; return `began`, `step_rad_s`."""
     count = len(values)
     values = values - values.mean()
     before = np.arange(RESTED_S, count - LEVEL_S + 1)
@@ -210,20 +211,20 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tup
 
 
 class TurnWatch:
-    """Estimates the platform's rate from every second of all sources; `span`: seconds of the longest window."""
+    """Estimates the platform's rate from each second of gyros and compass; `span`: length of the longest window, s."""
 
     def __init__(self, span: int) -> None:
         self._span = span
         self._levels: dict[str, ImuLevel] = {}
         self._headings: deque[tuple[bool, Batch]] = deque(maxlen=span)
-        """Seconds of the compass since the last movement, each with a flag: it belongs to the still stretch."""
+        """Seconds of the compass since the last movement, each with a flag: true if it belongs to the still stretch."""
         self._last_slot = 0
         self._start: int | None = None  # First second of the still stretch
         self._is_suspect = False
-        """True after a movement or a step: gyros off their level may show a turn; else they drift."""
+        """True after a movement or a step, when changed gyro rates may show a turn; otherwise they count as drift."""
         self.turn = Turn()  # Rate as of the last second
         self.words = ""
-        """Reason for the pilot why no calibration is possible; empty: none."""
+        """Reason, for the pilot, why a turn prevents a calibration; empty: no turn."""
 
     def set_imu(self, name: str, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float]) -> None:
         self._levels[name] = ImuLevel(rotation, profile, steps, self._span)
@@ -235,7 +236,7 @@ class TurnWatch:
                 level.rest.clear()
 
     def new_stretch(self) -> None:
-        """End the still stretch; its seconds join the levels."""
+        """End the still stretch; its seconds join the level at rest of each IMU."""
         turned = self._turned()
         for level in self._levels.values():
             level.end_window(turned if level.rest or len(level.window) >= LEVEL_S else None)
@@ -250,17 +251,17 @@ class TurnWatch:
 
     @property
     def wander_deg(self) -> float | None:
-        """Range of the heading since the last movement, over the longest window at most; None: too few seconds."""
+        """Range of the heading, deg, since the last movement, at most over the longest window; None: too short."""
         turned = np.unwrap([float(batch.mean[0]) for _, batch in self._headings], period=360.0)
         if len(turned) < SMOOTHED_OVER:
             return None
         return float(np.ptp(np.convolve(turned, np.full(SMOOTHED_OVER, 1.0 / SMOOTHED_OVER), "valid")))
 
     def add_second(self, slot: int, imus: Mapping[str, Batch], heading: Batch | None, *, good: bool) -> bool:
-        """Add a second without movement (except perhaps of the compass); return False if the stretch ends with it.
+        """Add a second in which no sensor but the compass may have moved; return false if it ends the still stretch.
 
-        `slot` ascends; `heading` is None without a compass, or while that settles after a movement. `good`: the second
-        belongs to a still stretch.
+        `slot` must ascend. `heading`: None without a compass, or while the compass settles after a movement. `good`:
+        the second belongs to a still stretch.
         """
         if slot - self._last_slot > BLIND_S:
             self._headings.clear()
@@ -276,7 +277,7 @@ class TurnWatch:
         return self._judge(slot)
 
     def _turned(self) -> float | None:
-        """Return the variance of the rate by compass, NaN without one; None: seconds must not join a level."""
+        """Return the variance of the platform's rate by compass, NaN without one; None: no second may join a level."""
         turn = self.turn
         # With gyros alone, a gradual change counts as drift, and the level follows it.
         drifts = turn.by == "gyros" and not self._is_suspect
@@ -311,7 +312,7 @@ class TurnWatch:
         return True
 
     def _combined(self, found: list[ImuLevel]) -> Turn:
-        """Combine both sources; an IMU that contradicts them has changed, and its level restarts."""
+        """Combine gyros and compass; an IMU that contradicts the result has changed, and its level restarts."""
         gyros = by_gyros([one.turn for one in found if one.turn is not None and not one.has_changed])
         seen = by_compass([batch for _, batch in self._headings])
         if seen is None or not seen.is_significant:
