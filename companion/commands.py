@@ -175,7 +175,7 @@ class Align(Command, frozen=True, tag="align"):
         Literal["zero", "tilts", "turn", "faces", "show", "forget"] | None,
         Field(
             "zero: on one spot; tilts: that, and 4 tilts; without a gradienter, turn: level on one spot;"
-            " faces: accelerometers, about 12 stands on any side",
+            " faces: accelerometers, about 12 poses held by hand",
             by=by,
             flags={
                 "show": "the alignment that is kept",

@@ -10,11 +10,9 @@ from companion.messages import KINDS, Entry, catalogue
 _HEAD: Final = """\
 # Messages: what the companion says, and what to do
 
-Type `companion explain WORDS` with some words of the line; it knows more phrases than this page. `…` is a name or a
-number. `status`, `check`, failed commands and the page show the remedy too.
-
-A line often has a speaker and a reason: in `Not armed: hold still 6 s` look up the part behind the colon. A line
-that begins with `... ` continues the one before.
+`companion explain WORDS` finds a line by some of its words; it knows more lines than this page. `…` is a name or a
+number. Of `Not armed: hold still 6 s` look up the part behind the colon. A line that begins with `... ` continues the
+one before. Change a setting in companion.toml, then restart the companion.
 """
 
 
@@ -22,16 +20,23 @@ def page() -> str:
     """Return the whole document, sorted by what the pilot has to do."""
     parts = [_HEAD]
     for kind, title in KINDS.items():
-        rows = [_row(entry) for entry in catalogue().values() if entry.do == kind]
-        parts.append(f"\n## {title}\n" + "".join(rows))
+        rows: dict[tuple[str, str, str], list[str]] = {}
+        for entry in catalogue().values():
+            if entry.do == kind:
+                rows.setdefault((entry.see, entry.cause, entry.remedy), []).extend(_shown(entry))
+        parts.append(f"\n## {title}\n" + "".join(_row(*key, shown) for key, shown in rows.items()))
     return "".join(parts)
 
 
-def _row(entry: Entry) -> str:
+def _shown(entry: Entry) -> tuple[str, ...]:
     # `companion explain` knows all patterns.
-    shown = ", ".join(f"`{pattern}`" for pattern in (entry.patterns[:1] if entry.text else entry.also[:2]))
-    words = " ".join(part for part in (entry.cause, entry.remedy) if part)
-    return f"\n{f'[{shown}]({entry.see})' if entry.see else shown}: {words}\n"
+    return entry.patterns[:1] if entry.text else entry.also[:1]
+
+
+def _row(see: str, cause: str, remedy: str, patterns: list[str]) -> str:
+    shown = ", ".join(f"`{pattern}`" for pattern in patterns)
+    words = " ".join(part for part in (cause, remedy) if part)
+    return f"\n{f'[{shown}]({see})' if see else shown}: {words}\n"
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ async def align(options: argparse.Namespace) -> int:
     alignment, state = answer["alignment"], answer["state"]
     lines = [_heading(answer), *(stands_lines(alignment) if alignment else [])]
     lines += sides_lines(answer.get("accelerometers", ()))
-    good = state in ("done", "in force") or (wanted["action"] == "show" and state != "refused")
+    good = state in ("done", "active") or (wanted["action"] == "show" and state != "refused")
     return _conclude(options, answer, lines, good=good)
 
 
@@ -199,7 +199,7 @@ def _number(value: float | None) -> str:
 def sides_lines(imus: Sequence[Object]) -> list[str]:
     lines = []
     for imu in imus:
-        lines.append(f"{imu['name']}: known from all sides, {imu['measured_at'][:19]} UTC; its output has left")
+        lines.append(f"{imu['name']}: calibrated in six positions, {imu['measured_at'][:19]} UTC; its output has left")
         lines.append(_figure_line("accel bias", "mg", imu["bias_left_mg"], imu["bias_sigma_mg"], "+.3f"))
         lines.append(_figure_line("accel scale", "%", imu["scale_left"], imu["scale_sigma"], "+.4f", 0.01))
     return lines
@@ -231,7 +231,7 @@ def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float]
 
 def stands_lines(record: Object) -> list[str]:
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
-    lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands{slope}"]
+    lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} poses{slope}"]
     zero: list[str] = []
     if "gradienter" in record:
         (x, y), sigma, configured = record["offset_deg"], record["sigma_deg"], record["gradienter"]["offset_deg"]
@@ -246,7 +246,7 @@ def stands_lines(record: Object) -> list[str]:
             f"    sigma_deg = {sigma:.4f}",
         ]
     for imu in record["imus"]:
-        scatter = f" stands miss gravity by {imu['scatter_mg']:.2f} mg" if "scatter_mg" in imu else ""
+        scatter = f" poses miss gravity by {imu['scatter_mg']:.2f} mg" if "scatter_mg" in imu else ""
         lines.append(f"{imu['name']}:{scatter}")
         whole = imu.get("whole_bias_mg")
         if "level_bias_mg" in imu:

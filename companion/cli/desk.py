@@ -136,7 +136,7 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--columns",
         metavar="NAMES",
-        help="in place of the header: t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g (_: passed over)",
+        help="in place of the header: t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g (_: skipped)",
     )
     parser.add_argument(
         "--rate", type=within(4.0, 10000.0), metavar="HZ", help="of a log without times, or in their place"

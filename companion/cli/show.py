@@ -94,7 +94,7 @@ def status_lines(status: Object) -> list[str]:
     if status["fault"] is not None:
         lines.append(f"FAULT: {status['fault']}")
     if status["putting_back"]:
-        lines.append("an interrupted write is being put back (needs the autopilot, disarmed)")
+        lines.append("an interrupted write is being restored (needs the autopilot, disarmed)")
     if recording["lost"]:
         lines.append(f"recordings: {recording['lost']} messages lost so far, the disk is too slow")
     if (file := recording["file"]) is not None:
@@ -106,7 +106,7 @@ def status_lines(status: Object) -> list[str]:
     lines += _reading_lines(status)
     arming = status["arming"]
     verdict = _VERDICTS[arming["verdict"]] + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
-    lines += [f"at arming ({arming['at_arm']}): {verdict}", f"in force: {arming['in_force']}"]
+    lines += [f"at arming ({arming['at_arm']}): {verdict}", f"active calibration: {arming['in_force']}"]
     lines += [f"by hand, {_minute(one['measured_at'])} UTC: {by_hand_words(one)}" for one in status["by_hand"]]
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
@@ -127,13 +127,13 @@ def explained_lines(found: Sequence[tuple[str, messages.Entry]]) -> list[str]:
 
 def undo_line(steps: Sequence[Object]) -> str:
     if not steps:
-        return "undo: nothing is left to take back"
+        return "undo: nothing to undo"
     step, more = steps[0], len(steps) - 1
     when = f" of {_minute(step['at'])} UTC" if step["at"] else ""
     several = f" and all since {_minute(step['since'])}" if step["since"] != step["at"] else ""
     further = f"; {more} more after it" if more else ""
     words = f"{step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters{further}"
-    return f"the next undo takes back: {words}"
+    return f"the next undo reverts: {words}"
 
 
 def _minute(iso: str) -> str:
@@ -174,7 +174,7 @@ def monitor_lines(status: Object) -> list[str]:
         lines.append(f"pitch {pose['pitch_deg']:+.2f}  roll {pose['roll_deg']:+.2f}  heading {heading}")
     lines += ["", *_judged(summary.rows(status)), ""]
     lines += _bias_lines(status["calibration"])
-    lines.append(f"in force: {status['arming']['in_force']}")
+    lines.append(f"active calibration: {status['arming']['in_force']}")
     lines += end_lines(status)
     return lines
 
@@ -193,7 +193,7 @@ def _bias_lines(calibration: Object | None) -> list[str]:
 
 def _held_back(imu: Object, triad: str) -> str:
     if triad in imu.get("unchanged", ()):
-        return "  right already: not written"
+        return "  already correct: not written"
     return "  held back: not written" if triad in imu.get("held_back", ()) else ""
 
 
@@ -244,7 +244,7 @@ def history_lines(
         lines.append(f"{'':4} {'interrupted (UTC)':20} what became of the old values")
         lines += [f"{'':4} {_interrupted(one)}" for one in interrupted]
     if armings:
-        lines.append(f"{'':4} {'armed (UTC)':20} in force")
+        lines.append(f"{'':4} {'armed (UTC)':20} active")
         lines += [
             f"{'':4} {arming['armed_at'][:19]:20} {'' if arming['state'] != 'uncalibrated' else 'UNCALIBRATED: '}"
             f"{arming['reason']}"
@@ -273,7 +273,7 @@ def by_hand_words(done: Object) -> str:
         return words
     if done["undone_at"]:
         return f"{words}; {number} parameters written, undone {_minute(done['undone_at'])}"
-    in_force = {True: ", in force", False: ", not in force as written any more", None: ""}[done["in_force"]]
+    in_force = {True: ", active", False: ", changed by another writer since", None: ""}[done["in_force"]]
     return f"{words}; {number} parameters written{in_force}"
 
 

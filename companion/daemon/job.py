@@ -16,7 +16,7 @@ from companion.links.system.events import comes
 from companion.storage.changes import BY_TEMPERATURE
 
 ALIGNMENT: Final = "gradienter alignment"
-FACES: Final = "measurement on all sides"
+FACES: Final = "six-position calibration"
 TURN: Final = "turn on the spot"
 TEMPERATURE: Final = "temperature curve"
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)

@@ -89,7 +89,7 @@ _WORDS: Final = {
     State.SOLVING: "measuring",
     State.VERIFYING: "checking",
     State.RESTARTING: "restarting autopilot",
-    State.UNDOING: "putting back",
+    State.UNDOING: "restoring",
 }
 _WRITING: Final = {State.WRITING, State.VERIFYING, *_SHOWN}
 

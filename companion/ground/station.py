@@ -259,7 +259,7 @@ class Station:
         elif self.vehicle.armed != "unknown":
             reason = (
                 "the companion fell silent, its autopilot did not: has it stopped?"
-                " If it was writing, it puts the old values back when it starts again"
+                " If it was writing, it restores the old values when it starts again"
             )
         else:
             reason = "nothing is heard of the vehicle any more; it goes on by itself: `companion ground status` later"

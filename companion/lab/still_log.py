@@ -136,7 +136,7 @@ def read_csv(path: Path, columns: str | None = None, rate_hz: float | None = Non
         t_s=t_s,
         readings=readings,
         temperature_degc=table[:, 7],
-        notes=(f"columns passed over: {_some(passed)}",) if passed else (),
+        notes=(f"columns skipped: {_some(passed)}",) if passed else (),
         left_out=left_out,
     )
 

@@ -247,7 +247,7 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
     if settings.tls:
         hint = " (does it want a certificate? mqtt.cert_file)" if settings.cert_file is None else ""
     if _is_unanswered(error):
-        return message("broker_fails", state=_SILENT if reached else f"says nothing{hint}")
+        return message("broker_fails", state=_SILENT if reached else f"sends nothing{hint}")
     for cause in causes(error):
         if isinstance(cause, LinkError):
             return str(cause)

@@ -125,7 +125,7 @@ def _in_short(record: Record) -> str:
     found = ", ".join(imu.name for imu in record.imus)
     words = f"Biases found of {found}. " if record.state == "done" and found else ""
     if not outcomes and any(imu.unchanged for imu in record.imus):
-        return f"{words}The offsets in the autopilot are right already: nothing was written."
+        return f"{words}The offsets in the autopilot are already correct: nothing was written."
     if not outcomes:
         return f"{words}Nothing was written to the autopilot."
     if all(outcome == "verified" for outcome in outcomes):

@@ -69,7 +69,7 @@ class NumberedFiles(Generic[T]):
             try:
                 found = self.file(number).read()
             except StorageError as error:
-                logger.warning("%s, passed over", error)
+                logger.warning("%s, skipped", error)
             else:
                 if found is not None:
                     yield number, found
@@ -224,4 +224,4 @@ def signing_time_in(directory: Path) -> StateFile[SigningTime]:
 
 def _check_time(found: SigningTime) -> None:
     if not 0 <= found.ticks <= found.reserved < 2**48 or not 0.0 <= found.uptime_s < MOST_UPTIME_S:
-        raise msgspec.ValidationError(f"ticks {found.ticks} to {found.reserved} at {found.uptime_s:g} s cannot be")
+        raise msgspec.ValidationError(f"ticks {found.ticks} to {found.reserved} at {found.uptime_s:g} s is impossible")

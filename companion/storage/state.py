@@ -208,8 +208,8 @@ def set_aside(path: Path) -> str:
     name = next((name for name in names if not os.path.lexists(path.with_name(name))), names[-1])
     with contextlib.suppress(OSError):
         os.replace(path, path.with_name(name))
-        return f"set aside as {name}"
-    return "it cannot be set aside either"
+        return f"renamed to {name}"
+    return "it cannot be renamed either"
 
 
 class _Entries(msgspec.Struct, Generic[T], frozen=True):

@@ -323,13 +323,13 @@ def faults() -> list[Fault]:
             recordings_mb=8,
             **back,
         ),
-        Fault("record-damaged", "files", "the newest record is damaged", spoil_record, names=r"passed over", **back),
+        Fault("record-damaged", "files", "the newest record is damaged", spoil_record, names=r"skipped", **back),
         Fault(
             "record-newer",
             "files",
             "the newest record is of a later version",
             spoils("records/??????.json", "newer"),
-            names=r"passed over",
+            names=r"skipped",
             **back,
         ),
         Fault(

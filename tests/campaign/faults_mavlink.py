@@ -13,7 +13,7 @@ from tests.campaign.rough_wire import Stranger, malformed
 from tests.support.component import CALIBRATE, CANCEL, UNDO, command_message
 
 LOST = (
-    r"heartbeat|does not answer|no answer|telemetry|not be put back|NOT back|not read|lost|not seen"
+    r"heartbeat|does not answer|no answer|telemetry|not be put back|NOT restored|not read|lost|not seen"
     r"|restart|unknown whether|arm state unknown"
 )
 ARMED = r"armed|Armed"
@@ -116,7 +116,7 @@ def link_faults() -> list[Fault]:
             *acts,
             lasts_s=lasts_s,
             names=names,
-            excused=f"{LOST}|{STILLNESS}|reboot|not believed|changed|could not be",
+            excused=f"{LOST}|{STILLNESS}|reboot|rejected|changed|could not be",
         )
         for name, does, acts, names, lasts_s in rows
     ]
@@ -339,7 +339,7 @@ def autopilot_faults() -> list[Fault]:
             "autopilot",
             "another station sets an offset to nonsense",
             foreign_write,
-            excused=r"somebody|someone|changed|set |NOT back|OFF|does not use",
+            excused=r"somebody|someone|changed|set |NOT restored|OFF|does not use",
         ),
         Fault(
             "gyro-calibration-fails",

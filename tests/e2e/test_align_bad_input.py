@@ -103,7 +103,7 @@ async def test_all_that_goes_wrong_on_all_sides(tmp_path: Path) -> None:
         assert result.outcome == "done", result
         assert isinstance(job.product, FacesRecord)
         assert len(made.service.status()["stands"]["done"]) == len(job.product.stands) <= 13
-        for words in (*NAMED, "it stands as in stand 2"):
+        for words in (*NAMED, "same pose as pose 2"):
             assert words in said(made), words
         np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
         np.testing.assert_allclose(read(made, "accel") / MG, true_mg(made), atol=0.15)

@@ -87,7 +87,7 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
             undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             result = await undone.finished
-            assert result.reason.endswith(f"old values back: {what}")
+            assert result.reason.endswith(f"old values restored: {what}")
             assert {name: made.double.parameter(name) for name in gyros} == gyros
         assert {name: made.double.parameter(name) for name in old} == old
         again = ByHand(made.service.core, made.service.devices.imus)
@@ -168,4 +168,4 @@ async def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autop
         assert 0.0 < (pose.sigma_deg.theta or 0.0) < 0.02
         assert pose.psi_deg == pytest.approx(np.degrees(yaw) % 360.0, abs=0.5)
         assert pose.sigma_deg.psi == pytest.approx(10.0)
-        assert any("known from all sides" in words for words in after.warnings)
+        assert any("calibrated in six positions" in words for words in after.warnings)

@@ -184,7 +184,7 @@ async def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undon
                 started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test")),
             )
         assert result.outcome == "failed"
-        assert result.reason == "the attitude did not follow the new level, or it moved; old values back"
+        assert result.reason == "the attitude did not follow the new level, or the aircraft moved; old values restored"
         assert made.autopilot.parameter(names[0]) == pytest.approx(0.3)
         job = started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test"))
         result = await follow(made, hands, job)
@@ -205,5 +205,5 @@ async def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undon
         assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
         undone = made.service.calibrating.manager.start_undo("test")
         assert not isinstance(undone, Refusal)
-        assert (await undone.finished).reason.endswith("old values back: faces")
+        assert (await undone.finished).reason.endswith("old values restored: faces")
         assert {name: made.autopilot.parameter(name) for name in old} == old

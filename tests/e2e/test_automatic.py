@@ -208,7 +208,7 @@ async def test_the_writes_of_a_day_are_bounded_also_over_restarts(
             answer = rig.service.arming.readiness.answer()
             assert len(rig.service.calibrating.store.history()) == expected
     assert answer.verdict == "refuse"
-    assert "flash spared" in answer.words
+    assert "2 writes today" in answer.words
 
 
 async def test_a_check_starts_nothing(tmp_path: Path) -> None:

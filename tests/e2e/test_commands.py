@@ -129,7 +129,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             await _until_read(line.config)
             status = await companion("status", "-c", config)
             assert status.code == DONE
-            for word in ("in force: ", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
+            for word in ("active calibration: ", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
                 assert word in status.out
 
             done = await companion("-c", config, "calibrate", "--wait", "--timeout", "60", "--json")
@@ -250,7 +250,7 @@ def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
             assert "nothing" in finding["words"]
             assert "compass" in bad.json["reason"]
             (finding,) = [each for each in bad.json["findings"] if each["name"] == "autopilot"]
-            assert "companion setup looks for it elsewhere" in finding["words"]
+            assert "companion setup searches the other ports" in finding["words"]
             assert bad.err.startswith("checking: 1.5 s")
 
     asyncio.run(main())

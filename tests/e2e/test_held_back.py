@@ -60,7 +60,7 @@ async def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_
         assert [imu["held_back"] for imu in rig.service.status()["calibration"]["imus"]] == [["accel"], []]
         assert accelerometers(rig) == before
         assert "The gradienter has moved by 0.3" in said
-        assert "Held back: accelerometers of fc; calibrate on request to write it all the same" in said
+        assert "Held back: accelerometers of fc; to write it, calibrate on request" in said
         # With what is in force it may arm as ever, and everybody is told.
         answer = rig.service.arming.readiness.answer()
         assert answer.verdict == "accept"

@@ -42,7 +42,7 @@ async def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_a
         await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
         assert values(rig.double) == before
         assert rig.service.status()["undoable"] == []
-        assert " old values back, 20" in await told(rig)
+        assert " old values restored, 20" in await told(rig)
         (record,) = rig.service.calibrating.store.history()
         assert record.undone_at
         await rig.until(

@@ -84,7 +84,7 @@ def test_a_broker_that_is_killed_and_comes_back_gets_everything_anew(
                 await watcher.publish(f"{BASE}/request/calibrate", {"transaction": "after"})
                 refused = await watcher.response(BASE, "calibrate", "after")
                 assert (refused["state"], refused["refusal"]) == ("refused", "unknown")
-                assert "no autopilot heard yet" in refused["reason"]
+                assert "no autopilot found yet" in refused["reason"]
 
     asyncio.run(main())
 
@@ -180,7 +180,7 @@ def test_a_message_too_long_for_the_broker_holds_up_no_other(
             ours.outbox.keep(f"{BASE}/state", b"short")
             task = asyncio.create_task(ours.run())
             await watcher.until(f"{BASE}/state", is_(b"short"))
-            assert caplog.text.count("given up: 30000 bytes") == 1
+            assert caplog.text.count("message dropped: 30000 bytes") == 1
             assert ours.connections == link.MOST_TRIES + 1
             task.cancel()
             await asyncio.wait([task])

@@ -102,7 +102,7 @@ async def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same
         assert rig.service.status()["why_no_undo"] is None
         status, words = await press(rig, "undo")
         assert status == 200
-        assert "old values back" in words
+        assert "old values restored" in words
         assert rig.double.parameter("INS_GYROFFS_X") == before
 
 
@@ -131,7 +131,7 @@ async def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: P
         await rig.until(lambda: headline(rig)[1] == "READY", 3.0)
 
         job = started(rig.service.calibrating.manager.start_undo("test"))
-        await rig.until(lambda: headline(rig)[1] == "PUTTING BACK", 3.0)
+        await rig.until(lambda: headline(rig)[1] == "RESTORING", 3.0)
         assert (await job.finished).outcome == "done"
         await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 3.0)
         assert rig.service.status()["calibration"] is None

@@ -166,7 +166,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             button = "#align button[data-name='align turn']"
             await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'center'}})")
             await tab.touch(button)
-            await tab.until("$('standing').textContent === 'turn on the spot: stand 1 of 5' && $('wish').textContent")
+            await tab.until("$('standing').textContent === 'turn on the spot: pose 1 of 5' && $('wish').textContent")
             await tab.lift()
             assert await tab.value("document.querySelectorAll('#how .nose').length") == 4
             await tab.value("scrollTo(0, 0)")

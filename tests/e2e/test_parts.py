@@ -137,11 +137,11 @@ def test_integers_that_hide_the_mean_are_not_blamed_on_the_part() -> None:
     )
     earth = np.diag([1.0, 1.0, 0.0]) * (8.0 * DEG_H) ** 2
     (said,) = wide_gyros([window], earth, IN_CONFIGURATION)
-    assert said.startswith("imu fc: gyro sigma is that of an unknown part")
+    assert said.startswith("imu fc: sensor part unknown, gyro sigma only estimated")
     hidden = msgspec.structs.replace(window, hidden={"gyro": "coarse steps"})
     (said,) = wide_gyros([hidden], earth, IN_CONFIGURATION)
     assert said.startswith("no compass: ")
     (said,) = wide_gyros([window], None, IN_CONFIGURATION)
-    assert said.startswith("imu fc: gyro sigma is that of an unknown part")
+    assert said.startswith("imu fc: sensor part unknown, gyro sigma only estimated")
     named = msgspec.structs.replace(window, named=True)
     assert wide_gyros([named, hidden], None, IN_CONFIGURATION) == []

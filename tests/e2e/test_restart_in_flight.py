@@ -148,7 +148,7 @@ def undone(flying: Flight) -> None:
     [
         (False, exchanged_part, "the IMU was changed (gyro (device id)) since its calibration"),
         (True, of_another_power_up, "the IMU was without power since its calibration"),
-        (True, undone, "no calibration is in force"),
+        (True, undone, "no calibration is active"),
     ],
 )
 async def test_biases_that_are_not_this_imus_now_are_not_used(

@@ -73,7 +73,7 @@ def test_each_undo_takes_one_step_back_to_the_bit_says_which_and_then_there_is_n
                 rig.ground.command(UNDO)
                 await rig.until(lambda left=left: len(rig.ground.finals(UNDO)) == left, 30.0)  # type: ignore[misc]
                 assert read(rig) == values
-                assert any(words.endswith(f"old values back: {what}") for words in rig.ground.texts())
+                assert any(words.endswith(f"old values restored: {what}") for words in rig.ground.texts())
                 assert steps(rig) == list(STEPS[left:])
             rig.ground.command(UNDO)
             await rig.until(lambda: rig.ground.finals(UNDO) == [*[ACCEPTED] * len(STEPS), DENIED], 30.0)
@@ -186,7 +186,7 @@ async def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
         assert failed.outcome == "failed"
         assert why in failed.reason
         assert failed.reason.endswith("level stays active: undo again")
-        assert "old values back" not in failed.reason
+        assert "old values restored" not in failed.reason
         assert read(rig) == wanted[0]
         assert step_file.read_bytes() == kept
         assert not rig.service.offsets.ledger.pending
@@ -196,7 +196,7 @@ async def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
             await rig.ready()
         await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "DISARMED", 30.0)
         assert steps(rig) == list(STEPS)
-        assert (await undone(rig)).reason == "2 old values back: level"
+        assert (await undone(rig)).reason == "2 old values restored: level"
         assert read(rig) == wanted[1]
 
 
@@ -217,9 +217,9 @@ async def test_what_somebody_else_has_changed_stops_it_is_named_and_passed_over_
         assert read(rig) == now
         assert steps(rig) == list(STEPS[1:])
         forced = await undone(rig, force=True)
-        assert forced.reason == "0 old values back: auto calibration"
+        assert forced.reason == "0 old values restored: auto calibration"
         # The faces below it are untouched by that.
-        assert (await undone(rig)).reason == "6 old values back: faces"
+        assert (await undone(rig)).reason == "6 old values restored: faces"
         assert read(rig) == wanted[3] | {name: now[name] for name in GYROS}
 
 
@@ -234,7 +234,7 @@ async def test_right_after_the_start_it_waits_until_the_autopilot_is_heard(tmp_p
     rig.wire.cut = True
     async with rig.running():
         asked_s = rig.now_s
-        with pytest.raises(CalibrationRefusedError, match="no autopilot heard yet"):
+        with pytest.raises(CalibrationRefusedError, match="no autopilot found yet"):
             await asked(rig)
         assert 4.0 < rig.now_s - asked_s < 7.0
         asking = asyncio.ensure_future(asked(rig))
@@ -242,7 +242,7 @@ async def test_right_after_the_start_it_waits_until_the_autopilot_is_heard(tmp_p
         assert not asking.done()
         rig.wire.cut = False
         reply = await asking
-        assert (reply["state"], reply["reason"]) == ("done", "2 old values back: level")
+        assert (reply["state"], reply["reason"]) == ("done", "2 old values restored: level")
         assert [reply["undone"]["what"], *(each["what"] for each in reply["undoable"])] == list(STEPS)
 
 

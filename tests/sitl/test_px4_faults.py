@@ -96,7 +96,7 @@ def test_a_daemon_that_dies_at_the_far_value_puts_the_old_ones_back_unless_px4_w
                 if left:
                     # IMU_GYRO_CAL_EN: a far gyro value left alone for some seconds is what PX4 calibrates anew.
                     assert left == {f"CAL_GYRO0_{axis}OFF" for axis in "XYZ"}
-                    assert "changed by others, left alone: CAL_GYRO0" in daemon.log()
+                    assert "changed by another writer, not restored: CAL_GYRO0" in daemon.log()
                     assert_right(vehicle, {name: now[name] for name in left})
 
     asyncio.run(main())

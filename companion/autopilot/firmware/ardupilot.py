@@ -244,7 +244,7 @@ class ArduPilot(Firmware):
         ),
     )
     heading_watched = (_HEADING_SCRIPT,)
-    heading_risks = ("it will not arm while the stream is away (VisOdom: not healthy)",)
+    heading_risks = ("ArduPilot does not arm while the companion's heading is missing (VisOdom: not healthy)",)
 
     def heading_net(self, found: Mapping[str, float]) -> Net:
         fallbacks = found.get("EK3_SRC2_YAW"), found.get("EK3_SRC3_YAW")

@@ -209,10 +209,10 @@ Net = Literal["script", "command", "autopilot", "none"]
 """Party that switches the autopilot to another heading source when our heading ends; "command" means the companion."""
 
 NETS: Final[dict[Net, str]] = {
-    "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
-    "command": "if our heading ends, the companion asks for gyros and GNSS, but not if its board dies (companion lua)",
-    "autopilot": "if our heading ends, the autopilot goes back to its magnetometer",
-    "none": "if our heading ends there is none: fly only where you can land without one",
+    "script": "if the companion's heading ends in flight, the script switches to gyros and GNSS within a second",
+    "command": "if the companion's heading ends, it selects gyros and GNSS, unless its board fails (companion lua)",
+    "autopilot": "if the companion's heading ends, the autopilot returns to its magnetometer",
+    "none": "if the companion's heading ends, no heading is left: fly only where you can land without one",
 }
 
 NO_IMU: Final = 0

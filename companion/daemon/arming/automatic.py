@@ -68,7 +68,7 @@ class Automatic:
         if not self.wanted or self.stopped is not None:
             return "calibrate"
         if self._writes_today() >= PER_DAY:
-            return "calibrate (flash spared)"
+            return f"calibrate ({PER_DAY} writes today)"
         now_s = asyncio.get_running_loop().time()
         # Offsets replaced by a boot, and a new gradienter zero, are urgent unless a calibration has failed.
         urgent = any(finding.why in (Why.REPLACED, Why.ALIGNED) for finding in self._in_force.findings(now_s))

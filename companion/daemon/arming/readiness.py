@@ -40,7 +40,7 @@ _STEPS: Final[dict[State, str]] = {
     State.VERIFYING: "checking new offsets",
     State.RESTARTING: "restarting autopilot",
     State.SETTLING: ADJUSTING,
-    State.UNDOING: "putting back old offsets",
+    State.UNDOING: "restoring old offsets",
 }
 _CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.REBOOTED: "checking after restart",

@@ -72,12 +72,12 @@ def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple
         yield Precondition.DISARMED, "armed: disarm first"
     if vehicle.arm_state is ArmState.UNKNOWN:
         age_s = vehicle.heartbeat_age_s
-        words = "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: power? cable?"
+        words = "no autopilot found yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: power? cable?"
         yield Precondition.ARM_STATE_KNOWN, words
     if (why := ledger.why_yield()) is not None:
         yield Precondition.ONE_COMPANION, why
     if ledger.pending:
-        yield Precondition.RESTORED, "putting old values back first"
+        yield Precondition.RESTORED, "restoring old values first"
 
 
 class CalibrationManager:
@@ -101,7 +101,7 @@ class CalibrationManager:
         try:
             self.last = next(iter(self._store.history(limit=1)), None)
         except StorageError as error:
-            logger.warning("%s; the daemon goes on without earlier records", error)
+            logger.warning("%s; the companion continues without earlier records", error)
 
     # --- state, and requests (component.service.CalibrationService)
 
@@ -185,7 +185,7 @@ class CalibrationManager:
 
     async def close(self) -> None:
         """Cancel the running job and wait for its end, so that it has finished or rolled back its writes."""
-        self.cancel("the daemon's end")
+        self.cancel("the companion's shutdown")
         if self._task is not None:
             await asyncio.wait([self._task])
 
@@ -252,7 +252,7 @@ class CalibrationManager:
         self._machine.on(Event.UNDO)
         if record is not None and record.state == "cancelled" and record.written:
             self._machine.on(Event.CONCLUDED)
-            self._end(job, JobResult("done", "auto calibration taken back"))
+            self._end(job, JobResult("done", "auto calibration undone"))
         else:
             await self._finish(job, self._undo(job, force=force))
 
@@ -261,7 +261,7 @@ class CalibrationManager:
         job.undid_calibration = await self._note_undone(step)
         job.product = {"written": msgspec.to_builtins(written), "undone": step.shown()}
         self._machine.on(Event.CONCLUDED)
-        return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
+        return f"{len(written)} old values restored{step.origin.what and f': {step.origin.what}'}"
 
     def _end(self, job: Job, result: JobResult) -> None:
         if result.outcome != "done":

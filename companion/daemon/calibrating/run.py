@@ -151,12 +151,12 @@ class CalibrationRun(Job):
 
     def _begin_again(self, error: WriteFailedError) -> None:
         self._machine.on(Event.MOVED)
-        logger.warning("%s; put back, measuring again", error.reason)
+        logger.warning("%s; old values restored, measuring again", error.reason)
         self._forget()
         if error.kind == "wrong slot, orientation or scale":
-            self.log.warnings.append(f"{error.reason}; put back, and written where it belongs")
+            self.log.warnings.append(f"{error.reason}; old values restored, then written to the correct slot")
         else:
-            self.log.warnings.append(f"{error.reason}; put back, and tried again")
+            self.log.warnings.append(f"{error.reason}; old values restored, trying again")
         self.check_cancelled()
 
     # --- the phases
@@ -202,7 +202,7 @@ class CalibrationRun(Job):
                 core.say(Severity.NOTICE, words)
         if self.held_back:
             kept = in_short(self.held_back)
-            core.say(Severity.WARNING, f"Held back: {kept}; calibrate on request to write it all the same")
+            core.say(Severity.WARNING, f"Held back: {kept}; to write it, calibrate on request")
 
     async def _make_plan(self) -> None:
         """Plan the new offsets of all IMUs in use, and the switching off of settings that would overwrite offsets."""

@@ -175,7 +175,7 @@ class Calibrating(Subsystem):
             if (busy := self.manager.blocking_reason((Precondition.IDLE,))) is not None:
                 raise CalibrationRefusedError(busy[1])
             was = await self.alignment.forget()
-            words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
+            words = "the configuration's zero and sigma are active" if was else "there was no alignment to forget"
             yield {"kind": "result", "state": "done", "reason": words}
         else:
             job = _accepted(self.start_alignment(asked, f"{face} align"))
@@ -188,7 +188,7 @@ class Calibrating(Subsystem):
     def _shown(self) -> Object:
         alignment, sides = self.alignment, self.faces.status()
         if alignment.used is not None or (sides and alignment.settings() is None):
-            state, reason = "in force", ""
+            state, reason = "active", ""
         elif alignment.unused is not None:
             state, reason = "not used", alignment.unused
         else:
@@ -234,7 +234,7 @@ class Calibrating(Subsystem):
         if request.level and request.write:
             return "either --write (offsets) or --level (the board's tilt): what is in one is not in the other"
         if request.level and self.faces.record is None:
-            return "the board's tilt needs accelerometers known from all sides: companion align faces --write first"
+            return "the board's tilt needs a six-position calibration: companion align faces --write first"
         return self._why_not_written(write=request.write or request.level)
 
     def _why_not_written(self, *, write: bool) -> str | None:
@@ -269,7 +269,7 @@ class Calibrating(Subsystem):
         if BY_TEMPERATURE not in after:
             return "no curve was written that could be undone"
         later = after[: after.index(BY_TEMPERATURE)]
-        return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
+        return None if not later else f"written since: {', '.join(later)}; companion undo restores that first"
 
     async def _write_curves(self, job: Job, *, overwrite: bool) -> str:
         """Write the bias curves over temperature to the autopilot, and verify that its output stays; return a summary.
@@ -290,7 +290,7 @@ class Calibrating(Subsystem):
         log.warnings += left
         if not any(target.all for target in targets):
             self._core.machine.on(Event.NOTHING_TO_WRITE)
-            return "already in force"
+            return "already active"
         plan = await self._offsets.write(job, Plan(tuple(targets), self._core.vehicle.boots), window, log)
         await self._offsets.settle(job, plan, window, log)
         job.product = {"imus": log.written, "warnings": log.all_warnings}
@@ -308,7 +308,7 @@ class Calibrating(Subsystem):
             if curve is None:
                 left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
             elif degc is None:
-                left.append(f"imu {name}: it tells no temperature now")
+                left.append(f"imu {name}: it sends no temperature now")
             elif enabled_by and not overwrite and not self._wrote_curve(calibration.thermal):
                 left.append(
                     f"imu {name}: {enabled_by} is on, and not by the companion: kept"

@@ -40,7 +40,7 @@ _FAULTS: Final = {
     "required": "the autopilot wants signatures: give the companion its key (signing_key_file)",
     "other key": "the autopilot signs with another key: give both the same one",
     "unsigned": "the autopilot does not sign on this link: give it the companion's key",
-    "old": "the autopilot's signatures are old, not believed: wait some seconds, or restart it",
+    "old": "the autopilot's signatures are too old, rejected: wait some seconds, or restart it",
     "ahead": f"signing time far ahead of this board's clock: stop the companion, delete {SIGNING_FILE}, start it",
 }
 _SENDERS: Final[dict[Reason, str]] = {

@@ -76,7 +76,7 @@ class Resume:
         record = self._record
         found = None if record is None else next((imu for imu in record.imus if imu.name == name), None)
         if record is None or found is None or found.gyro_bias_rad_s is None:
-            return "no calibration is in force"
+            return "no calibration is active"
         if self._imu is not None:
             if self._imu.calibration is None:
                 return "reading the autopilot's offsets"
@@ -86,7 +86,7 @@ class Resume:
         local = await self._core.offload(_place, record, models.whereabouts(self._core.config, self._core.vehicle))
         settings = settings_of(self._core.profiles.imu(name), found, local, self._carrier.gyro_step_rad_s)
         if settings is None:
-            return "no calibration is in force"
+            return "no calibration is active"
         covariance = np.diag([(THEIR_TILT_DEG * DEG) ** 2] * 2 + [HEADING_UNKNOWN_RAD**2])
         stand = StandingAttitude(theirs[0], to_matrix(theirs[1]).T, covariance, heading_known=False, local=local)
         self._carrier.resume(settings, stand)

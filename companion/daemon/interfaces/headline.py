@@ -56,7 +56,7 @@ class Headlines:
         if unmet is Precondition.ARM_STATE_KNOWN:
             return self._no_autopilot()
         if manager.blocking_reason((Precondition.RESTORED,)) is not None:
-            return "PUTTING BACK", "an interrupted write is being put back", "busy"
+            return "RESTORING", "an interrupted write is being restored", "busy"
         state, words = self._readiness.state(now_s)
         if unmet is Precondition.DISARMED:
             if state != "uncalibrated":

@@ -217,7 +217,7 @@ class Recovery:
         if ours:
             with changing(self._imus.values()):
                 await self._writer.restore(ours)
-        found = f"{len(ours)} old values back" if ours else "nothing to restore"
+        found = f"{len(ours)} old values restored" if ours else "nothing to restore"
         if foreign:
             found += "; " + message("changed_by_others", values=", ".join(foreign))
         words = message("interrupted_write_ended", result=found)

@@ -48,7 +48,7 @@ logger = logging.getLogger(__name__)
 
 DISARMED_WITHIN_S: Final = 10.0
 """Longest wait for a heartbeat before a write, if it is not known whether the aircraft is armed."""
-WATCHING: Final = "watching the telemetry take the new offsets"
+WATCHING: Final = "checking the telemetry for the new offsets"
 POLL_S: Final = 0.2
 CONCLUDING_PERCENT: Final = 95.0
 READ_ATTEMPTS: Final = 3

@@ -218,7 +218,7 @@ def _autopilot(config: Config, vehicle: Object) -> CheckLine:
     needs = "switched on, and sent there (MAVProxy --out, mavlink-router)?"
     if baud is not None:
         needs = f"{port_needs(None, baud)}; TX to RX"
-    remedy = f"{needs}; companion setup looks for it elsewhere"
+    remedy = f"{needs}; companion setup searches the other ports"
     return CheckLine("autopilot", good=False, words=f"{vehicle['summary']}: {remedy}", remedy=remedy)
 
 

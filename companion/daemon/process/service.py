@@ -291,14 +291,14 @@ class Supervisor:
             await asyncio.sleep(period_s)
 
     def _report(self, overdue: Sequence[WatchedTask]) -> None:
-        fed = "; the watchdog is not fed until it does" if self._manager.watchdog_s is not None else ""
+        fed = "; if this lasts, systemd restarts the companion" if self._manager.watchdog_s is not None else ""
         for each in overdue:
             if each.name not in self._missed:
                 where, age = _where(each.task), f"{each.age_s:.0f}"
                 logger.error("watchdog: %s%s", message("task_hangs", task=each.name, seconds=age, where=where), fed)
         missed = {each.name for each in overdue}
         for name in () if self._stopping else self._missed - missed:
-            logger.warning("watchdog: %s goes on again", name)
+            logger.warning("watchdog: %s runs again", name)
         self._missed = missed
 
     def _words(self, overdue: Sequence[WatchedTask]) -> str:

@@ -63,7 +63,7 @@ class Measuring:
         await self._core.catch_up()
         status = self._core.collector.status(asyncio.get_running_loop().time())
         if armed:
-            return status, "armed: it goes on once it is disarmed", None
+            return status, "armed: continues once disarmed", None
         if vehicle.conflict is not None:
             return status, f"waiting: {vehicle.conflict}", None
         if vehicle.arm_state is ArmState.UNKNOWN:

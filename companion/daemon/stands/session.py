@@ -52,7 +52,7 @@ STILL_MOVING_S: Final = 20.0
 """Duration of movement after which the operator gets a message: a hand or the wind may move the aircraft."""
 LEANED_DEG: Final = 0.03
 """Largest change of tilt within a pose; half of it enters the mean, as much as an error of placement on floor marks."""
-ARMED: Final = "armed during the alignment; the earlier one stays in force"
+ARMED: Final = "armed during the alignment; the earlier one stays active"
 
 
 @dataclasses.dataclass(slots=True, eq=False)

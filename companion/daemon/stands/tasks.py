@@ -127,7 +127,7 @@ class ZeroTask(SpotTask):
 
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         if now.tilt is None:
-            raise CalibrationRefusedError("no reading of the gradienter in this stand")
+            raise CalibrationRefusedError("no reading of the gradienter in this pose")
         try:
             up = up_in_vehicle(self._gradienter, now.tilt.x_deg, now.tilt.y_deg)
         except ValueError as error:
@@ -218,7 +218,7 @@ class TurnTask(SpotTask):
         sides = self._known.known(first.name, self._imus[first.name].in_force, degrees.get(first.name))
         self.board = None if sides is None else mounting(first, sides, local.gravity_m_s2)
         if self.board is None and self.request.level:
-            raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
+            raise CalibrationRefusedError("these accelerometers have no six-position calibration: align faces again")
         return TurnRecord(
             measured_at=log.started,
             slope_deg=round(result.slope_deg, 3),
@@ -301,7 +301,7 @@ class SidesTask(PoseTask):
         found = self._by_imu[imu.name]
         up = self._face(imu)[0] - found.figures[BIAS]
         again = seen_before(found, up / np.linalg.norm(up), self._imus[imu.name].in_force.orientation)
-        return pose, None if again is None else f"it stands as in stand {again + 1}: {self._missing.words}"
+        return pose, None if again is None else f"same pose as pose {again + 1}: {self._missing.words}"
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         before, self._by_imu, self._missing = self._by_imu, {}, None
@@ -318,14 +318,14 @@ class SidesTask(PoseTask):
         if not self._by_imu:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
         return [
-            f"Stand {stand + 1} is left out: it is {float(found.off_m_s2[stand]) / MG:+.1f} mg off"
+            f"Pose {stand + 1} is left out: it is off by {float(found.off_m_s2[stand]) / MG:+.1f} mg"
             for name, found in self._by_imu.items()
             for stand in set(found.left_out) - set(before[name].left_out if name in before else ())
         ]
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> FacesRecord:
         if self._missing is not None:
-            self.shortfall = f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
+            self.shortfall = f"after {MOST} poses {self._missing.words.partition(': ')[2]}"
             log.warnings.append(self.shortfall)
         elif self.request.write:
             log.warnings += self._scales_left()

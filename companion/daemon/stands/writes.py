@@ -115,14 +115,14 @@ class AlignmentWrites:
     ) -> tuple[Outcome, str | None]:
         """Wait until the attitude has turned as expected; return outcome and warning, or raise AutopilotError."""
         loop, vehicle = asyncio.get_running_loop(), self._vehicle
-        job.progress(WRITTEN_PERCENT, "watching the attitude take the new level")
+        job.progress(WRITTEN_PERCENT, "checking the attitude for the new level")
         since_s, boots = loop.time() + USED_AFTER_S, vehicle.boots
         while loop.time() < since_s + WITHIN_S and vehicle.boots == boots:
             job.check_cancelled()
             now = self._own.up(max(since_s, loop.time() - LATEST_S))
             if before is not None and now is not None:
                 if _angle_deg(turn @ before, before) < SEEN_DEG:
-                    return "stored", "the new level is too near the old one to be seen"
+                    return "stored", "the level changed too little to verify"
                 if _follows(before, now, turn):
                     return "verified", None
             await job.pause(POLL_S)
@@ -130,8 +130,8 @@ class AlignmentWrites:
             if await self._imus_turned(turn, last):
                 return "verified", REBOOT
         elif before is None:
-            return "stored", "the effect of the new level was not seen: no ATTITUDE comes"
-        raise AutopilotError("the attitude did not follow the new level, or it moved")
+            return "stored", "the effect of the new level is not verified: no ATTITUDE messages"
+        raise AutopilotError("the attitude did not follow the new level, or the aircraft moved")
 
     async def _imus_turned(self, turn: Matrix, last: Window) -> bool:
         with contextlib.suppress(CalibrationRefusedError):

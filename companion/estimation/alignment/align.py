@@ -179,17 +179,17 @@ def turned(stands: Sequence[StandMeans], ground: Ground) -> Alignment:
 _COMPLAINTS: Final = {
     "spot": "stand {stand} is off by {deg:.2f} deg from the others on this spot ({by}): the spot moved, or the aircraft"
     " was not put back onto its marks; begin again on firm ground",
-    "compass": "stand {stand}: the heading is off by {deg:.0f} deg ({by}): iron near by? Begin again",
-    "turn": "stand {stand}: it was not turned as the gyros say, off by {deg:.0f} deg ({by}): begin again",
+    "compass": "pose {stand}: the heading is off by {deg:.0f} deg ({by}): iron near by? Begin again",
+    "turn": "pose {stand}: it was not turned as the gyros say, off by {deg:.0f} deg ({by}): begin again",
     "zero": "the gradienter's zero would be off by {deg:.1f} deg, more than can be ({by}): does the aircraft stand"
     " level on its base, and are law and mounting right?",
-    "gradienter": "stand {stand}: the gradienter is off by {deg:.2f} deg ({by}): check its law and mounting",
-    "accelerometer": "stand {stand}: imu {name} and the gradienter differ by {mg:.1f} mg ({by}): check the gradienter's"
+    "gradienter": "pose {stand}: the gradienter is off by {deg:.2f} deg ({by}): check its law and mounting",
+    "accelerometer": "pose {stand}: imu {name} and the gradienter differ by {mg:.1f} mg ({by}): check the gradienter's"
     " law and mounting, and that nothing is loose",
-    "gyro": "stand {stand}: gyro {name} does not fit the other stands ({by}): still warming up? Begin again",
+    "gyro": "pose {stand}: gyro {name} does not fit the other poses ({by}): still warming up? Begin again",
 }
-_LOOSE: Final = "stand {stand}: imu {name} is off by {mg:.1f} mg ({by}): is something loose? Begin again"
-_UNKNOWN: Final = "the stands do not fit what is known of the sensors ({by}): begin again"
+_LOOSE: Final = "pose {stand}: imu {name} is off by {mg:.1f} mg ({by}): is something loose? Begin again"
+_UNKNOWN: Final = "the poses contradict the known sensor errors ({by}): begin again"
 
 
 def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:

@@ -204,7 +204,7 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
     if worst_first:
         why = _figure(sigma, int(np.argmax(told[best])))
     else:
-        why = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
+        why = "one pose does not fit; the next one shows which" if found.in_doubt else "one more pose needed as a check"
     side, up = sides[best]
     unknown = tuple(_figure(sigma, which) for which in worst_first)
     return Wish(f"{side}: {why}", vector(vehicle_from_sensor @ up), unknown=unknown)

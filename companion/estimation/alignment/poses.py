@@ -85,7 +85,7 @@ class HeldPose(NamedTuple):
 
 def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> Wish:
     if not poses:
-        return Wish("stand it on a firm, marked spot")
+        return Wish("stand the aircraft on a firm, marked spot")
     if len(poses) >= request.on_spot:
         done = [_side(poses[0].up, pose.up) for pose in poses[request.on_spot :]]
         up = next((up for side, up in _TILTED.items() if side not in done), LEVEL)

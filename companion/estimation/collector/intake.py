@@ -155,7 +155,7 @@ class Thermometer:
             wrong = f"shows {degc:.2f}, allowed {allowed}: in another unit?"
         elif len(self._jumps) == _JUMPS and slot - self._jumps[0] <= _WITHIN_S:
             wrong = f"jumps: more than {JUMP_K:g} K within a second, again and again"
-        self.wrong = f"its thermometer {wrong}; nothing is learned by it" if wrong else ""
+        self.wrong = f"its thermometer {wrong}; its temperature is not used" if wrong else ""
         return None if wrong or jumped else degc
 
 

@@ -114,7 +114,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
             return ""
         if self.rate_k_s:
             k_min = abs(self.rate_k_s) * 60.0
-            return f"gyro {name}: its temperature moves by {k_min:.1f} K a minute, sigma allows for that"
+            return f"gyro {name}: its temperature changes by {k_min:.1f} K a minute, sigma allows for that"
         age = f"{powered_s:.0f} s" if powered_s < 120.0 else f"{powered_s / 60.0:.0f} min"
         words = f"gyro {name}: on for {age}, may still be warming, sigma allows for that"
         now, *later = (math.sqrt((self.unseen(at_s) + other_variance)[:3].max()) for at_s in (powered_s, *_LATER_S))

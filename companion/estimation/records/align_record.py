@@ -167,7 +167,7 @@ def check(record: AlignmentRecord | FacesRecord) -> None:
         found = [((*record.offset_deg, 0.0), (record.sigma_deg,) * 3, _MOST_DEG)]
     for value, sigma, most in found:
         if not np.abs([*value, *sigma]).max() < most or min(sigma) <= 0.0:
-            raise msgspec.ValidationError(f"{value} with a sigma of {sigma} cannot be")
+            raise msgspec.ValidationError(f"{value} with a sigma of {sigma} is impossible")
 
 
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):

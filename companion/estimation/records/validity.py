@@ -49,7 +49,7 @@ class Why(enum.Enum):
     ALIGNED = "gradienter aligned since then"
     CHANGED = "changed by someone else"
     FAILED = "last calibration failed"
-    UNSEEN = "offsets written but not seen to work"
+    UNSEEN = "offsets written but not verified"
     OLD = "calibration too old"
     TEMPERATURE = "temperature changed"
     RESIDUAL = "biases moved"

@@ -349,7 +349,7 @@ class BatchSource:
         # NaN compares false, so this drops it too.
         good = np.asarray((np.abs(rows) <= self._limits).all(axis=1))
         if not good.all():
-            self.dropped["not a believable number"] += int((~good).sum())
+            self.dropped["not a plausible number"] += int((~good).sum())
         if stamps is not None:
             fresh = _fresh(stamps, np.where(good[:, None], rows, 0.0))
             if (repeated := int((good & ~fresh).sum())) > 0:

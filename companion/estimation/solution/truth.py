@@ -195,7 +195,10 @@ def _up_by_sides(
         across = (np.eye(3) - np.outer(up, up)) / length
         up_covariance = across @ covariance @ across.T
         sigma_deg = float(np.sqrt(np.linalg.eigvalsh(up_covariance)[-1])) / DEG
-        angle, sigma_words = f"tilt by the accelerometers of imu {imu.name}, known from all sides", f"{sigma_deg:.2g}"
+        angle, sigma_words = (
+            f"tilt by the accelerometers of imu {imu.name}, calibrated in six positions",
+            f"{sigma_deg:.2g}",
+        )
         warnings.append(message("angle_without_sensor", sensor="gradienter", angle=angle, sigma_deg=sigma_words))
         return up, up_covariance
     return None

@@ -57,12 +57,12 @@ def implausible(
         found["accel"] = message("tilt_sensor_turned", imu=name, deg=deg)
     elif bias[axis := int(bias.argmax())] > MOST_ACCEL_M_S2:
         found["accel"] = (
-            f"accel {name}: a bias of {bias[axis] / G:.2f} g on {_AXES[axis]}, more than any part has"
+            f"accel {name}: a bias of {bias[axis] / G:.2f} g on {_AXES[axis]}, more than any sensor has"
             f" ({MOST_ACCEL_M_S2 / G:g}): scale, unit or tilt are wrong"
         )
     if rate[axis := int(rate.argmax())] > MOST_GYRO_RAD_S:
         found["gyro"] = (
-            f"gyro {name}: a bias of {rate[axis] / DEG:.0f} deg/s on {_AXES[axis]}, more than any part has"
+            f"gyro {name}: a bias of {rate[axis] / DEG:.0f} deg/s on {_AXES[axis]}, more than any sensor has"
             f" ({MOST_GYRO_RAD_S / DEG:g}): deg/s for rad/s?"
         )
     return found

@@ -172,7 +172,7 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
     try:
         reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
     except OSError as error:
-        why = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "nobody listens there"}.get(
+        why = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "no program listens there"}.get(
             error.errno or 0, str(error)
         )
         if error.errno == errno.EACCES:

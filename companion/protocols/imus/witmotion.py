@@ -29,7 +29,7 @@ from companion.protocols.decoding.base import NO_FRAME, Decoder, RejectedError
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
-ALONE: Final = "without company"
+ALONE: Final = "incomplete pair"
 
 _FIRST_TYPE, _LAST_TYPE = 0x50, 0x5F
 _ACCEL, _GYRO, _ANGLE, _FIELD = 0x51, 0x52, 0x53, 0x54

@@ -148,7 +148,7 @@ function calibration(found, arming) {
 function byHand(found) {
   $("by-hand").replaceChildren(...found.map(one => {
     const written = Object.keys(one.written).length;
-    const end = one.undone_at ? `undone ${utc(one.undone_at)}` : one.in_force ? "in force" : one.in_force === false ? "not as written any more" : "";
+    const end = one.undone_at ? `undone ${utc(one.undone_at)}` : one.in_force ? "active" : one.in_force === false ? "changed since" : "";
     return make("p", `${one.what}, ${utc(one.measured_at)}: ${one.state === "failed" ? "failed: " : ""}${one.reason}` + (written && end ? `; ${end}` : ""), "note");
   }));
 }

@@ -74,7 +74,7 @@ function stands(found) {
   const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, found.outcome]);
   if (key === shownStands) return;
   shownStands = key;
-  $("standing").textContent = running ? `${found.kind}: stand ${found.number} of ${found.total}` : `${found.kind}: ${found.outcome}`;
+  $("standing").textContent = running ? `${found.kind}: pose ${found.number} of ${found.total}` : `${found.kind}: ${found.outcome}`;
   $("stands").dataset.outcome = found.outcome || "";
   $("wish").textContent = wish;
   $("still").textContent = found.objection || (found.unknown.length ? "still unknown: " + found.unknown.join(", ") : unknown || "");
@@ -83,7 +83,7 @@ function stands(found) {
   const left = Math.max(found.total - found.done.length, 0);
   $("done").replaceChildren(...found.done.map((up, k) => {
     const it = make("li");
-    it.append(picture(up, 0, `stand ${k + 1}: done`), sign("good"));
+    it.append(picture(up, 0, `pose ${k + 1}: done`), sign("good"));
     return it;
   }), ...Array.from({length: running ? left : 0}, (_, k) => make("li", String(found.done.length + k + 1))));
 }

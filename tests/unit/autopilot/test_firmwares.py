@@ -40,7 +40,7 @@ def test_every_name_has_an_object_and_every_heartbeat_one() -> None:
 def test_an_unknown_one_has_nothing_to_measure_or_to_write(firmware: Firmware) -> None:
     assert (firmware.imu_messages, firmware.ranges, firmware.rivals) == ({}, {}, ())
     assert not firmware.gyro_calibration_resets_ekf
-    assert firmware.forwarding_words([]) == (True, "none heard (none connected?)")
+    assert firmware.forwarding_words([]) == (True, "no ground station found (none connected?)")
     with pytest.raises(AutopilotError):
         firmware.heading_names()
 

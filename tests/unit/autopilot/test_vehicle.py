@@ -98,7 +98,7 @@ async def test_disarmed_heartbeats_of_a_forger_are_not_believed_and_named(own_hz
         await asyncio.sleep(0.01)
         assert state(vehicle) is not ArmState.DISARMED
     assert state(vehicle) is ArmState.UNKNOWN
-    assert vehicle.conflict == "system id 1 says armed and disarmed by turns: two autopilots, or a forger"
+    assert vehicle.conflict == "system id 1 reports armed and disarmed alternately: two autopilots, or a forged sender"
     for task in both:
         task.cancel()
     vehicle.close()

@@ -90,7 +90,7 @@ async def test_a_refusal_in_the_middle_puts_the_written_ones_back_in_reverse_ord
 
     on_nth_set(autopilot, 3, refuse)
     async with aboard(autopilot) as (writer, _, _):
-        with pytest.raises(WriteFailedError, match="old values back") as caught:
+        with pytest.raises(WriteFailedError, match="old values restored") as caught:
             await writer.apply(CHANGES)
         assert caught.value.kind == "refused"
         assert autopilot.parameters == rounded(BEFORE)
@@ -154,7 +154,7 @@ async def test_arming_in_the_middle_stops_at_once_and_says_what_is_left() -> Non
 
     on_nth_set(autopilot, 2, arm)
     async with aboard(autopilot) as (writer, _, _):
-        with pytest.raises(WriteFailedError, match="old values NOT back in INS_GYROFFS_X, INS_GYROFFS_Y") as caught:
+        with pytest.raises(WriteFailedError, match="old values NOT restored in INS_GYROFFS_X, INS_GYROFFS_Y") as caught:
             await writer.apply(CHANGES)
         assert caught.value.kind == "armed in the middle"
         assert caught.value.left_changed == (X, Y)
@@ -227,7 +227,7 @@ async def test_what_the_autopilot_calibrated_itself_at_a_restart_is_left_and_nam
     on_nth_set(autopilot, 2, restart)
     async with aboard(autopilot) as (writer, _, _):
         await asyncio.sleep(2.0)
-        with pytest.raises(WriteFailedError, match=r"rebooted in the middle.*old values NOT back in INS_GYROFFS_X"):
+        with pytest.raises(WriteFailedError, match=r"rebooted in the middle.*old values NOT restored in INS_GYROFFS_X"):
             await writer.apply(CHANGES)
         assert writer.left_changed == (X,)
         assert writer.written[X].read_back == f32(0.0444)

@@ -103,7 +103,7 @@ async def end_of(ledger: Ledger, block: Block) -> BaseException | None:
         (undone_and_then, True),
     ],
     ids=[
-        "old values back", "nothing written", "left changed", "another error",
+        "old values restored", "nothing written", "left changed", "another error",
         "the disk", "cancelled", "torn down", "no word", "an error after done", "an error after undone",
     ],
 )  # fmt: skip
@@ -126,7 +126,7 @@ def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(tmp_path: P
 @pytest.mark.parametrize(
     ("block", "kept"),
     [(raises(ALL_BACK), True), (raises(NOTHING), True), (Ledger.undone, False), (raises(HALF_BACK), False)],
-    ids=["old values back", "nothing written", "undone", "left changed"],
+    ids=["old values restored", "nothing written", "undone", "left changed"],
 )
 def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
     tmp_path: Path, block: Block, kept: bool

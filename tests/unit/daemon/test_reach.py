@@ -73,7 +73,7 @@ def test_an_autopilot_that_never_answers_does_not_hear_us() -> None:
 def test_ardupilot_needs_nothing_but_our_heartbeat() -> None:
     good, words = words_of(ScriptedAutopilot(parameters={"INS_GYR_CAL": 0.0}))
     assert good
-    assert "none heard" in words
+    assert "no ground station found" in words
     assert "set not to forward" in words
 
 

@@ -186,7 +186,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
 
     with caplog.at_level(logging.WARNING):
         run_virtual(main())
-    assert [record.getMessage() for record in caplog.records] == ["mavlink signing time not saved: disk full"]
+    assert [record.getMessage() for record in caplog.records] == ["MAVLink signing time not saved: disk full"]
 
 
 def test_the_unit_hands_the_boot_id_over(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,7 @@ EVERYTHING: dict[str, Any] = {
         (
             ("fault", "conflict", "job", "arm_state", "second"),
             Precondition.RESTORED,
-            "putting old values back first",
+            "restoring old values first",
             "busy",
         ),
     ],

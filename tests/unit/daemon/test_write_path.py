@@ -95,7 +95,7 @@ def test_a_write_that_must_not_stay_is_restored_at_once(
 ) -> None:
     async def main() -> None:
         aircraft = WritePathAircraft(tmp_path)
-        with pytest.raises(raised, match=r"; old values back$"):
+        with pytest.raises(raised, match=r"; old values restored$"):
             await aircraft.commit(verdict, full=full)
         assert aircraft.writer.restored == MADE
         assert aircraft.ledger.steps(1) == ()
@@ -108,7 +108,7 @@ def test_values_that_could_not_be_restored_are_named_and_left_to_the_recovery(tm
     async def main() -> None:
         aircraft = WritePathAircraft(tmp_path)
         aircraft.writer.fails = WriteFailedError("armed in the middle", "armed", {}, ("INS_GYROFFS_X",))
-        with pytest.raises(AutopilotError, match="old values NOT back in INS_GYROFFS_X: restored once disarmed"):
+        with pytest.raises(AutopilotError, match="old values NOT restored in INS_GYROFFS_X: restored once disarmed"):
             await aircraft.commit(AutopilotError("not followed"))
         assert aircraft.ledger.pending
 

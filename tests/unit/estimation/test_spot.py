@@ -126,7 +126,7 @@ def test_a_turn_that_the_stands_contradict_is_named() -> None:
     found = solved(stands)
     assert found.complaint is not None
     said = in_words(found.complaint, gradienter=False)
-    assert said.startswith("stand 3: it was not turned as the gyros say, off by 12 deg")
+    assert said.startswith("pose 3: it was not turned as the gyros say, off by 12 deg")
 
 
 def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NONE") -> Sides:
@@ -182,6 +182,4 @@ def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
 def test_without_a_gradienter_none_is_blamed() -> None:
     loose = Complaint(("accelerometer", 2, "fc"), 7.0, 3.0 * MG)
     assert "gradienter" in in_words(loose)
-    assert in_words(loose, gradienter=False).startswith(
-        "stand 2: imu fc is off by 3.0 mg (7 sigma): is something loose"
-    )
+    assert in_words(loose, gradienter=False).startswith("pose 2: imu fc is off by 3.0 mg (7 sigma): is something loose")

@@ -40,7 +40,7 @@ def test_a_bad_one_is_named_with_what_was_found_and_not_believed(degc: Degc, wor
     thermometers, found = shown(1000, fc=degc, own=warm)
     line = thermometers["fc"].wrong
     assert line.startswith("its thermometer ")
-    assert line.endswith("; nothing is learned by it")
+    assert line.endswith("; its temperature is not used")
     assert "\n" not in line
     assert len(line) < 120
     assert re.search(words, line), line

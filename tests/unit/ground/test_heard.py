@@ -41,12 +41,12 @@ def test_the_vehicle_as_its_heartbeats_show_it() -> None:
 def test_lines_that_go_on_are_one_text() -> None:
     heard = GroundListener(191)
     say(heard, "Calibration failed: armed in the middle;")
-    say(heard, "... old values back")
+    say(heard, "... old values restored")
     say(heard, "another vehicle's autopilot", component=1)
     say(heard, "Hold still 5 s")
-    assert said(heard) == ["Calibration failed: armed in the middle;", "... old values back", "Hold still 5 s"]
+    assert said(heard) == ["Calibration failed: armed in the middle;", "... old values restored", "Hold still 5 s"]
     whole = [text.words for text in heard.texts_of(1, 0.0)]
-    assert whole == ["Calibration failed: armed in the middle; old values back", "Hold still 5 s"]
+    assert whole == ["Calibration failed: armed in the middle; old values restored", "Hold still 5 s"]
 
 
 def test_what_a_terminal_would_obey_is_not_passed_on() -> None:

@@ -123,7 +123,7 @@ def test_an_end_that_was_not_heard_is_no_success(value: float | None, words: str
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "words"), [(False, "companion ground status"), (True, "puts the old values back")]
+    ("autopilot", "words"), [(False, "companion ground status"), (True, "restores the old values")]
 )
 def test_a_companion_that_is_gone_is_given_up_with_words(autopilot: bool, words: str) -> None:
     async def main() -> None:

@@ -96,7 +96,7 @@ def test_a_damaged_or_newer_one_is_refused_in_one_line(
     assert words in str(refused.value)
     # All but the daemon's own start, which no file may prevent: then with the figures of the worst parts, and a word.
     config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name, forgiving=True))
-    assert str(Profiles(config).status()[0]["summary"]).startswith("mine, sigmas are those of the worst")
+    assert str(Profiles(config).status()[0]["summary"]).startswith("mine, sigmas (errors) assume the worst")
     instead, worst = noise_profile(config.imu[0].profile), noise_profile(None)
     assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
     (said,) = caplog.messages
@@ -182,7 +182,7 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gx, gy, gz, ax, ay, az in t_s, gx"),
         ("", [], 1, "the file is empty"),
         (None, [], 1, "No such file"),
-        (None, ["--save", "bmi088"], 1, "found a name of the catalogue"),
+        (None, ["--save", "bmi088"], 1, "found a built-in part's name"),
         (None, ["--profile", "bmi08"], 2, "did you mean 'bmi088'?"),
         ("short", ["--short"], 1, "imu imu: only 28 s at rest; a profile needs 60 s"),
         ("short", ["--short", "--imu", "fc"], 1, "imu fc: only 28 s at rest"),

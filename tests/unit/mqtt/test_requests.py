@@ -153,7 +153,7 @@ def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request(capl
         daemon = Daemon()
         for _ in range(3):  # three connections
             await daemon.take(b'{"transaction": "old"}', retained=True)
-        assert [record.getMessage().partition(" is never obeyed")[0] for record in caplog.records] == [
+        assert [record.getMessage().partition(" is ignored")[0] for record in caplog.records] == [
             "mqtt: the retained request at companion/1/request/calibrate"
         ]
         assert daemon.states() == ["refused"] * 3

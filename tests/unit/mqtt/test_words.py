@@ -102,7 +102,7 @@ def _lost(name: str) -> Exception:
         (_refused("Quota exceeded"), None, "the broker says: "),
         (_lost("Session taken over"), None, "the broker has another client called 'me'"),
         (_lost("Server shutting down"), None, "the broker shuts down"),
-        (aiomqtt.MqttError("Operation timed out"), None, "says nothing (does it want tls = true?)"),
+        (aiomqtt.MqttError("Operation timed out"), None, "sends nothing (does it want tls = true?)"),
         (ExceptionGroup("", [_lost("Keep alive timeout")]), None, "the broker is silent"),
         (LinkError("password file /x: no such file"), None, "password file /x: no such file"),
         (OSError(113, "Connect call failed ('192.0.2.1', 1883)"), None, "no route to host"),

@@ -123,7 +123,7 @@ def test_a_silent_device_is_polled_with_one_question_that_stores_nothing(
     assert len(line.samples) >= len(line.said) - 1
     assert not decoder.rejected
     assert getattr(device, "stored", 0) == 0
-    assert dialogue.words == f"asked {1.0 / dialogue.period_s:.0f} times a second with {name}"
+    assert dialogue.words == f"polled {1.0 / dialogue.period_s:.0f} times a second with {name}"
 
 
 @pytest.mark.parametrize("make", [Gradienter, BeiInclinometer])

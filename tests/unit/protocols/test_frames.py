@@ -175,7 +175,7 @@ def test_documented_frames_of_one_epoch_are_read_as_documented() -> None:
 def test_a_documented_frame_alone_is_not_believed(frame: dict[str, Any]) -> None:
     decoder = make_decoder("imu", "witmotion")
     assert decoder.feed(bytes_of(frame) + bytes(11), 7.0) == []
-    assert decoder.rejected == {"without company": 1}
+    assert decoder.rejected == {"incomplete pair": 1}
 
 
 @pytest.mark.parametrize("device", sorted({frame["device"] for frame in FRAMES if not frame["valid"]}))

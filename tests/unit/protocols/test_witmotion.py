@@ -75,15 +75,15 @@ def test_only_neighbours_belong_together() -> None:
     assert (len(samples), rejected) == (1, {"orphan": 2})
     # The rate is lost, and with it the next epoch's acceleration is not taken for this one's.
     samples, rejected = feed(accel + accel + b"x" + gyro + NEXT)
-    assert (samples, rejected) == ([], {"without company": 1, "orphan": 2})
+    assert (samples, rejected) == ([], {"incomplete pair": 1, "orphan": 2})
 
 
 def test_a_frame_alone_is_not_believed() -> None:
-    assert feed(wit(0x53) + bytes(11)) == ([], {"without company": 1})
-    assert feed(wit(0x53) + b"x" + wit(0x53) + NEXT)[1] == {"without company": 1}
+    assert feed(wit(0x53) + bytes(11)) == ([], {"incomplete pair": 1})
+    assert feed(wit(0x53) + b"x" + wit(0x53) + NEXT)[1] == {"incomplete pair": 1}
     bad = bytearray(wit(0x53))
     bad[5] ^= 1
-    assert feed(wit(0x53) + bytes(bad) + bytes(11)) == ([], {"without company": 1, "checksum": 1})
+    assert feed(wit(0x53) + bytes(bad) + bytes(11)) == ([], {"incomplete pair": 1, "checksum": 1})
 
 
 def test_the_last_frame_waits_for_another() -> None:

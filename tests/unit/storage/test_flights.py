@@ -40,7 +40,7 @@ def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest
     assert list(store.newest()) == [3, 1]
     (words,) = caplog.messages
     assert words.startswith(f"{path}: cannot be used: its checksum does not fit")
-    assert words.endswith(", passed over")
+    assert words.endswith(", skipped")
     for content in (b"", b"{}", data[: len(data) // 2], b"[" * 100_000):
         path.write_bytes(content)
         with pytest.raises(StorageError, match="cannot be used: "):

@@ -69,7 +69,7 @@ def test_what_cannot_be_used_is_set_aside_and_said_in_one_line(
     words = said.getMessage()
     assert (said.levelno, words.count("\n")) == (logging.WARNING, 0)
     assert words.startswith(f"{path}: cannot be ")
-    assert words.endswith(f"; set aside as {path.name}.unusable")
+    assert words.endswith(f"; renamed to {path.name}.unusable")
     assert len(words) < 400
     assert not os.path.lexists(path)
     assert os.path.lexists(f"{path}.unusable")
@@ -135,7 +135,7 @@ def test_where_it_cannot_be_set_aside_it_is_named_and_not_used(tmp_path: Path, m
         journal = ChangeLog(tmp_path).journal
         assert journal.load() is None
         assert journal.unusable is not None
-        assert journal.unusable.endswith("it cannot be set aside either")
+        assert journal.unusable.endswith("it cannot be renamed either")
 
 
 def test_a_few_are_kept_of_each_name(tmp_path: Path) -> None:
