@@ -1,4 +1,4 @@
-"""Biases of each IMU from earlier calibrations and still windows, and the prediction of its present biases.
+"""Biases of each IMU from earlier calibrations and windows without motion, and the prediction of its present biases.
 
 A change of sensor, profile or mounting voids the stored biases. The last calibration since power-up predicts best.
 """
@@ -40,9 +40,9 @@ from companion.storage.records import BiasStore, KnownImu, this_boot
 logger = logging.getLogger(__name__)
 
 LOOK_K: Final = 1.0  # Temperatures closer than this count as equal
-WRITE_EVERY_S: Final = 60.0  # Minimum time between writes of still windows to the disk
+WRITE_EVERY_S: Final = 60.0  # Minimum time between writes of windows without motion to the disk
 _MUCH_BETTER: Final = 0.7
-"""Ratio of sigmas (new to stored still window of equal temperature) below which the new window replaces the stored."""
+"""Limit on new sigma / stored sigma: below it, a new window replaces the stored window of equal temperature."""
 _IN_WORDS: Final = {  # Keys of an identity, as text for people
     "system": "vehicle",
     "gyro": "gyro (device id)",
@@ -65,7 +65,7 @@ class BiasMemory:
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
-        """Reference bias by IMU and triad (gyro, accel): id of the power-up, point, number of contradictions since."""
+        """Accepted bias by IMU and triad (gyro, accel): power-up id, history point, number of contradictions since."""
         self._now_degc: dict[str, float | None] = {}
         self._written_s = -math.inf
 
@@ -93,7 +93,7 @@ class BiasMemory:
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
     ) -> tuple[Vector, Vector] | None:
-        """Predict the change of the output from `degc` to `now_degc`, and its variance, by axis; None if unknown."""
+        """Predict the output's change between two temperatures, and its variance, by axis; None if unknown."""
         curve = self.curve(name, triad)
         if curve is None or degc is None or now_degc is None:
             return None
@@ -114,14 +114,14 @@ class BiasMemory:
         return msgspec.structs.replace(found, warm=None, **left)
 
     def _taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
-        """Return the bias change (3,) from `degc` to `now_degc` that the autopilot's thermal calibration removes."""
+        """Return the bias change (3,) between two temperatures that the autopilot's thermal calibration removes."""
         calibration = self._imus[name].calibration if name in self._imus else None
         return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
     # --- before a result is used
 
     def with_offsets(self, solution: Solution) -> Solution:
-        """Return a solution with the offsets that the autopilot subtracts; raise AutopilotError if they are unknown."""
+        """Return the solution with the autopilot's offsets entered; raise AutopilotError if they are unknown."""
         imus = tuple(
             dataclasses.replace(imu, subtracted=self._imus[imu.name].in_force.subtracted(imu.temperature_degc))
             if imu.name in self._imus
@@ -146,7 +146,7 @@ class BiasMemory:
         return found
 
     def why_not_now(self, name: str, started_at: str) -> str | None:
-        """Return a reason to doubt that the bias is still that of the calibration started at `started_at`, or None."""
+        """Return a reason to doubt that an IMU's bias is unchanged since the calibration of `started_at`, or None."""
         if (point := self._point(name, started_at)) is None:
             return message("imu_changed_since_calibration", event="has lost its history")
         if what := self._changed(name):
@@ -231,7 +231,7 @@ class BiasMemory:
         await self._write()
 
     async def look(self, solution: Solution) -> None:
-        """Store the biases of a still window if it is this power-up's best at its temperature (steps of 1 K)."""
+        """Store a window's biases if it is this power-up's first, or by far the best, within 1 K of its temperature."""
         unix_s = time.time()
         self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
@@ -262,7 +262,7 @@ class BiasMemory:
             await self._write()
 
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
-        """Return whether a window is this power-up's first at its temperature, or much better than those before."""
+        """Return whether a window is this power-up's first at its temperature, or much better than earlier windows."""
         degc, power_up = imu.mean_degc, self.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or degc is None or self._changed(imu.name):
             return False
@@ -289,7 +289,7 @@ class BiasMemory:
             logger.warning("%s", message("history_not_kept", what="biases of this calibration", reason=error))
 
     def _refer(self, name: str, triad: Triad, point: Point) -> None:
-        """Update this power-up's reference bias; a contradicting point replaces it only if it is the third in a row."""
+        """Accept a point as this power-up's bias; one contradicting the accepted bias must be the third in a row."""
         found = point.of(triad)
         if found is None:
             return

@@ -27,7 +27,7 @@ from companion.links.system.events import Listeners
 logger = logging.getLogger(__name__)
 
 CATCH_UPS: Final = 3
-"""Maximum number of consecutive evaluations of the measuring window: while one is computed the next may become due."""
+"""Maximum number of evaluations of the measuring window in a row: while one runs, the next may become due."""
 TICK_S: Final = 0.2
 REREAD_EVERY_S: Final = 0.5
 """Minimum time between two reads of the autopilot: any station can announce a change and so cause a read."""
@@ -59,7 +59,7 @@ class RuntimeSettings:
 
 
 class RepeatedRead:
-    """Calls `read` after each autopilot start and each `again`; retries it `retry_s` after an AutopilotError."""
+    """Calls a function at each autopilot start and each call of `again`; repeats it after an AutopilotError."""
 
     def __init__(self, vehicle: Vehicle, read: Callable[[], Awaitable[None]], retry_s: float) -> None:
         self._vehicle, self._read, self._retry_s = vehicle, read, retry_s

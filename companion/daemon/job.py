@@ -55,7 +55,7 @@ class Job:
         """True if this job has undone a calibration; False for the undo of an alignment or a temperature curve."""
         self.words = ""  # Present activity, as text for people
         self.hold_still_s: int | None = None
-        """Seconds for which the aircraft must be held still, if the job waits for nothing else; otherwise None."""
+        """Seconds for which the aircraft must be held motionless, if the job waits for nothing else; otherwise None."""
         self.progress_percent = 0
         """Progress in percent, 0 to 100; it never falls."""
         self._until_s = 0.0

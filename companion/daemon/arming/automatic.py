@@ -1,8 +1,8 @@
 """Automatic calibrations, so that a fresh result is active before anyone arms.
 
-If the setting `at_arm` is "gate" or "warn", the disarmed and still aircraft is calibrated at the first opportunity, and
-again when new offsets would be clearly better. Every write wears the autopilot's flash. Therefore offsets that a still
-window confirms are not written again, and the number of writes a day is limited, also across restarts.
+If the setting `at_arm` is "gate" or "warn", the disarmed, motionless aircraft is calibrated at the first opportunity,
+and again when new offsets would be clearly better. Every write wears the autopilot's flash. Therefore offsets that a
+window without motion confirms are not written again. The number of writes a day is limited, also across restarts.
 
 Choices of people are never overwritten: after an undo, a cancel, or a change by another station, automatic calibrations
 stop with a message until the next request or restart.
@@ -64,7 +64,7 @@ class Automatic:
         return wanted.at_arm != "off" and wanted.push and self._core.only_listening is None
 
     def why_not(self) -> str | None:
-        """Return the remedy, as text, if no automatic calibration can start now; None: one starts when needed."""
+        """Return the waiting time or the remedy, as text, if no automatic calibration can start now; otherwise None."""
         if not self.wanted or self.stopped is not None:
             return "calibrate"
         if self._writes_today() >= PER_DAY:
@@ -106,7 +106,7 @@ class Automatic:
                 logger.info("nothing is written by itself: %s", answer.reason)
 
     async def _still_ours(self) -> bool:
-        """Read the offsets; return whether they are unchanged, as another station may have set them unnoticed."""
+        """Read the offsets; return whether they are unchanged: another station could have changed them unnoticed."""
         try:
             same = [await imu.refresh() for imu in self._imus.values()]
         except AutopilotError as error:

@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 # until a request, and offsets replaced by a boot are written again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
-"""Findings reported even if a result is held back: choices of people, and writes without a visible effect."""
+"""Findings reported even while a result is held back: people's choices, and writes without a visible effect."""
 SETTLED_EVERY_S: Final = 5  # Interval between checks of the output while there is no finding; otherwise 1 s
 
 
@@ -60,16 +60,16 @@ class _TriadState:
 
     held: Held | Why = Why.NEVER
     shelved: Held | None = None
-    """Calibration from before an autopilot restart; active again once a still window agrees with it."""
+    """Calibration from before an autopilot restart; active again once a window without motion agrees with it."""
     present: Present | None = None
     in_doubt: tuple[str, Held] | None = None
-    """Reason and result of an automatic calibration that was held back; None once it no longer fits the output."""
+    """Automatic calibration that was held back: reason, and result; None once the result no longer fits the output."""
     judged: bool = True
-    """False if integer readings are too coarse to show the bias: these sensors are then left out of the check."""
+    """False if integer readings are too coarse to show the bias; the check then leaves these sensors out."""
 
 
 class ActiveCalibration:
-    """Active calibration of all IMUs; call `poll` often, and `measure` whenever there may be a new still window."""
+    """Active calibration of all IMUs; call `poll` often, and `measure` when a new window without motion is possible."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
@@ -84,7 +84,7 @@ class ActiveCalibration:
         flown = [imu.name for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
         names = flown or [imu.name for imu in config.imu]
         self.what = What.BOTH if config.gradienter is not None else What.GYROS
-        """Biases that an automatic calibration determines: accelerometers only if there is a gradienter."""
+        """Biases that an automatic calibration estimates: of gyros, and with a gradienter also of accelerometers."""
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
         self.temperatures_degc: dict[str, float] = {}  # Temperatures of the IMUs at the last check of their output
@@ -291,7 +291,7 @@ class ActiveCalibration:
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:
-        """Return whether a result stays held back: it must be recent, and it alone must agree with the output."""
+        """Return whether a recent result stays held back: it fits the output, and the active calibration does not."""
         if state.in_doubt is None:
             return False
         measured = state.in_doubt[1]

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
-"""Time for which the aircraft must stand still after somebody has let go of it, before it may arm."""
+"""Time for which the aircraft must be motionless after somebody has let go of it, before arming is allowed."""
 COUNTDOWN_KEPT_S: Final = 2.0  # Age of a countdown beyond which the next one may be higher
 OLDEST_ANSWER_S: Final = 1.5  # Age at which an answer that was not updated is void
 _STEPS: Final[dict[State, str]] = {
@@ -46,7 +46,7 @@ _CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.REBOOTED: "checking after restart",
     Why.UNSEEN: _STEPS[State.VERIFYING],
 }
-"""Findings against a calibration that the next still window can clear without a new one, with their messages."""
+"""Findings that the next window without motion can clear without a new calibration, with their messages."""
 _NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
 """Preconditions without which the arm gate refuses, whatever calibration is active."""
 _WAITS: Final = {
@@ -54,7 +54,7 @@ _WAITS: Final = {
     Precondition.RESTORED: f"{_STEPS[State.UNDOING]}: wait",
 }
 LATE_S: Final = 2.0
-"""Delay until the latest second of telemetry is complete and checked."""
+"""Longest delay before telemetry is checked: the check uses only complete one-second intervals."""
 
 ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
@@ -70,7 +70,7 @@ class Readiness:
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._countdown = -math.inf, math.inf
-        """Countdown to a calibration: event-loop time of its computation, and the seconds that were left then."""
+        """Latest countdown to a calibration: event-loop time of its computation, and seconds left at that time."""
         self._has_gated = False
         self.turns = 0
 
@@ -80,7 +80,7 @@ class Readiness:
 
     @property
     def asks_script(self) -> bool:
-        """Return whether ArduPilot's gate script gets the answer: while the gate is on, and later to permit arming."""
+        """Return whether ArduPilot's gate script gets the answer: once the gate was on, even if it is off now."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
 
@@ -109,7 +109,7 @@ class Readiness:
             await asyncio.sleep(POLL_S)
 
     async def _measured(self, now_s: float) -> bool:
-        """Call `ActiveCalibration.measure` and update the answer meanwhile: on a ship's deck that takes seconds."""
+        """Run `ActiveCalibration.measure`, which takes seconds on a ship's deck; keep updating the answer meanwhile."""
         measuring = asyncio.ensure_future(self.in_force.measure(now_s))
         try:
             while not (await asyncio.wait((measuring,), timeout=POLL_S))[0]:

@@ -46,7 +46,7 @@ class Armings:
         self._queue: asyncio.Queue[ArmingRecord] = asyncio.Queue(QUEUE)
         self.last: ArmingRecord | None = None
         self.seen_disarmed = False
-        """True once this daemon has seen the aircraft disarmed; until then it may have started in flight."""
+        """True once this daemon has seen the aircraft disarmed; until then, the daemon may have started in flight."""
 
     async def run(self) -> None:
         try:
@@ -92,7 +92,7 @@ class GateSetup:
         self.reading = RepeatedRead(core.vehicle, self._read, RETRY_S)
         self._said: str | None = None
         self.problem: str | None = None
-        """Autopilot settings that the gate lacks, as text for people; None: nothing is missing, or not known yet."""
+        """Autopilot settings missing for the gate, as text for people; None: none is missing, or not known yet."""
         self.known = False
         core.parameters.on_value.add(self._on_parameter)
 
@@ -161,7 +161,7 @@ class Arming(Subsystem):
         return tasks
 
     def _calibration(self) -> Object | None:
-        """Return the active calibration with its age, otherwise the last good one without age: the clock may be off."""
+        """Return the active calibration with its age, or the last good one without age (clocks may have been wrong)."""
         in_force, now_s = self.in_force, asyncio.get_running_loop().time()
         known, record = in_force.calibration is not None, in_force.calibration or in_force.earlier
         if record is None:

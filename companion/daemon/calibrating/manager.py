@@ -159,7 +159,7 @@ class CalibrationManager:
         return self._start(run, Event.REQUEST, self._finish(run, run.calibrate()))
 
     def start_job(self, job: Job, run: Callable[[Job], Awaitable[str]], missing: str | None) -> Job | Refusal:
-        """Start a job other than a calibration, or return a refusal; `missing`: reason why it is impossible here."""
+        """Start a job other than a calibration, or return a refusal; `missing`: reason why the job is impossible."""
         if (refusal := self._refusal(missing)) is not None:
             return refusal
         return self._start(job, Event.REQUEST, self._finish(job, run(job)))
@@ -192,7 +192,7 @@ class CalibrationManager:
     def _refusal(
         self, missing: str | None, kind: Literal["nothing_to_undo", "other"] = "other", *, but: Job | None = None
     ) -> Refusal | None:
-        """Return a refusal if no job can start now, otherwise None; `but`: a running job that blocks no start."""
+        """Return a refusal if no job can start now, otherwise None; `but`: a running job to disregard."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
         if but is None and (found := self.blocking_reason()) is not None:

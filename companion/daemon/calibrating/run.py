@@ -54,7 +54,7 @@ logger = logging.getLogger(__name__)
 Key = tuple[str, Triad]  # Name of an IMU, and its gyros or its accelerometers
 
 WRONG_IMU_ATTEMPTS: Final = 3
-"""Maximum number of write attempts: with three IMUs, two may be mistaken for the right one before it is found."""
+"""Maximum number of write attempts: with three IMUs, the first two attempts can write to the wrong IMU."""
 _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
 
 
@@ -81,7 +81,7 @@ class CalibrationRun(Job):
         reboot: bool = False,
         automatic: bool = False,
     ) -> None:
-        """Prepare a calibration; `before`: the last one, if it was good and has not been undone."""
+        """Prepare a calibration; `before`: record of the last calibration, if it was good and has not been undone."""
         kind = AUTOMATIC if automatic else "calibration"
         super().__init__(kind, what, requester, timeout_s, reboot=reboot, automatic=automatic)
         self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
@@ -95,13 +95,13 @@ class CalibrationRun(Job):
         self.calibrations: dict[str, ImuCalibration] = {}
         """Offsets and scales that the autopilot applied to each of its IMUs during the measurement."""
         self.held_back: dict[Key, Doubt] = {}
-        """Triads (gyros or accelerometers of an IMU) not written automatically: they contradict earlier results."""
+        """Triads (gyros or accelerometers of an IMU) not written, as their biases contradict earlier ones."""
         self._forget()
 
     def _forget(self) -> None:
         self.measured: Window | None = None  # Window of telemetry under the active offsets
         self.solution: Solution | None = None
-        """Estimated biases: residuals after the offsets for the autopilot's IMUs, whole biases for other IMUs."""
+        """Estimated biases; of the autopilot's IMUs only the residuals that the present offsets leave."""
         self.points: dict[str, Point] = {}  # Biases by IMU for later predictions, stored on success
         self.unchanged: set[Key] = set()  # Triads whose old offsets stay, as good as new ones
         self.plan: Plan | None = None
@@ -112,7 +112,7 @@ class CalibrationRun(Job):
     async def calibrate(self) -> str:
         """Run all phases; return the result in one line.
 
-        After an error or a cancel the old values are restored, or the error names those that are not.
+        After an error or a cancel, old parameter values are restored; the error names any that are not.
         """
         self._announce()
         self._measuring.begin()
@@ -170,7 +170,7 @@ class CalibrationRun(Job):
             self._machine.on(Event.MOVED)
 
     async def _estimate(self) -> None:
-        """Estimate biases, combine them with earlier ones by weight, and in an automatic run hold back contradictions.
+        """Estimate biases and combine them with earlier ones by weight; an automatic run holds back contradictions.
 
         A result that contradicts earlier ones is written on request only. If the gradienter has moved, an automatic
         write would spoil good offsets unnoticed.
@@ -316,7 +316,7 @@ def in_short(triads: Collection[Key]) -> str:
 
 
 def _less(points: Mapping[str, Point], held_back: Collection[Key]) -> dict[str, Point]:
-    """Return the points without results held back, as repeated measurements must not confirm each other."""
+    """Remove held-back results from the points to store: repeated measurements must not confirm each other."""
     left: dict[str, Point] = {}
     for name, point in points.items():
         kept = msgspec.structs.replace(point, **{triad: None for imu, triad in held_back if imu == name})

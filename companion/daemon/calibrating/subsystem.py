@@ -197,7 +197,7 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, **found}
 
     def start_alignment(self, asked: Align, by: str) -> Job | Refusal:
-        """Start an alignment, or return a refusal; raise CalibrationRefusedError if the request names no kind of it."""
+        """Start an alignment, or return a refusal; raise CalibrationRefusedError if the request names no known kind."""
         action = next((each for each in _KINDS if each == asked.action), None)
         if action is None:
             allowed = Align.fields()["action"].allowed
@@ -272,10 +272,10 @@ class Calibrating(Subsystem):
         return None if not later else f"written since: {', '.join(later)}; companion undo restores that first"
 
     async def _write_curves(self, job: Job, *, overwrite: bool) -> str:
-        """Write the bias curves over temperature to the autopilot, and verify that its output stays; return a summary.
+        """Write bias curves over temperature to the autopilot; verify that the IMU output stays; return a summary.
 
-        The curves of all IMUs are written, or none. `overwrite`: replace even a temperature calibration that others
-        have written. After an error or a cancel the old values are restored, or the error names those that are not.
+        The curves of all IMUs are written, or none. `overwrite`: replace even a temperature calibration by somebody
+        else. After an error or a cancel, old parameter values are restored; the error names any that are not.
         """
         log = WriteLog()
         await self._core.offload(self.memory.follow)

@@ -1,6 +1,6 @@
-"""One IMU of the autopilot: its telemetry, the offsets that the autopilot subtracts in it, and changes of the offsets.
+"""One IMU of the autopilot: its telemetry, the offsets that the autopilot subtracts, and changes of the offsets.
 
-Samples count only while these offsets are known; a change by anybody voids the samples collected before. Offsets are
+Samples count only while the offsets are known; a change by anybody voids the samples collected before. Offsets are
 also written by people, and by a boot of ArduPilot with INS_GYR_CAL = 1, which calibrates the gyros.
 """
 
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 RETRY_S: Final = 3.0
 CONFIRMED_WITHIN_S: Final = 3.0
-"""Longest delay after which a read disproves an announced change: later, the offset may have changed and returned."""
+"""Maximum time from an announced change to a read that disproves it: later, the value may have been changed back."""
 
 
 class AutopilotImu:
@@ -51,7 +51,7 @@ class AutopilotImu:
         self.on_sample: Listeners[ImuSample] = Listeners()
         self.on_counting: Listeners[ImuSample] = Listeners()  # Listeners to samples under known offsets
         self.on_raw: Listeners[float, Six, float | None] = Listeners()
-        """Listeners to means of raw readings: time, output with the present offsets applied, temperature in deg C."""
+        """Listeners to averaged raw readings: time, readings corrected by the present offsets, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Listeners to reads of the offsets: previous ones (None after a write by the companion), present ones."""
         self.on_change: Listeners[[]] = Listeners()
@@ -95,7 +95,7 @@ class AutopilotImu:
 
     @property
     def decided(self) -> bool:
-        """True once it is known whether this IMU exists: its offsets and samples have arrived, or failed to."""
+        """True once this IMU is known to exist or not: offsets and samples have arrived, or either was not obtained."""
         if self.calibration is None:
             return self.failures > 0 or (self.stream.decided and bool(self.stream.problem))
         return self.stream.decided
@@ -240,7 +240,7 @@ _Known = tuple[tuple[float, ...], int]
 
 
 class OffsetWatch:
-    """Detects changes of the offsets; call `poll` often. Calls `lost` with the IMU whose calibration ended and why."""
+    """Detects changes of the offsets; call `poll` often. Calls `lost` with an IMU whose calibration ended, and why."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost

@@ -30,7 +30,7 @@ BEFORE_S: Final = 3.0
 QUIET_S: Final = 3.0
 """Longest data gap of an IMU that still counts as evidence of motion; a write of offsets causes such a gap."""
 LATE_S: Final = 1.0
-"""Maximum delay of an IMU's first data after the other IMUs': a later IMU missed the start of the motion."""
+"""Maximum delay of an IMU's first data after the earliest IMU's: a later IMU missed the start of the motion."""
 TURNED_DEG: Final = 15.0
 TURNING_RAD_S: Final = math.radians(12.0)
 """Minimum angular rate that counts as turning; a gyro bias may be up to 10 deg/s."""
@@ -41,11 +41,11 @@ NO_OFFSETS: Final = object()
 
 
 class SensorWatch:
-    """Checks every sensor twice a second, also against the tilts and turns that the IMUs measure.
+    """Checks every sensor twice a second, also for an unchanged reading while the IMUs measure a tilt or turn.
 
-    Each IMU measures them in its own axes, so no mounting is needed. `offsets_of`: the offsets subtracted from an IMU's
-    readings, or None while they are unknown. After a change of the offsets or of the board's orientation an IMU's data
-    are collected anew: the change must not look like a tilt.
+    Each IMU measures in its own axes, so no mounting is needed. `offsets_of` returns the offsets subtracted from an
+    IMU's samples, None if unknown. After a change of these offsets or of the board's orientation, the IMU's data are
+    collected anew: the change must not look like a tilt.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class SensorWatch:
         self._sensors, self._collector = sensors, collector
         self._offsets_of, self._say = offsets_of, say
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
-        """One-second summaries by IMU: number of the second, unit vector of the mean force (3,), turn about it, deg."""
+        """Summary of each second, by IMU: number of the second, unit vector of mean force (3,), turn about it, deg."""
         self._offsets: dict[str, object] = {}
         self._has_failed = False
 
@@ -101,7 +101,7 @@ class SensorWatch:
                 seconds.append((batch.slot, down, math.degrees(about) if abs(about) > TURNING_RAD_S else 0.0))
 
     def _seen(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
-        """Return each IMU's one-second summaries between two times, without IMUs that cover less than others."""
+        """Return each IMU's one-second summaries between two times; leave out IMUs whose data begin late or stopped."""
         # Measured against the newest second, not the clock: collection stops while a sensor is implausible.
         newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
         found = [
@@ -145,7 +145,7 @@ class SensorWatch:
 
 
 def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:
-    """Return the smallest tilt, in deg, of the latest summaries since `since_s` against the first; 0 if too few."""
+    """Return the smallest tilt, deg, of the latest summaries (from `since_s` on) against the first; 0 if too few."""
     stayed = [down for slot, down, _ in seconds[1:] if slot >= since_s][-TILTED_SECONDS:]
     if len(stayed) < TILTED_SECONDS:
         return 0.0

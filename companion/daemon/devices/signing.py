@@ -28,7 +28,7 @@ AHEAD_S: Final = 30.0
 specification refuses new senders that are more than a minute behind, so the jump stays well below that."""
 RESERVE_BEFORE_TICKS: Final = 5 * TICKS_PER_S
 UNANSWERED: Final = 3
-"""Number of TIMESYNC requests in a row, one a second, that may go unanswered; more show that signing is required."""
+"""Tolerated TIMESYNC requests in a row without answer, one a second; more show that the autopilot wants signatures."""
 ASK_AGAIN_S: Final = 30.0  # Pause after an answer of the autopilot before the next request
 AFTER_S: Final = 3.0
 """Time without a verified message of the autopilot before a fault is reported; a change of the key takes less."""

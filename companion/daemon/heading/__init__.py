@@ -1,1 +1,1 @@
-"""The attitude sent to the autopilot, the supervision of it, and the autopilot settings that it needs."""
+"""The attitude sent to the autopilot, its supervision, and the autopilot settings required for it."""

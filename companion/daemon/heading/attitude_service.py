@@ -128,7 +128,7 @@ class Sender:
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf
 
     def is_due(self, t_s: float, now_s: float) -> bool:
-        """Return whether to send the attitude of time `t_s`: time stamps and sendings must be `SHORTEST_S` apart."""
+        """Return whether the attitude of time `t_s` is due: time stamps and sending times stay `SHORTEST_S` apart."""
         return (
             t_s >= self._next_s - _ROUNDING_S
             and t_s - self._last_s >= SHORTEST_S - _ROUNDING_S
@@ -189,7 +189,7 @@ class AttitudeService:
     # --- inputs
 
     def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
-        """Wrap a sample callback: an exception stops the push and drops the estimate, but calibration continues."""
+        """Wrap a sample callback: an exception stops sending and drops the attitude estimate; calibration continues."""
 
         def guarded(samples: Sequence[Sample], read_s: float) -> None:
             try:
@@ -208,7 +208,7 @@ class AttitudeService:
             self._push(read_s)
 
     def _push(self, read_s: float) -> None:
-        """Send the attitude if due; run in the event-loop turn that read the samples: a timer would skip messages."""
+        """Send the attitude if due. Call this right after reading samples: a timer would skip messages."""
         if not self.health.pushing or not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()

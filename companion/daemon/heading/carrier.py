@@ -35,7 +35,7 @@ from companion.samples import CompassSample, ImuSample, Sample, Triad, Vector
 logger = logging.getLogger(__name__)
 
 KEPT_S: Final = 5.0
-"""Time for which samples are stored, to propagate an alignment from its still window's end (up to 2 s ago) to now."""
+"""Time for which samples are stored, to propagate an alignment from the end of its window (up to 2 s ago) to now."""
 _NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
 CHECK_EVERY_S: Final = 10.0
@@ -95,7 +95,7 @@ def without_truncation(sample: ImuSample, step_rad_s: float) -> ImuSample:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandingAttitude:
-    """Attitude of the standing aircraft at the end of a still window."""
+    """Attitude of the motionless aircraft at the end of a measuring window."""
 
     t_s: float
     body_from_ned: Matrix
@@ -108,7 +108,7 @@ class StandingAttitude:
 def standing_attitude(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
 ) -> StandingAttitude:
-    """Estimate the attitude in a still window; raise CalibrationRefusedError if readings disagree. Blocking."""
+    """Estimate the motionless aircraft's attitude; raise CalibrationRefusedError if readings disagree. Blocking."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
     turn = truth.body_from_ned

@@ -41,20 +41,20 @@ THEIR_HEADING_DEG: Final = 5.0
 GOOD_S: Final = 3.0  # Time without a fault before a stopped push resumes
 TOLD_TILT_DEG: Final = 4.0
 TOLD_HEADING_DEG: Final = 8.0
-"""Smoothed difference of heading that starts a warning (of tilt: `TOLD_TILT_DEG`); the warning ends at half of it."""
+"""Smoothed heading difference that starts a warning (tilt: `TOLD_TILT_DEG`); half the difference ends the warning."""
 SMOOTHED_S: Final = 3.0
 """Time constant that smooths attitude differences: two filters with different delays disagree briefly."""
 OLD_S: Final = 2.0
 STEEP_RAD: Final = math.radians(60.0)
 """Pitch beyond which roll and heading cannot be separated."""
 FORGETS_PER_S: Final = 0.02
-"""Rate at which the smallest clock offset to the autopilot is raised, s/s: clocks drift, a simulated one by 1 %."""
+"""Rate, s/s, at which the smallest clock offset seen is raised: clocks drift, a simulated autopilot's by 1 %."""
 HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
 STRAYS_RAD: Final = math.radians(5.0)
 FADES_S: Final = 4.0
-"""Time constant of the fading sum of heading drift: up to 1.25 deg/s goes undetected, and the compass corrects it."""
+"""Time constant of the fading sum of heading drift. Drift up to 1.25 deg/s is undetected: the compass corrects it."""
 STRAYS_SIGMAS: Final = 3.0  # Allowed drift in sigmas of the heading: the compass may correct a poorly known heading
 SCALES: Final = 0.01
 """Tolerated difference between the scale factors of two gyros, as a fraction of the angle turned."""
@@ -64,7 +64,7 @@ LONGEST_STEP_S: Final = 0.25
 
 
 class HeadingDriftMonitor:
-    """Sums the companion heading's turn minus that of other gyros, by the same rule as the autopilot's script."""
+    """Detects heading drift as companion/lua does: sums heading changes minus turns by the autopilot's gyros."""
 
     def __init__(self) -> None:
         self.strayed_rad = 0.0
@@ -76,7 +76,7 @@ class HeadingDriftMonitor:
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
-        """Add a heading, its sigma, and other gyros' rate about the vertical; `late_s`: time error beyond `LATE_S`."""
+        """Add a heading, its sigma, and the autopilot's rate about the vertical; `late_s`: error beyond `LATE_S`."""
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         if before is None:
             self._sigma_rad = max(self._sigma_rad, sigma_rad)
@@ -105,11 +105,11 @@ class Difference:
         self._carrier = carrier
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
-        """Amount by which the clock offset was raised since the message with the least delay, s: largest time error."""
+        """Largest error of a time stamp, s: rise of the clock offset since the message with the least delay."""
         self.theirs: tuple[float, Quaternion] | None = None
         """Autopilot's latest attitude: time on the companion's clock, and quaternion from body to NED."""
         self.latest: tuple[float, float] | None = None
-        """Unsmoothed difference of tilt and of heading, rad; None while a pitch is beyond `STEEP_RAD`."""
+        """Unsmoothed difference of tilt and of heading, rad; None while either pitch is beyond `STEEP_RAD`."""
         self.heard_s = -math.inf
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
@@ -136,7 +136,7 @@ class Difference:
         return cmath.phase(self._heading)
 
     def levelled(self, attitude: Attitude, now_s: float) -> Attitude:
-        """Return the attitude rotated by the shortest arc so that its vertical is the autopilot's, if that is known.
+        """Return the attitude, rotated by the shortest arc to the autopilot's vertical if this vertical is known.
 
         PX4 computes yaw with an order of Euler angles that depends on its own tilt. At 30 deg of tilt the yaw of two
         orders differs by up to 10 deg. PX4 jumps to a heading that it has refused for 1 s (ev_yaw_control.cpp,
@@ -218,9 +218,9 @@ def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tu
 class Health:
     """Decides whether the attitude may be sent to the autopilot (pushed); call `judge` several times a second.
 
-    A heading that differs from the autopilot's stops the push if both agreed since the last alignment, or if the
-    autopilot's heading comes from its own compass (`own_agrees`). In both cases one heading is wrong. A detected
-    heading drift stops the push until the next alignment.
+    A heading that differs from the autopilot's stops the sending in two cases: the headings agreed since the last
+    alignment, or the autopilot's heading agrees with its own compass (`own_agrees`). Then one heading is wrong.
+    A detected heading drift stops the sending until the next alignment.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Start of the daemon in flight: the attitude resumes with the last calibration, or not at all.
 
 Roll and pitch come from the autopilot, the heading from the companion's compass. No attitude is sent to the autopilot
-before the companion's and the autopilot's agree.
+before it agrees with the autopilot's own attitude.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AGREES_S: Final = 0.7  # Time of agreement before the push starts, and of disagr
 FRESH_S: Final = 1.0  # Largest age of the autopilot's attitude to start from; the gyros extrapolate it
 LATEST: Final = 10  # Number of latest records searched for a calibration that is done
 DECLINATION_SIGMA_DEG: Final = 1.0
-"""One sigma of a stored declination: 0.3 to 0.5 deg from the model, the rest from the distance flown since."""
+"""One sigma of a stored declination: 0.3 to 0.5 deg from the model, the rest from the distance flown meanwhile."""
 
 
 class Resume:

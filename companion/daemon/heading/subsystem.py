@@ -1,4 +1,4 @@
-"""The pose shown to people, the attitude sent to the autopilot, and the check of autopilot settings for it."""
+"""Roll, pitch and heading shown to people, the attitude sent to the autopilot, and the autopilot settings for it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DECLINATION_EVERY_S: Final = 60.0
 
 
 class Heading(Subsystem):
-    """Connects the pose shown to people and the attitude sent to the autopilot."""
+    """Subsystem for roll, pitch and heading shown to people, and for the attitude sent to the autopilot."""
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
         self._core = core
@@ -113,7 +113,7 @@ class Heading(Subsystem):
 
 
 class PoseNow:
-    """Pose shown to people: from `carried` (valid in flight too) if it returns one, otherwise from the sensors."""
+    """Roll, pitch, heading shown to people: from the attitude estimate (valid in flight too), else from sensors."""
 
     def __init__(self, core: Core, alignment: ActiveAlignment, carried: Callable[[], Object | None] | None) -> None:
         self._core, self._alignment, self._carried = core, alignment, carried
@@ -145,7 +145,7 @@ class PoseNow:
         return self.now()
 
     def now(self) -> Object | None:
-        """Return the pose; None without a recent tilt. The heading is magnetic while the declination is unknown."""
+        """Return roll, pitch and heading (magnetic while the declination is unknown); None without a recent tilt."""
         if self._carried is not None and (carried := self._carried()) is not None:
             return carried
         tilt, heading = self._fresh()

@@ -50,7 +50,7 @@ class ControlServer:
         self._served: Counter[bool] = Counter()
 
     async def __aenter__(self) -> Self:
-        """Bind the socket, replacing a stale one; raise LinkError if that fails or another daemon answers on it."""
+        """Bind the socket, replacing a stale one; raise LinkError on failure, or if another daemon answers on it."""
         listener = _bind(self._path)
         if self._group is not None:
             _open_to(self._path, self._group)

@@ -40,7 +40,7 @@ LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
-"""Name of each child process in requests, and its name in texts on the requester, as in "cancelled by mqtt cancel"."""
+"""Names of interfaces in requests, and in texts for people, as in "cancelled by mqtt cancel"."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
 """Status of the web page while its process reports nothing."""
 
@@ -109,7 +109,7 @@ class Interfaces(Subsystem):
         yield {"kind": "result", "status": await self.refresh()}
 
     async def _monitor(self, request: Monitor, _face: str) -> AsyncIterator[Object]:
-        """Stream the status every 0.5 s; with `pose` also the attitude every 0.2 s, a new state or record at once."""
+        """Stream the status every 0.5 s; with `pose`, also the attitude and any new state or record every 0.2 s."""
         if not request.pose:
             while True:
                 yield {"kind": "progress", "status": await self.refresh()}

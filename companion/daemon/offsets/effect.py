@@ -1,7 +1,7 @@
 """Check of new offsets by telemetry: the IMU output must change by the step that the offset changes predict.
 
-The sigma of each window's mean includes the rounding of integer telemetry. Only the check of PX4's temporary large
-offsets (px4_writes.py), which is short, uses plain means.
+The sigma of each window's mean includes the rounding of integer telemetry. The sigmas in the short check of PX4's
+temporary large offsets (px4_writes.py) leave this rounding out.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ VERIFY_MAX_S: Final = 60.0  # Longest wait for stillness after a write; then its
 VERIFY_ON_DECK_S: Final = 180.0
 """Longest wait for a write's effect on a ship or boat, whose motion hides the step for most of a minute."""
 LOOK_S: Final = 10.0
-"""Time without movement after a write that suffices to see its step, even if a calibration needs more."""
+"""Sufficient time without movement to see the step of a write in the output, even if a calibration needs more."""
 LOOK_LONGER_S: Final = 30.0
 """Longest observation of a step that noise hides at first: after this time, flicker noise makes averaging useless."""
 TELEMETRY_S: Final = 2.0
 """Time after a write during which missing telemetry is no fault: samples during the write were left out."""
 TELEMETRY: Final = "waiting for the telemetry"
-"""Progress text shortly after a write, while its own step in the IMU output still looks like movement."""
+"""Progress text shortly after a write, which itself causes missing samples and a step that looks like movement."""
 UNWATCHED: Final = "this IMU is not in the telemetry"
 POLL_S: Final = 0.2
 
@@ -52,13 +52,13 @@ Verdicts = Mapping[str, list[EffectVerdict]]  # Verdicts by IMU
 # micro-g, as of an ordinary model. The worst model's flicker, used for sigma_use over minutes, would hide every step.
 ORDINARY_FLICKER: Final[Mapping[Triad, float]] = {"gyro": 8.0 / 0.664 * DEG_H, "accel": 0.05 / 0.664 * MG}
 TOLERANCE_SIGMAS: Final = 2.0
-"""Allowed difference from the expected output in addition to noise, as a multiple of sigma_use of the bias."""
+"""Allowed difference from the expected output in addition to noise, in sigmas of the bias (its sigma_use)."""
 
 
 async def watch_effect(
     core: Core, px4: Px4Writes, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
 ) -> tuple[Verdicts | None, str]:
-    """Wait until the aircraft is still after a write, then judge the step; observe longer if it is nearly visible.
+    """Wait until the aircraft is motionless after a write, then judge the step; if it is nearly visible, go on longer.
 
     `go_on` is called regularly with a progress text and may raise to end the wait. `boots`: number of autopilot
     restarts seen before the write. Returns verdicts by IMU, and the reason if there are none or they are not final.
@@ -140,9 +140,9 @@ def judge_vectors(
     *,
     apart_s: float = 0.0,
 ) -> list[EffectVerdict]:
-    """Judge the written offset vectors of one IMU (accelerometer, gyro, or both) by the windows before and after.
+    """Judge the new offsets of one IMU (accelerometer, gyro, or both) by the windows before and after the write.
 
-    On PX4 a small change is in use if the output followed the temporary large offset and then the step to the new one.
+    On PX4 a small change is in use if the output followed the temporary large offset and then the new offset.
     `apart_s`: time between the middles of both windows.
     """
     gyro_step, accel_step = output_step(target.calibration, target.changes, first.accel_m_s2)
@@ -200,7 +200,7 @@ def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
 def _as_at_end(
     triad: Triad, warming: tuple[Warming | None, Warming | None], apart_s: float, before: Vector, after: Vector
 ) -> tuple[Vector, Vector, Array]:
-    """Correct two windows' means for warm-up to the end of the first; also return the correction's sigma, x y z."""
+    """Correct both windows' means for warm-up, to the end of the first window; also return this correction's sigma."""
     first, second = warming
     if first is None:
         return before, after, np.zeros(3)
@@ -217,9 +217,9 @@ def _as_at_end(
 def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
     """Raise the sigmas of the mean after a write to at least those expected from the noise before the write.
 
-    A write does not change the noise, but the scatter of a few seconds can by chance be a tenth of the true one. If the
-    window before the write was short too, one limit for all axes is used. In simulations of good writes, windows of 2 s
-    refused 2 % with a limit per axis, 0.1 % with one limit. Windows of 5 s or more before the write refused 0.2 %.
+    A write does not change the noise, but the scatter in a few seconds can by chance be a tenth of the true scatter. If
+    the window before the write is short too, its mean noise over the axes is a further lower limit. In simulated good
+    writes with windows of 2 s, this reduced refusals from 2 % to 0.1 %. With 5 s or more before the write: 0.2 %.
     """
     longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
     triad = float(np.sqrt(np.mean(np.square(before)))) if spans_s[0] < MIN_BATCHES else 0.0

@@ -122,7 +122,7 @@ class Ledger:
             self._orphaned.set()
 
     async def update_pending(self, changes: ChangeSet) -> None:
-        """Save the changes of a write before they are made; after a StorageError the earlier file content remains."""
+        """Save the changes of a write before they are made; after a StorageError the file keeps its earlier content."""
         if self._open is not None:
             changes = msgspec.structs.replace(changes, origin=self._open.origin)
         await self._offload(self._log.journal.write, changes)
@@ -170,7 +170,7 @@ class Recovery:
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self._offload, self._interruptions = core.offload, interruptions_in(core.config.storage.path)
         self.on_recovered: Callable[..., Awaitable[object]] | None = None
-        """Callback after a recovery: changes of the write, text for people, and `undone` if it used up an undo step."""
+        """Callback after a recovery: changes of the write, text for people, and whether this used up an undo step."""
 
     def interruptions(self) -> list[Object]:
         """List interrupted writes, the latest first; reads the disk and blocks."""

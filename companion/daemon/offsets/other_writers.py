@@ -35,11 +35,11 @@ BEAT_S: Final = 1.0
 SETTLE_S: Final = 6.0
 """Time after our start within which the announcement of an already running companion must arrive."""
 CONFIRM_S: Final = 0.5
-"""Least time over which announcements must arrive: those queued by a companion that has ended arrive together."""
+"""Minimum time between a companion's first and latest announcement: after its end, queued ones arrive together."""
 EXPIRE_S: Final = 12.0
 """Silence after which another companion counts as gone: it announces itself every second, but messages may be lost."""
 MOST: Final = 8
-"""Most other companions stored: a limit, because messages with forged instance numbers can be sent in any number."""
+"""Maximum number of other companions stored: forged messages can have any number of different instance numbers."""
 INSTANCE_BITS: Final = 30
 
 
@@ -125,7 +125,7 @@ class OtherCompanions:
 
 
 class Rivalry:
-    """Warnings about the autopilot's calibrations that overwrite our offsets; disables them if so configured."""
+    """Warns about autopilot calibrations that overwrite our offsets; the setting `push.stop_rivals` disables these."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._imus, self._say = imus, core.say
@@ -147,7 +147,7 @@ class Rivalry:
         return stop(tuple(rivals.values()))
 
     def left_of(self, calibration: ImuCalibration) -> list[str]:
-        """Return an IMU's warnings without those about autopilot calibrations that the next write will disable."""
+        """Return an IMU's warnings, except warnings about autopilot calibrations that the next write will disable."""
         stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
         return [warning for warning in calibration.warnings if warning not in stopped]
 

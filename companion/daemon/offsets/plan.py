@@ -26,10 +26,10 @@ from companion.physics.units import MG
 from companion.samples import TRIADS, Triad, rows_of
 
 COARSE_ACCEL_MG: Final = 5.0
-"""Sigma above which new accelerometer offsets cause a warning: the autopilots' own level calibration is that good."""
+"""Sigma above which new accelerometer offsets cause a warning: autopilots' own level calibrations reach this sigma."""
 
 AS_GOOD: Final = 1.5
-"""Multiple of the new offsets' expected error up to which old offsets are left: a write would only wear the flash."""
+"""Largest error of old offsets, in units of the new offsets' expected error, that is not worth the flash's wear."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -118,7 +118,7 @@ def warnings_of(target: ImuPlan, estimate: ImuSolution) -> list[str]:
 
 
 def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
-    """Raise AutopilotError if two IMUs seem to use the same PX4 parameters, and forget the learned assignment."""
+    """If two IMUs seem to use the same PX4 parameters, forget the learned slots, and raise AutopilotError."""
     owners: dict[str, str] = {}
     for target in targets:
         for name in (*target.calibration.parameters.gyro_offset, *target.calibration.parameters.accel_offset):
@@ -132,7 +132,7 @@ def refuse_shared(targets: Sequence[ImuPlan], memory: SlotMemory) -> None:
 def as_good(
     calibration: ImuCalibration, found: ImuSolution, shared: Shared, before: ImuRecord | None
 ) -> frozenset[Triad]:
-    """Find the sensors (gyro, accelerometer) whose old offsets are as good as new ones: a write would only add noise.
+    """Return the triads (gyro, accelerometer) whose old offsets are as good as new ones: a write would only add noise.
 
     Old offsets are as good if the last calibration wrote them and the residual is small: within the errors of both
     estimates, or small compared with the drift of the next minutes, which affects old and new offsets alike.
@@ -169,7 +169,7 @@ def without(found: ImuSolution, triads: Collection[Triad]) -> ImuSolution:
 
 
 def residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> Residual:
-    """Compute the output error of our own IMU in an autopilot that uses it, with the present offsets, from the bias."""
+    """Return the error left in our own IMU's output after an autopilot using this IMU subtracts its present offsets."""
     rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
     gyro = accel = None
     if found.gyro_rad_s is not None:

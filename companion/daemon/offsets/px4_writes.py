@@ -44,15 +44,15 @@ RATE_HZ: Final = 50.0
 """Message rate requested for IMUs that PX4 does not already stream."""
 HEAR_S: Final = 0.4
 BEFORE_S: Final = 1.0
-"""Span of telemetry averaged before a temporary large offset, for comparison with the output after it."""
+"""Span of telemetry averaged before a temporary large offset is written, for comparison with later output."""
 MEAN_S: Final = 0.4
-"""Span of telemetry averaged while a temporary large offset is in use, without samples from before it."""
+"""Span of telemetry averaged while a temporary large offset is in use; earlier samples are left out."""
 PATIENCE_S: Final = 2.5
 """Longest wait for the step in the telemetry. If somebody else writes too, PX4 applies our value up to 1 s later."""
 KEPT_S: Final = 4.0
 LEAST_SAMPLES: Final = 5
 MATCH: Final = 0.2
-"""Tolerance of the observed step, as a fraction of the expected one, in addition to changes that PX4 ignores."""
+"""Tolerance of an observed step, as a fraction of the expected step, in addition to small changes that PX4 ignores."""
 CHECK_S: Final = 0.1
 
 
@@ -67,7 +67,7 @@ class ExpectedStep:
     step: Array
     """Expected step of the output, x y z in vehicle FRD; rad/s for a gyro, m/s^2 for an accelerometer."""
     rest: Array
-    """Expected step from the temporary large offset to all new offsets, x y z, in units and frame of `step`."""
+    """Expected step when all new offsets replace the temporary large one, x y z, in units and frame of `step`."""
     unknown: float
     """Uncertainty of the expected step, as a fraction: PX4 may use offsets that differ a little from its parameters."""
 
@@ -81,7 +81,7 @@ class ExpectedStep:
 Mean = tuple[Array, Array]
 """Mean of an IMU output and its sigma, each x y z in vehicle FRD, in rad/s or m/s^2."""
 OnTheWay = Mapping[Triad, tuple[Mean, Array]]
-"""Mean output under the temporary large offset, in integer messages, and the step to the new offsets, by sensor."""
+"""Mean output (integer messages) under a temporary large offset, and expected step to the new offsets, by triad."""
 
 
 class Px4Writes:
@@ -94,7 +94,7 @@ class Px4Writes:
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
         self.on_the_way: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
-        """Means under temporary large offsets in the latest write, by IMU, if the output moved as expected."""
+        """Mean outputs under the latest write's temporary large offsets, by IMU, of outputs that moved as expected."""
         self._learned = False  # True: this write has found the true parameter slot of a sensor
         self._boots = 0
         self._samples: defaultdict[int, deque[ImuSample]] = defaultdict(deque)
@@ -105,7 +105,7 @@ class Px4Writes:
     async def standing_by(
         self, targets: Sequence[ImuPlan], before: Mapping[str, Vector]
     ) -> AsyncIterator[FarProbe | None]:
-        """Observe telemetry during a write; yield the check of temporary large offsets, or None if it needs none.
+        """Observe telemetry during a write; yield the check of temporary large offsets, or None if there are none.
 
         `before`: accelerometer outputs before the write, by IMU name.
         """
@@ -133,9 +133,9 @@ class Px4Writes:
                 self._memory.brought_into_use(names, accel_offset_with(calibration, target.all), self._vehicle.boots)
 
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
-        """Make PX4 apply stored offsets that it may not use, and leave their values; return True if there were any.
+        """Make PX4 apply stored offsets that it possibly ignores, without changing them; return whether there were any.
 
-        After an AutopilotError, `Recovery` restores values left changed. After a StorageError nothing was written.
+        After an AutopilotError, `Recovery` restores any changed values. After a StorageError nothing was written.
         """
         unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
         targets = [
@@ -169,7 +169,7 @@ class Px4Writes:
         return functools.partial(self._verify, step)
 
     async def _verify(self, step: ExpectedStep | None) -> str | None:
-        """Find the IMU whose output moved, and learn its parameter slot; return a fault unless it moved as expected."""
+        """Find the IMU whose output moved, and learn its parameter slot; return the fault, if any, as text."""
         if step is None:
             return None
         since, loop = VehicleTimer(self._vehicle), asyncio.get_running_loop()
@@ -294,7 +294,7 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
     in_use = {change.parameter: change.before for change in changes}
 
     def output(values: Mapping[str, float], triad: Triad) -> Array:
-        """Return the change of the output, x y z, when these parameter values replace those before the write."""
+        """Return the change of the output, x y z, when `values` replace the parameter values before the write."""
         there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
         return np.array(output_step(calibration, there, accel_m_s2)[0 if triad == "gyro" else 1])
 

@@ -1,8 +1,8 @@
 """Restarts of the autopilot after a write: on request, or required because PX4's EKF2 still uses an old tilt.
 
-A required restart is saved on disk. If PX4 restarted while the companion was off, PX4's time since boot is shorter than
-at the write. If the companion's board kept running, it also shows that PX4 booted after the write. Without either sign
-the restart stays required: one restart too many costs a minute.
+A required restart is saved on disk. Either of two signs shows that PX4 restarted while the companion was off. PX4's
+time since boot is shorter than at the write, or PX4 booted after the write by the clock of a board that kept running.
+Without either sign the restart stays required: one restart too many costs a minute.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class NotRebootedError(AutopilotError):
 
 
 def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -> str | None:
-    """Return the reason why the autopilot would replace the new offsets at a restart; None if it would not."""
+    """Return the reason why the autopilot would replace the new offsets at a restart; None if it would keep them."""
     after = {change.parameter: change.after for change in changes}
     gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
     for rival in (rival for calibration in calibrations for rival in calibration.rivals):
@@ -103,14 +103,14 @@ def owed_in(directory: Path) -> StateFile[_Owed]:
 
 
 class RebootOwed:
-    """Memory, also on disk, that PX4 must be restarted before flight; `run` clears it after the restart."""
+    """Reminder, also on disk, that PX4 must be restarted before flight; `run` deletes it after the restart."""
 
     def __init__(self, core: Core) -> None:
         self._vehicle, self._offload, self._core = core.vehicle, core.offload, core
         self._file, self._host = owed_in(core.config.storage.path), this_boot()
         self._owed: _Owed | None = None
         self._boots = 0
-        """Number of autopilot restarts seen when another became required; 0 if that was in an earlier run."""
+        """Number of autopilot restarts seen before one became required; 0 if an earlier run required it."""
         self._from_earlier_run = False
 
     def load(self) -> None:

@@ -99,7 +99,7 @@ class Offsets(Subsystem):
         ]
 
     async def offsets_still_hold(self) -> bool:
-        """Read the offsets again; return False if those in use during the measurement may have been different."""
+        """Read the offsets again; return False if other offsets were possibly in use during the measurement."""
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()

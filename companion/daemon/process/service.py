@@ -57,7 +57,7 @@ SETTLED_AFTER_S: Final = 3.0
 """Time after the start by which all lazily imported modules (recording, the child processes) are loaded."""
 PERIOD_S: Final = 1.0
 FEEDS_PER_LIMIT: Final = 4.0
-"""Number of watchdog feeds within the service manager's time limit, if that is short, so that one may be late."""
+"""Minimum number of watchdog feeds within the service manager's time limit: one feed can then be late."""
 MARGIN_S: Final = 2.0
 COMPONENT_S: Final = 5.0
 ESTIMATOR_S: Final = 10.0
@@ -134,7 +134,7 @@ class Service:
     async def listen(self, goes_on: Callable[[float], bool]) -> Object:
         """Open all connections, listen while `goes_on(seconds)` is true, and return the status; nothing is written.
 
-        The seconds are counted in turns of the event loop, so a slow process listens longer.
+        Time is counted in passes of the loop, `LISTEN_TURN_S` each, so a slow process listens longer.
         """
         self.devices.load()
         tasks = [self._transport, *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]
@@ -158,7 +158,7 @@ class Service:
 
 @dataclasses.dataclass(slots=True)
 class WatchedTask:
-    """Task that must make progress, measured by its count of turns: the event loop runs on even if a task hangs."""
+    """Task that must make progress, shown by its counter `turns`: the event loop runs on even if a task hangs."""
 
     name: str
     task: str
@@ -166,7 +166,7 @@ class WatchedTask:
     who: Any  # Object with the count `turns`
     seen: int = 0
     age_s: float = 0.0
-    """Time since the task's latest turn, summed up by `overdue`; a stop of the whole event loop does not count."""
+    """Time since the task's latest progress, summed up by `overdue`; a stop of the whole event loop does not count."""
 
     def overdue(self, passed_s: float) -> bool:
         before, self.seen = self.seen, self.who.turns

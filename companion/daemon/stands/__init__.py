@@ -1,1 +1,1 @@
-"""Measurement of still windows, and alignments from several poses: gradienter zero, six positions, turn in place."""
+"""Measurements without motion, and alignments from several poses: gradienter zero, six positions, turn in place."""

@@ -154,7 +154,7 @@ class ActiveSixPosition:
         return None if calibration is None else self.known(name, calibration, temperature_degc)
 
     def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Sides | None:
-        """Return the errors left in one IMU's output, in sensor axes; None if this sensor was never measured."""
+        """Return the errors left in an accelerometer's output, in sensor axes; None if they were never measured."""
         imus = () if self.record is None else self.record.imus
         kept = next((imu for imu in imus if imu.name == name), None)
         if kept is None or kept.accel_id != calibration.accel_id:

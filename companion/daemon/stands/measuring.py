@@ -1,4 +1,4 @@
-"""Measurement of one still window, and the estimate of biases from it."""
+"""Measurement of one window without motion, and the estimate of biases from this window."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MOST_UPSETS: Final = 5
 
 
 class Measuring:
-    """Measures still windows of one aircraft, for one job at a time."""
+    """Measures windows without motion of one aircraft, for one job at a time."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus

@@ -47,11 +47,11 @@ STOP_WITHIN_DEG: Final = 5.0
 TURNS_DEG: Final = 2.0
 """Minimum turn within a second that counts as turning."""
 EARLY_S: Final = 3.0
-"""Time at rest after which a movement counts as too early; before that, the aircraft is still being set down."""
+"""Time at rest after which a movement counts as too early; earlier ones count as setting the aircraft down."""
 STILL_MOVING_S: Final = 20.0
 """Duration of movement after which the operator gets a message: a hand or the wind may move the aircraft."""
 LEANED_DEG: Final = 0.03
-"""Largest change of tilt within a pose; half of it enters the mean, as much as an error of placement on floor marks."""
+"""Largest change of tilt within a pose: half of it enters the mean, as much as a wrong placement on floor marks."""
 ARMED: Final = "armed during the alignment; the earlier one stays active"
 
 
@@ -77,7 +77,7 @@ class SessionState:
     since_s: float = 0.0
     """Event-loop time since which the aircraft has not moved."""
     moved: bool = False
-    """True once the aircraft has moved after the previous pose, or after the latest objection."""
+    """True once the aircraft has moved after the previous pose, or after the latest objection to a pose."""
     still_s: float = 0.0
     moving_since_s: float = math.inf
     hold_still_said: bool = False
@@ -168,7 +168,7 @@ class PoseSession:
     async def run(self, job: Job, task: PoseTask) -> str:
         """Measure all poses, estimate, write and save; return the result in one line.
 
-        After an error or a cancel the old values are restored, or the error names those that are not.
+        After an error or a cancel, old parameter values are restored; the error names any that are not.
         """
         request = task.request
         if request.write and request.action == "faces":

@@ -1,4 +1,4 @@
-"""Kinds of alignment: gradienter zero and accelerometer level at one place, and accelerometers in six positions."""
+"""Kinds of alignment: of gradienter and accelerometers at one place, and of accelerometers in six positions."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ MOST: Final = 24
 """Maximum number of poses in a six-position alignment."""
 _FIRST: Final = Wish("any side down, propped up, hands off")
 LOOSE_M_S2: Final = 0.5 * MG
-"""Sigma of the level bias above which its main error is the turn's angle, not the placement on the floor marks."""
+"""Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""
 
 
 class SpotTask(PoseTask):
-    """Base class of alignments in which the aircraft turns at one place, with the estimate."""
+    """Base class of alignments in which the aircraft turns at one place; `result` is the estimate."""
 
     result: Alignment
     stands: Sequence[StandMeans] = ()
@@ -82,9 +82,9 @@ class SpotTask(PoseTask):
         )
 
     def _make_stands(self, state: SessionState, names: Sequence[str], north_deg: float = 0.0) -> None:
-        """Set `stands` to the mean readings in each pose, for the named IMUs.
+        """Set `stands` to the mean readings in each pose; of IMUs, only those in `names` are included.
 
-        `north_deg`: angle added to the heading of each pose, to refer it to true north.
+        `north_deg`: angle added to each pose's heading, which then counts from true north.
         """
         stands = []
         for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
@@ -190,7 +190,7 @@ class ZeroTask(SpotTask):
 
 
 class TurnTask(SpotTask):
-    """Measures level accelerometer biases and the ground's slope; with six-position results also the board's tilt."""
+    """Measures the level aircraft's accelerometer biases and the ground's slope; after six positions, board tilt."""
 
     def __init__(
         self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: ActiveSixPosition
@@ -252,7 +252,7 @@ class TurnTask(SpotTask):
 
 
 def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None = None) -> list[str]:
-    """Return the names of IMUs (in `among`) readable in all poses; raise CalibrationRefusedError if there are none."""
+    """Return IMUs (of `among`) that measured acceleration in all poses; raise CalibrationRefusedError if none did."""
     read = [{imu.name for imu in window.imus if not imu.refused("accel")} for window in windows]
     names = [imu.name for imu in windows[0].imus if all(imu.name in each for each in read)]
     names = [name for name in names if among is None or name in among]
@@ -262,7 +262,7 @@ def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None
 
 
 def ground(local: LocalEarth, compass: CompassModel | None) -> Ground:
-    """Return gravity and the Earth's rotation rate; without a compass, heading 0 is that of the first pose."""
+    """Return gravity and the Earth's rotation rate; without a compass, headings count from the first pose."""
     rate, of_rate = local.rate_in_body(np.eye(3), heading_known=compass is not None)
     covariance = of_rate.copy()
     if compass is not None and compass.magnetic:
@@ -374,7 +374,7 @@ class SidesTask(PoseTask):
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:
-        """Return mean and sigma, (3,) each, in sensor axes, in which autopilots apply the scale."""
+        """Return mean acceleration and sigma, (3,) each, in sensor axes: autopilots apply the scale in these axes."""
         turn = self._imus[imu.name].in_force.orientation.T
         return turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2))
 

@@ -42,7 +42,7 @@ WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5
 """Time until written parameters are in use: both firmwares read them once a second."""
 LATEST_S: Final = 4.0
-"""Largest age of attitude messages in use: a busy link delays them by seconds, but old estimates have wandered."""
+"""Largest age of attitude messages used: a busy link delays messages by seconds, but old estimates have wandered."""
 POLL_S: Final = 0.25
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
@@ -50,7 +50,7 @@ REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the 
 class AlignmentWrites:
     """Writes accelerometer offsets and scales, or the level, all or nothing, and verifies the effect.
 
-    After an error or a cancel the old values are restored, or the error names those that are not.
+    After an error or a cancel, old parameter values are restored; the error names any that are not.
     """
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
