@@ -1,4 +1,4 @@
-"""Joint estimate from several still poses: the gradienter's zero, level, and the errors of each IMU.
+"""Joint estimate from several poses of a motionless aircraft: the gradienter's zero, and the errors of each IMU.
 
 One pose cannot separate a zero offset of the gradienter from a bias of the accelerometers. Two poses at one place,
 turned by 180 degrees, can. Further tilts separate bias from scale and show the misalignment of gradienter and IMUs.
@@ -7,9 +7,9 @@ not determine keeps its prior sigma.
 
 Without a gradienter (`turned`), the half turn gives the *effective* bias of the level aircraft: the bias plus the
 effect of the board's tilt. In the aircraft's axes, the ground's slope changes its sign after half a turn; a bias does
-not. Sigma depends on how exactly the aircraft returns to its marked place (`Priors.placement_deg`). On a slope, sigma
-also depends on the error of the turn's angle. It adds g sin(slope) / 2 for each radian of a half turn, or 0.76 mg for
-each degree on a slope of 5 deg. Quarter turns determine their own angles, because their readings lie on a circle.
+not. Sigma depends on how exactly the aircraft returns to its marked place (`Priors.placement_deg`). On a slope, a wrong
+angle of the half turn adds an error: g sin(slope) / 2 for each wrong radian, 0.76 mg for each wrong degree on a slope
+of 5 deg. Quarter turns determine their own angles, because their readings lie on a circle.
 
 Inconsistent readings are refused: every residual is compared with its own sigma (Baarda's w-test). This test names the
 wrong pose, and detects a movement of the ground earlier than a sum of squares.
@@ -52,8 +52,8 @@ from companion.physics.units import DEG, MG
 W_LIMIT: Final = 4.5
 """Threshold for a normalised residual (Baarda's |w|). Chance exceeds it in one of 1000 alignments of 100 readings."""
 SPOT_W_LIMIT: Final = 3.9
-"""Threshold for the normalised residual of a return to the marked place (Baarda's |w|). An alignment has few returns,
-so chance exceeds this lower threshold only once in some thousand alignments, too."""
+"""Threshold for the normalised residual of a return to the marked place (Baarda's |w|). It is lower than `W_LIMIT`,
+because an alignment has few returns: chance exceeds it only once in some thousand alignments."""
 DETERMINED: Final = 0.2
 """A value counts as determined by the readings if its sigma is below this share of its prior sigma."""
 _LEAST_REDUNDANCY: Final = 1e-3
@@ -78,7 +78,7 @@ class ImuAlignment:
     """Errors of one IMU that remain after the autopilot has subtracted its offsets; vehicle axes (FRD).
 
     `accel_bias_m_s2` is the bias without the effects of scale and misalignment. `misalignment_rad`: rotation vector
-    from the axes of gradienter and base to the axes of this IMU.
+    from the vehicle's axes, which gradienter and aircraft's base define, to this IMU's axes.
     """
 
     name: str
@@ -165,7 +165,7 @@ def align(
 
 
 def turned(stands: Sequence[StandMeans], ground: Ground) -> Alignment:
-    """Estimate bias when level, and slope, from two or four headings at one place, without a gradienter.
+    """Estimate biases of the level aircraft, and the ground's slope, from 2 or 4 headings at one place, by IMUs alone.
 
     Raises:
         CalibrationRefusedError: the readings are inconsistent.
@@ -203,7 +203,7 @@ def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
-    """Return a factor for the covariance: actual over predicted variance of residuals; 1 if it may be chance (99 %)."""
+    """Return a covariance factor: actual over predicted variance of residuals, or 1 if chance explains it (99 %)."""
     if freedom <= 0:
         return 1.0
     ratio = chi_square / freedom

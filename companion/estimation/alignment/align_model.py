@@ -1,8 +1,8 @@
 """Model of all poses for `align`, and the least-squares fit that every alignment uses.
 
-A *stand* in the code is the still window of one pose. The fit estimates the gradienter's zero, and for every IMU its
-misalignment, accelerometer scale, shear and bias, and gyro bias. With these it estimates gravity and the Earth's rate
-within the uncertainty of the place, the plane of the ground, and the attitude C_k in each pose k.
+A *stand* in the code is the time without motion that was measured in one pose. The fit estimates the gradienter's zero,
+and for every IMU its misalignment, accelerometer scale, shear and bias, and gyro bias. It also estimates gravity and
+the Earth's rate within the uncertainty of the place, the plane of the ground, and the attitude C_k in each pose k.
 
 Here u = C_k (0, 0, -1) is up in the vehicle's axes, and g is gravity. W is the Earth's rate in the ground frame, which
 is NED, or NED turned about the vertical if north is unknown.
@@ -43,11 +43,11 @@ _ANYHOW_RAD: Final = 1.0
 PRIOR_BIAS_M_S2: Final = 100.0 * MG
 PRIOR_SCALE: Final = 0.03
 PRIOR_SHEAR: Final = 0.01
-"""Prior sigma of an uncalibrated part's shear. ICM-42688-P: cross axis 1 %, scale 0.5 %; mounted parts are worse."""
+"""Prior sigma of an uncalibrated IMU's shear. ICM-42688-P: cross axis 1 %, scale 0.5 %; a mounted chip is worse."""
 _MAX_ROUNDS: Final = 30
 _CONVERGED: Final = 1e-5
 _STEP: Final = 1e-5
-"""Step of the numerical derivatives. `_CONVERGED` and `_STEP` are multiples of each unknown's prior sigma."""
+"""Step of the numerical derivatives; like the limit of convergence, a multiple of each unknown's prior sigma."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -105,12 +105,12 @@ def fit(
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class StandMeans:
-    """Means over the still window of one pose.
+    """Means over the time without motion in one pose.
 
     `tilt_deg`: gradienter readings minus the configured offset; None if out of range or without a gradienter.
-    `counted`: `heading_rad` is the heading of the pose before plus the turn that the gyros counted since
-    (`seconds.counting`), not wrapped. `heading_sigma_rad` is then the sigma of that turn, without the error of the
-    gyros' scale (`Priors.turn_scale`).
+    `counted`: true if the gyros measured the turn since the previous pose (`seconds.counting`). `heading_rad` is then
+    the previous pose's heading plus this turn, not wrapped. `heading_sigma_rad` is then the sigma of this turn, without
+    the error of the gyros' scale (`Priors.turn_scale`).
     """
 
     imus: tuple[ImuWindow, ...]
@@ -137,7 +137,7 @@ class Ground:
 class Priors:
     """Prior sigma of each unknown of an alignment; 0: known and not estimated (method.md section 3.4, joint MAP).
 
-    `placement_deg`: tilt error, each axis, of every return to the marked place. `turn_scale`: scale of counted turns.
+    `placement_deg`: tilt error, each axis, of every return to the marked place. `turn_scale`: gyro scale of turns.
     """
 
     offset_deg: float = 1.0
@@ -158,7 +158,7 @@ class Model:
     """Model of an alignment: computes the residuals of all poses from the unknowns.
 
     The unknowns, in SI units: zero of the gradienter (2), tilt of the ground at the marked place (2), gravity (1),
-    Earth's rate (3), scale of counted turns (1), attitude error of each pose (3), five groups (3) of each IMU.
+    Earth's rate (3), gyro scale of turns (1), attitude error of each pose (3), five groups (3) of each IMU.
     """
 
     offset, spot, gravity, rate, turn = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8), slice(8, 9)

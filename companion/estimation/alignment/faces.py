@@ -1,13 +1,13 @@
 """Bias, scale and shear of three accelerometers from the length of gravity, in poses of any orientation.
 
-Only the strength of gravity must be known: in any orientation the corrected reading has that length (Tedaldi, Pretto
-and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u the unit vector pointing up, in the sensor's axes,
+Only the strength g of gravity must be known: in any orientation, the corrected reading is a vector of length g
+(Tedaldi, Pretto and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u the unit vector up, in the sensor's axes,
 
     f = (I + S) g u + b           S symmetric: scale on its diagonal, shear beside it
 
 so that |(I + S)^-1 (f - b)| = g in every pose. A common rotation of the axes does not change the length; `mounting`
-finds that rotation from a turn at one place. Unlike the triangular matrix of Tedaldi et al., a symmetric one prefers no
-axis. Its diagonal is the scale that a firmware without shear correction uses.
+finds that rotation from a turn at one place. Unlike the triangular matrix of Tedaldi et al., the symmetric S prefers no
+axis. The diagonal of S is the scale that a firmware without shear correction uses.
 
 Each pose is weighted by the noise of its mean, and gravity by its uncertainty at the place. Every value therefore has a
 sigma from the first pose on. A pose that does not fit is found by leaving out one pose after another.
@@ -37,15 +37,15 @@ SHEAR: Final = slice(6, 9)
 W_LIMIT: Final = 3.9
 """Threshold for the normalised residual of one pose (Baarda's |w|): chance exceeds it once in ten thousand."""
 LEAST_SPARE: Final = 2
-"""Least number of poses, in addition to the number of unknowns, with which a wrong pose can be identified."""
+"""Least number of poses beyond the number of unknowns (nine) that identifies a wrong pose."""
 _LEAST_REDUNDANCY: Final = 1e-3
 
 ENOUGH_BIAS_M_S2: Final = 0.15 * MG
 ENOUGH_SCALE: Final = 2e-4
 ENOUGH_WANDER: Final = 0.8
-"""Good enough bias sigma, as a share of the bias' own wander: a dozen more poses do not improve a bad sensor."""
+"""Bias sigma that is good enough, over sigma of the bias' own change: a dozen more poses do not help a bad sensor."""
 SAME_DEG: Final = 20.0
-"""Angle between two poses below which the second adds hardly any information."""
+"""Angle between two poses below which the second pose adds hardly any information."""
 FACE_DEG: Final = 30.0  # A pose within this angle of a side counts as a measurement of that side
 _STAND_SIGMA_M_S2: Final = 0.03 * MG  # Predicted sigma of the mean of the next pose
 _AXES: Final = "xyz"
@@ -61,7 +61,7 @@ _SIDES: Final = {
 
 
 Face = tuple[Array, Array]
-"""Mean specific force of one still pose in the sensor's axes, and one sigma per axis; m/s^2, each (3,)."""
+"""Mean specific force during one pose, in the sensor's axes, and one sigma per axis; m/s^2, each (3,)."""
 
 
 class Sides(msgspec.Struct, frozen=True):
@@ -82,7 +82,7 @@ class FacesEstimate:
     `by_stands` (9, 9): covariance of the figures at the time of the poses. `wander_m_s2` (3,): one sigma of the biases'
     change until they are used. `up` (poses, 3): corrected unit vector up in the sensor's axes. `off_m_s2` (poses,):
     length of each corrected reading minus gravity. `left_out`: numbers, from 0, of poses that do not fit the others.
-    `in_doubt`: poses of which one more does not fit; the next pose will show which one.
+    `in_doubt`: numbers of further poses, one of which does not fit; the next measured pose will show which one.
     """
 
     figures: Array
@@ -259,7 +259,7 @@ def _two_digits(value: float) -> str:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """Tilt of the board against the aircraft's base: attitude that its corrected accelerometers show on a level base.
+    """Tilt of the board against the aircraft's base: attitude by the corrected accelerometers while the base is level.
 
     Roll is positive right side down, pitch nose up. `sigma_rad` (2,): one sigma of roll and pitch.
     """
@@ -270,9 +270,9 @@ class Mounting:
 
 
 def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting:
-    """Return the tilt of the board from its bias when level, after removing the accelerometers' own bias and scale.
+    """Return the board's tilt from the bias of the level aircraft, minus the accelerometers' own bias and scale errors.
 
-    Shear is not removed, because no firmware corrects it. An attitude corrected by this tilt is right when level.
+    Shear is not removed, because no firmware corrects it. An attitude corrected by this tilt is exact on a level base.
     """
     vehicle_from_sensor = known.vehicle_from_sensor
     read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)

@@ -1,6 +1,6 @@
 """Poses that an alignment asks for, as text and picture, and the check of a pose against the requested one.
 
-A *pose* is one way to put down or hold the aircraft. The code calls the still window measured in a pose a *stand*.
+A *pose* is one way to put down or hold the aircraft. A *stand* in the code is the time without motion in a pose.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ BY_EYE_SIGMA_DEG: Final = 10.0
 class AlignmentRequest(NamedTuple):
     action: Literal["zero", "tilts", "turn", "faces"]
     headings: int = 2
-    """Headings to measure. 2: start, half a turn, and on in the same direction to the start. 4: every quarter turn."""
+    """Headings to measure. 2: half a turn, then another in the same direction to the start. 4: every quarter turn."""
     write: bool = False  # Write offsets (and scales, if six positions determine them) to the autopilot
     level: bool = False  # Write the tilt of the board as the autopilot's level
 
     @property
     def on_spot(self) -> int:
-        """Number of poses at the marked place. A "turn", or two headings without tilts, repeats the first as check."""
+        """Number of poses at the marked place. A "turn", or two headings without tilts, ends with the first again."""
         if self.headings == 2 and self.action != "tilts":
             return 3
         return HEADINGS + (self.action == "turn")
@@ -61,7 +61,7 @@ class AlignmentRequest(NamedTuple):
 class Wish(NamedTuple):
     """Pose to request next. `up`: unit vector pointing up, in the aircraft's axes (forward, right, down).
 
-    `words`: text that is spoken up to the first colon. `unknown`: texts on values not yet precise enough, worst first.
+    `words`: text; spoken up to its first colon. `unknown`: texts on values not yet precise enough, worst first.
     """
 
     words: str
@@ -73,7 +73,7 @@ class Wish(NamedTuple):
 class HeldPose(NamedTuple):
     """Attitude of the aircraft in one pose. `up` (3,): unit vector pointing up, in the aircraft's axes.
 
-    `counted`: the gyros counted the turn, and `heading_sigma_deg` is the sigma of the turn since the pose before.
+    `counted`: the gyros measured the turn since the previous pose; `heading_sigma_deg` is then the turn's sigma.
     """
 
     up: Array
@@ -157,7 +157,7 @@ def _apart_deg(one: Array, other: Array) -> float:
 
 
 def _azimuth(level: Array, up: Array) -> float:
-    """Return the direction of the aircraft's lean, degrees from the nose, right positive; `level` is up on its base."""
+    """Return the direction of the aircraft's lean, degrees from the nose, right positive; `level`: up on the base."""
     lean = up - level
     return math.degrees(math.atan2(-lean[1], -lean[0]))
 
@@ -168,7 +168,7 @@ def _side(level: Array, up: Array) -> str:
 
 
 def leaned_deg(forces_m_s2: Array) -> float:
-    """Return the largest angle between the directions of up in the three thirds of a pose; 0 if it may be noise.
+    """Return the largest angle between the mean directions of up in three thirds of a pose's time; 0 if within noise.
 
     Args:
         forces_m_s2: (seconds, 3), mean specific force of each second.

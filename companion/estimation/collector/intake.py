@@ -1,10 +1,10 @@
-"""Input streams of the collector with their gates and verdicts, and the types of the collector's state.
+"""Input streams of the collector, each with a gate that checks stillness, and the types of the collector's state.
 
 The readings of a gradienter, or of a compass that averages, continue to change after the aircraft has stopped. They
 approach the true value with a time constant: in a field gradienter's fluid, the error falls to a tenth in each second
 (BEI INC manual; sensors.md sections 2.2 and 2.7). The gate detects only the steep beginning. After a movement that the
-IMUs detected, the seconds of gradienter and compass count again once the largest possible error is a tenth of sigma.
-The seconds of the IMUs count at once.
+IMUs detected, readings of gradienter and compass are used again once their largest possible error is a tenth of sigma.
+Readings of the IMUs are used at once.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CollectorObstacle(msgspec.Struct, frozen=True):
-    """Reason why no measurement is possible now: a movement or a fault."""
+    """Reason why no measurement is possible now: a movement, a fault, or a wait."""
 
     words: str
     moving: bool = False  # True for a movement, which the operator can end; False for a fault
@@ -72,7 +72,7 @@ class CollectorObstacle(msgspec.Struct, frozen=True):
 
 
 class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one sensor's stream; `words`: the reason why the sensor is not still.
+    """State of one sensor's stream; `words`: text on a movement, fault or silence of the sensor.
 
     `rate_hz`: samples in the last whole second. `lost`: number of missing samples, by the device's counter or clock.
     """
@@ -89,10 +89,10 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
 class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the collector; `RollingCollector.glance` leaves out the fields that need an estimate.
 
-    `still_s`: number of good seconds, common to all sensors, in the current still stretch. `steady_s`: number of good
-    seconds in a row until now. `hold_still_s`: seconds until a window is possible. `enough`: more seconds would not
-    improve the result. `progress`: 0 to 1, from the start to `enough`. `measuring`: text on the measurement.
-    `left`: text on the remaining time; on a deck only.
+    A second is good if all sensors were motionless and worked. `still_s`: good seconds since the aircraft came to rest.
+    `steady_s`: good seconds in a row until now. `hold_still_s`: seconds until a window is possible. `enough`: more
+    seconds would not improve the result. `progress`: 0 to 1, from the start to `enough`. `measuring`: text on the
+    measurement. `left`: text on the remaining time; on a deck only.
     """
 
     still_s: float
@@ -160,10 +160,10 @@ class Thermometer:
 
 
 class Settling:
-    """Detects the seconds in which a gradienter or compass still settles after a movement.
+    """Detects the seconds in which a gradienter or compass has not yet settled after a movement.
 
-    Its readings approach the true value with the time constant `lag_s` (0: at once). It has settled when the error is
-    a tenth of `sigma_deg`.
+    The readings approach the true value with the time constant `lag_s` (0: at once). The sensor has settled when the
+    largest possible error is a tenth of `sigma_deg`.
     """
 
     def __init__(self, lag_s: float, sigma_deg: float) -> None:
@@ -173,7 +173,7 @@ class Settling:
         self._moved: int | None = None  # Last second in which the aircraft moved
 
     def judge(self, slot: int, *, moved: bool) -> bool:
-        """Return true if the sensor has settled in this second; seconds must ascend. `moved`: IMUs detected motion."""
+        """Return true if the sensor is settled in second `slot`; seconds must ascend. `moved`: IMUs detected motion."""
         if moved:
             self._moved = slot
         self.left_s = 0 if self._moved is None else max(self._moved + 1 + self._tail_s - slot, 0)
@@ -181,7 +181,7 @@ class Settling:
 
 
 class Source:
-    """Input stream of one sensor, with its one-second batches, its gate on motion, and the gate's last verdict."""
+    """Input stream of one sensor: its one-second batches, its gate (stillness check), and the gate's last verdict."""
 
     carry = 0  # Seconds for which the last reading stays valid
 
@@ -199,7 +199,7 @@ class Source:
         return next(reversed(self.batches.batches.values()), None)
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
-        """Return true if this sensor was still during one second; `moved`: the IMUs detected a movement in it.
+        """Return true if this sensor was motionless in second `slot`; `moved`: the IMUs detected a movement then.
 
         `may_move`: movements are allowed, and only a fault of the sensor makes the result false.
         """
@@ -215,7 +215,7 @@ class Source:
         return self.verdict.still
 
     def accept(self, slot: int) -> None:
-        """Add a second to the gate's reference readings; every sensor was still in that second."""
+        """Pass the gate a second in which all sensors were motionless, for comparison with later seconds."""
         if (batch := self.batches.batches.get(slot)) is not None:
             self.gate.accept(batch)
 
@@ -245,7 +245,7 @@ class Source:
 
 
 class ImuSource(Source):
-    """Input stream of one IMU, with a turn counter, and with means in floats if the stream has integers only."""
+    """Input stream of one IMU, with a turn counter. Beside a stream of integers, means in floats can arrive."""
 
     gate: ImuGate
 
@@ -253,7 +253,7 @@ class ImuSource(Source):
         super().__init__("imu", imu.name, BatchSource(LIMITS_IMU, keep, steps=imu.steps), _gate(imu))
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
-        """One-second batches of means in floats, which arrive beside a stream of integers."""
+        """One-second batches of the means in floats that a device sends in addition to a stream of integers."""
         self._raw_count = 0
         self.counter: TurnCounter | None = None  # Set while the turns of an alignment are counted
         self._breaks = 0
@@ -330,7 +330,7 @@ class PoseSource(Source):
         super().__init__(kind, kind, batches, PoseGate(kind))
         self._settling = Settling(0.0, 1.0) if model is None else Settling(model.lag_s, model.sigma_deg)
         self._unsettled: deque[int] = deque(maxlen=keep)
-        """Seconds in which this sensor still settled; they count for other sensors, but not for its own mean."""
+        """Seconds in which this sensor had not settled: means of other sensors use them, its own mean does not."""
 
     def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
         if not self._settling.judge(slot, moved=moved):

@@ -1,10 +1,10 @@
 """Interface that chooses the seconds of a window and caches its estimate, and the implementation for the ground.
 
-A still stretch begins with `min_still_s` good seconds in a row. After that, up to 20 % of its seconds may be rejected
-(a gust, a knock), because the mean is robust. More than three rejected seconds in a row show that the aircraft was
-moved, and end the stretch.
+A still stretch is the time since the aircraft came to rest. It begins with `min_still_s` good seconds in a row. After
+these, at most 20 % of all its seconds are allowed to be bad (a gust, a knock), as the mean is robust. More than three
+bad seconds in a row show that the aircraft was moved, and end the stretch.
 
-Choosing the seconds takes far less time than the estimate, so `Work` computes an estimate in another thread.
+Choosing the seconds takes far less time than the estimate, which another thread can therefore compute (`Work`).
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Floats
 
 MIN_BATCHES: Final = 5
-"""Least number of seconds in a window that begins after `since_s`; fewer do not show their own scatter."""
+"""Least number of seconds in a window that verifies a write; fewer seconds do not show their own scatter."""
 MAX_REJECTED: Final = 0.20
 MAX_REJECTED_RUN: Final = 3
 _NO_ROOM: Final = 1e-300
 
 
 class Work(NamedTuple):
-    """Computation of an estimate over the seconds `slots`, ascending; all of them begin after `since_s`, if given.
+    """Computation of an estimate over the seconds `slots`, ascending. `since_s`: earliest start of `slots`, if any.
 
     `run` returns the estimate, or a `CalibrationRefusedError` with the reason; another thread may call it.
     """
@@ -46,11 +46,11 @@ class Work(NamedTuple):
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """Readings of one window, and the function that estimates from them; immutable.
+    """Readings of one window, and the function that computes the estimate from these readings; immutable.
 
-    `slots`: good seconds, ascending, at least one. `tilt`, `heading`: settled seconds of gradienter and compass; None
-    without the sensor. `begun_s`: time of power-up of each IMU, if known. `estimate` returns the estimates of the IMUs,
-    or the whole window, or a `CalibrationRefusedError`.
+    `slots`: good seconds, ascending, at least one. `tilt`, `heading`: batches of gradienter and compass from seconds in
+    which these were settled; None without the sensor. `begun_s`: host time of power-up of each IMU, if known.
+    `estimate` returns a list with an estimate of each IMU, or a whole `Window`, or a `CalibrationRefusedError`.
     """
 
     slots: Sequence[int]
@@ -95,7 +95,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WindowSource(ABC):
-    """Chooses the seconds of a window; caches the newest estimate, and that of one window beginning after `since_s`."""
+    """Chooses the seconds of a window; caches the newest estimate, and the estimate of one window after a write."""
 
     may_move = False
     """True if movements are allowed: a second is then rejected only for a fault of a sensor."""
@@ -106,7 +106,7 @@ class WindowSource(ABC):
 
     @abstractmethod
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
-        """Add an IMU with the batches of its stream and of its means in floats; restart it if its stream changes."""
+        """Add an IMU, or replace it after its stream changed. `batches`: the stream; `raw`: extra means in floats."""
 
     def set_pose(self, kind: str, batches: BatchSource) -> None:  # noqa: B027 - not every source of windows needs it
         """Add the one-second batches of a gradienter or compass."""
@@ -119,19 +119,19 @@ class WindowSource(ABC):
 
     @abstractmethod
     def add(self, slot: int, *, good: bool) -> bool:
-        """Add a second that the gates judged as `good` or not; return false if the still stretch ended with it."""
+        """Add a second that the gates judged as `good` or not; return false if this second ends the still stretch."""
 
     @property
     @abstractmethod
     def stillness(self) -> CollectorStatus: ...
 
     def good_slots(self, since_s: float | None) -> list[int]:
-        """Return the good seconds after `since_s`, for the check that gradienter and compass have settled."""
+        """Return the good seconds after `since_s` (None: all), to check that gradienter and compass have settled."""
         return []
 
     @abstractmethod
     def slots(self, since_s: float | None) -> Sequence[int]:
-        """Return the seconds of a window that begins after `since_s`; None: of the longest possible window.
+        """Return the seconds of the longest window that begins after `since_s`; None: begins at any time.
 
         Raises:
             CalibrationRefusedError: too few seconds.
@@ -149,7 +149,7 @@ class WindowSource(ABC):
         self.generation += 1
 
     def known(self, last: int, since_s: float | None) -> Any:
-        """Return the cached estimate for `since_s` if its window ends with second `last` or later; else None."""
+        """Return the cached estimate of a window after `since_s`; None if no such window reaches second `last`."""
         kept = self._kept.get(since_s)
         return kept[1] if kept is not None and kept[0] >= last else None
 
@@ -161,7 +161,7 @@ class WindowSource(ABC):
         return None if self.known(slots[-1], since_s) is not None else self.work(slots, since_s)
 
     def accept(self, work: Work, found: Any) -> bool:
-        """Cache the result `found` of `work`; return false if it is too late, because a new stretch has begun."""
+        """Cache the result `found` of `work`; return false if a new still stretch has begun since `work` was made."""
         if work.generation != self.generation:
             return False
         self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
@@ -174,7 +174,7 @@ class WindowSource(ABC):
         return Measurement(slots=slots, estimate=self.estimate_later(slots, since_s))
 
     def estimate_later(self, slots: Sequence[int], since_s: float | None, late: int = 0) -> Callable[[], Any]:
-        """Return a function that computes the estimate over `slots`, or returns a cached one at most `late` s old."""
+        """Return a function that returns the estimate over `slots`, or a cached one that lacks the last `late` s."""
         found = self.known(slots[-1] - late, since_s)
         if found is not None:
             return lambda: found
@@ -205,7 +205,7 @@ class Stretch:
         self._steady = 0
 
     def add(self, slot: int, *, good: bool) -> bool:
-        """Add the next second; return false if the still stretch ends with it."""
+        """Add the next second; return false if this second ends the still stretch."""
         self._steady = self._steady + 1 if good else 0
         self.flags.append(good)
         if good:
@@ -319,19 +319,19 @@ class GroundWindows(WindowSource):
 
 
 def is_enough(settings: Settings, found: Sequence[Estimate]) -> bool:
-    """Return true if each axis meets its target or has white noise below 30 % of the rest (method.md section 3.2)."""
+    """Return true if each axis meets its target or has white noise below 30 % of the other noise (method.md 3.2)."""
     return all(bool((each.white_variance <= _room(settings, each)).all()) for each in found)
 
 
 def expected_s(settings: Settings, found: Sequence[Estimate]) -> int:
-    """Predict the number of good seconds that is enough, if the noise does not change."""
+    """Predict the number of good seconds after which `is_enough` is true, if the noise does not change."""
     needed = [np.square(each.white) / np.maximum(_room(settings, each), _NO_ROOM) for each in found]
     longest = max((float(each.max()) for each in needed), default=0.0)
     return min(max(math.ceil(min(longest, settings.max_s)), settings.min_slots), settings.max_slots)
 
 
 def _room(settings: Settings, own: Estimate) -> Floats:
-    """Return the white-noise variance (6,) that the target allows; negative for integers that need more seconds."""
+    """Return the white-noise variance (6,) that is low enough; -1 if integers do not determine the mean yet."""
     target = np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
     stays = own.use_variance - own.white_variance
     room = np.maximum(np.square(target) - stays, WHITE_SHARE * stays)

@@ -1,7 +1,7 @@
 """Rolling collector: combines the streams of all sensors into one window (method.md sections 2.4, 3.1 and 3.2).
 
 The collector has no clock: the time comes with the samples and with `now_s`. All sensors share one grid of 1 s. A
-second counts if every sensor was still in it.
+second counts if every sensor was motionless during it.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class RollingCollector:
     """Collects one-second batches of all sensors, judges stillness, and computes the means of a window.
 
     No sample value raises an exception; dropped samples are counted by reason. Memory is bounded to `max_s` batches per
-    sensor, plus a margin. `gradienter` or `compass` None: the sensor is missing. `windows` chooses the seconds of a
-    window; None: those of the still stretch.
+    sensor, plus a margin. `gradienter`, `compass`: None if the aircraft has none. `windows` chooses the seconds of a
+    window; None: `GroundWindows`, for an aircraft on the ground.
 
     Raises:
         ValueError: two IMUs have one name.
@@ -75,7 +75,7 @@ class RollingCollector:
         self._now_s = -math.inf
         self._restarts = 0
         self.on_second: list[Callable[[], object]] = []
-        """Callbacks after each second that all sensors completed. They delay new samples, so they must be quick."""
+        """Callbacks after new seconds were judged. They delay the next samples, so they must be quick."""
         for imu in imus:
             self.set_imu(imu)
 
@@ -93,7 +93,7 @@ class RollingCollector:
     def add_raw(self, name: str, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
         """Add a mean in floats (gyro in rad/s, accelerometer in m/s^2) of an IMU whose stream has integers only.
 
-        The gates judge stillness by the stream. A window uses these means if they determine the gyro biases better.
+        Stillness is judged by the integers. A window uses the floats if they determine the gyro biases better.
         """
         if name in self.imus:
             self.imus[name].add_raw(t_s, row, temperature_degc)
@@ -106,7 +106,7 @@ class RollingCollector:
             self._evaluate()
 
     def add_compass(self, sample: CompassSample) -> bool:
-        """Add a heading that the device computed; return false if the heading from its field is used instead."""
+        """Add a heading that the compass computed; return false if one from its magnetic field is used instead."""
         counts = self._field is None or self._field.takes_own(sample)
         if counts:
             self._add_heading(sample)
@@ -127,9 +127,9 @@ class RollingCollector:
             self._evaluate()
 
     def tick(self, now_s: float) -> None:
-        """Close the seconds that ended before `now_s` (on the samples' clock), also those of silent sensors.
+        """Close the seconds that ended before `now_s` (on the samples' clock), even if a sensor is silent.
 
-        The caller must do this a few times a second.
+        Call this method a few times a second.
         """
         if math.isfinite(now_s):
             self._now_s = now_s
@@ -182,7 +182,7 @@ class RollingCollector:
         )
 
     def reset(self, why: str, imu: str | None = None) -> None:
-        """Drop the readings of one IMU, or of all sensors: after arming, a write of offsets, or a restart.
+        """Drop the readings of one IMU, or of all sensors: after arming, a write of offsets, or a device's restart.
 
         The current second is dropped, too. The still stretch begins again. The learned noise is not dropped.
         """
@@ -248,7 +248,7 @@ class RollingCollector:
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
         """Return the means over the good seconds up to the latest complete one, at most `max_s` seconds.
 
-        With `since_s` (to verify a write), only seconds that begin after it count, and 5 good seconds are enough.
+        To verify a write at time `since_s`, only later seconds count, and on the ground 5 good seconds are enough.
         `duration_s` of an IMU is the number of seconds in its means.
 
         Raises:
@@ -341,7 +341,7 @@ class RollingCollector:
                 source.accept(slot)
 
     def _watch_turn(self, slot: int, *, good: bool) -> bool:
-        """Check a judged second for a turn of the ground; return false if the still stretch ends with it."""
+        """Check a judged second for a turn of the ground; return false if a turn ends the still stretch."""
         others = self._others()
         if self._windows.may_move or any(verdict.fault for verdict in others):
             return True

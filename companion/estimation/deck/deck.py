@@ -1,4 +1,4 @@
-"""Choice of windows for an aircraft on a deck that sways and turns; `collector.measurement` does that for the ground.
+"""Choice of a window's seconds on a deck that sways and turns (on the ground: `collector.measurement`).
 
 The seconds of an IMU must follow one another without a gap, because the aircraft turns by an unknown angle in a gap.
 """
@@ -36,9 +36,9 @@ from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS
 
 EVERY_S: Final = {180: 10, 600: 30, MAX_S: 60}
-"""Interval between two window ends, s, by maximum window length, s: long windows cost more time and change less."""
+"""Interval between two window ends, s, by upper limit of window length, s: long windows cost more and change less."""
 KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
-"""Number of seconds to store: enough for the longest window until the next window replaces it."""
+"""Number of seconds to store: those of the longest window, and those that arrive before the next window."""
 LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
 _KEPT_SHOWN: Final = 4  # Seconds stored until the gradienter's readings arrive
@@ -51,7 +51,7 @@ _IN_MINUTES_S: Final = 90.0
 
 
 class Stream:
-    """Consecutive seconds of one IMU, without a gap, and their comparison with the gradienter."""
+    """Consecutive seconds of one IMU, without a gap; if there is a gradienter, each second is compared with it."""
 
     def __init__(self, imu: ImuInput, gradienter: GradienterModel | None) -> None:
         self.imu, self._gradienter = imu, gradienter
@@ -119,7 +119,7 @@ class Deck(WindowSource):
         self._headings: dict[int, float] = {}
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
         self._reference_deg: tuple[float, float] | None = None
-        """Tilt, deg, of the last accelerometer means; means after a write are converted to this tilt for comparison."""
+        """Mean tilt, deg, of the newest window; accelerometer means after a write are converted to this tilt."""
         self._is_good = True
 
     def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
@@ -176,7 +176,7 @@ class Deck(WindowSource):
         return CollectorStatus(still_s=seconds, steady_s=seconds, good_now=self._is_good)
 
     def common(self, since_s: float | None = None) -> range:
-        """Return the seconds that all IMUs have after `since_s`, up to the latest window end allowed by `EVERY_S`."""
+        """Return the seconds after `since_s` that all IMUs have, up to the last end of a window by `EVERY_S`."""
         ends = [(one.seconds[0][0].slot, one.seconds[-1][0].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)
@@ -253,7 +253,7 @@ class Deck(WindowSource):
 
 
 def aim(span_s: float, known: TriadVariances, target: float) -> tuple[float, float, float]:
-    """Return the present sigma, the goal for sigma, and the predicted window length, s, that reaches the goal.
+    """Return a triad's present sigma, its goal, and the predicted window length, s, after which sigma is at the goal.
 
     The goal is the target, or the smallest sigma that more time can reach. `known`: variances from `span_s` seconds.
     """

@@ -28,10 +28,10 @@ from companion.physics.units import DEG, MG
 MIN_S: Final = 60
 """Shortest window on a deck, s. Some waves last as long, so a shorter window is never enough."""
 MIN_LOOK_S: Final = 40
-"""Shortest window to verify a write, s; the larger sigma of the short time is part of the result."""
+"""Shortest window to verify a write, s. A short window has a larger sigma, which the result states."""
 MAX_S: Final = 1200
 SCALE_SIGMA: Final = 0.003
-"""Sigma of scale and cross-axis errors of common gyros (at most 0.5 %): this share of a turn looks like a bias."""
+"""Sigma of scale and cross-axis errors of common gyros (at most 0.5 %): this share of a turn rate looks like a bias."""
 COMPASS_SHARE: Final = math.sqrt(0.5)
 """Share of a compass' sigma that changes with the heading; the rest is the same on all headings."""
 FROZEN_S: Final = 20
@@ -39,14 +39,14 @@ FROZEN_S: Final = 20
 _SWAYS_RAD_S: Final = 0.3 * DEG  # Least scatter of the rates of roll and pitch in that time
 _SAME: Final = 1e-9
 _SPREAD: Final = 1.5
-"""Standard deviation of readings, in steps, from which swaying averages out their rounding to integers."""
+"""Least standard deviation of readings, in integer steps, at which swaying averages out the rounding to integers."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
-"""Least prior sigma of an accelerometer bias after comparison with the gradienter; `solve` adds that of its zero."""
+"""Prior sigma of an accelerometer bias by comparison with the gradienter; `solve` adds sigma of the latter's zero."""
 _MIDDLE: Final = 0.37  # Share of K^2 T that a slope through the window misses
 _FLICKER_TO_COME: Final = 0.75
-"""Share of the flicker variance B^2 for the next minutes, which past flicker does not predict. With the flicker within
-the window (a random walk of B / sqrt(T)), the sum is the flicker's part of V(T, H) (method.md section 2.2)."""
+"""Variance, over B^2, of the flicker in the next minutes that past flicker does not predict. Together with the flicker
+within the window (a random walk of B / sqrt(T)), it is the flicker's part of V(T, H) (method.md section 2.2)."""
 _GRAVITY_M_S2: Final = 9.8
 
 
@@ -118,7 +118,7 @@ class DeckWindow:
         """Return the seconds in which a sensor repeated one reading while the aircraft swayed.
 
         Raises:
-            CalibrationRefusedError: the sensor still repeats that reading.
+            CalibrationRefusedError: the sensor repeats one reading until the end of the window.
         """
         if not readings:
             return set()
@@ -229,7 +229,7 @@ class DeckWindow:
 
 
 def followed_walk(gyro: AllanModel, span_s: float) -> float:
-    """Return K, rad/s / sqrt(s), of a random walk that wanders as much as a gyro's bias does in `span_s` seconds."""
+    """Return K, rad/s / sqrt(s), of a random walk that changes in `span_s` seconds as much as this gyro's bias does."""
     return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
 
 
@@ -239,7 +239,7 @@ def _felt(
     reference: tuple[float, float] | None,
     compared: tuple[Array, Matrix] | None,
 ) -> tuple[Array, Matrix]:
-    """Return the accelerometers' mean (3,) converted to rest at the reference tilt, and its covariance (3, 3)."""
+    """Return the accelerometers' mean (3,) as if at rest with the tilt `reference`, and its covariance (3, 3)."""
     size = found.force_m_s2
     if gradienter is None or reference is None or compared is None:
         up = -found.body_to_ned[:, 2].mean(axis=0)
@@ -253,7 +253,7 @@ def _felt(
 
 
 def _hidden_steps(imu: ImuInput, batches: Sequence[Batch]) -> Array:
-    """Return the variance (6,), vehicle axes, of rounding errors that swaying does not remove, and of shared errors."""
+    """Return the variance (6,), vehicle axes, of rounding that swaying leaves, plus mean `Batch.shared_variance`."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
     means = np.array([batch.mean for batch in batches])
     spread = np.sqrt(means.var(axis=0) + np.mean([batch.variance for batch in batches], axis=0))

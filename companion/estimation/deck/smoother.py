@@ -1,12 +1,12 @@
 """Smoother: gyro biases and the mean direction of up, from minutes of data of an IMU that sways and turns.
 
 The gyros, integrated from second to second, propagate the attitude. In the Earth's axes, the mean specific force is
-gravity, because the effect of waves averages out (`waves`). A drift of the level therefore shows a bias of the
-horizontal gyros; a drift against the compass shows a bias of the vertical gyro. Near the true attitude the readings are
-linear in the unknowns, so weighted least squares is iterated. For constant unknowns, a Kalman smoother gives the same.
+gravity, because the effect of waves averages out (`waves`). If roll or pitch drifts against gravity, the horizontal
+gyros have a bias; if the heading drifts against the compass, the vertical gyro has one. Near the true attitude the
+readings are linear in the unknowns: weighted least squares is iterated. A Kalman smoother of constants gives the same.
 
-Unknowns: the attitude at the start (3), the gyro bias (3), the error of the accelerometers' bias (3), and the compass
-errors with the sine and cosine of the heading (2), which iron on the aircraft causes. If significant, a ramp of the
+Unknowns: attitude at the start (3), gyro bias (3), error of the accelerometers' bias (3), compass error (2). The
+compass error, by iron on the aircraft, is a sine and a cosine of the heading. If significant, a ramp of the
 gyro bias (3) is added. The Earth's rotation is subtracted later, once the latitude is known; `by_earth` is its effect.
 """
 
@@ -32,7 +32,7 @@ from companion.physics.frames import (
 )
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
-"""Assumed Earth's rate to the north, midway between latitudes 0 and 65 deg; the remainder has a linear effect."""
+"""Assumed Earth's rate to the north, midway between latitudes 0 and 65 deg; an error of this rate acts linearly."""
 RAMP_T: Final = 5.0
 """Threshold, in sigmas, for a ramp of the gyro bias; equal to the threshold at rest (`noise.lines`)."""
 _ROUNDS: Final = 7
@@ -63,7 +63,7 @@ class Found:
 
     `gyro_rad_s`: bias at the end of the window, plus `by_earth` (3, 3) times the Earth's rate (NED). `body_to_ned`
     (n + 1, 3, 3): attitudes at the n + 1 ends of the seconds, relative to the compass' north. `heading_sigma_rad`:
-    sigma of the heading at the end of the window, from averaging alone.
+    sigma of the heading at the end of the window, by noise alone.
     """
 
     gyro_rad_s: Array
@@ -199,7 +199,7 @@ class _System:
     def solve(
         self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int
     ) -> tuple[Array, Matrix, Matrix]:
-        """Solve weighted least squares; return values, covariance, effect of Earth's rate. `noise` None: a guess."""
+        """Solve weighted least squares; return values, covariance, effect of Earth's rate. `noise` None: guessed."""
         wander = believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3
         level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
         # (3, n, unknowns + 4): the readings are the last column.

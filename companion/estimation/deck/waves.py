@@ -1,7 +1,7 @@
 """Noise of waves: autoregressive model, whitening of a series by that model, and comparison with the gradienter.
 
-Waves are narrow in frequency and average out far faster than white noise. The noise of a line through waves is the
-error of predicting each value from the past. The model is fitted by Burg's method (Kay, Modern Spectral Estimation,
+Waves are narrow in frequency and average out far faster than white noise. The noise of a line through waves is only the
+error of predicting each value from earlier ones. The model is fitted by Burg's method (Kay, Modern Spectral Estimation,
 1988, section 7.3). A Kalman filter whitens the series; it allows for gaps and the gyros' random walk of angle.
 
 The comparison of accelerometer and gradienter uses the gradienter's law and the lag of its fluid. Both sensors measure
@@ -24,7 +24,7 @@ from companion.physics.gradienter import readings_from_up
 
 MOST_TERMS: Final = 12
 _LEAST_LEFT: Final = 1e-6
-"""Least share of the variance that a prediction may leave: less is beyond numerical precision (a pure sine)."""
+"""Least share of the variance that a prediction leaves; less, as for a pure sine, is beyond numerical precision."""
 _DOUBLINGS: Final = 24
 
 
@@ -68,8 +68,8 @@ def whitened(columns: Floats, waves: Waves, wander: tuple[float, float] = (0.0, 
     """Whiten n rows of readings and regressors (n, c) to unit variance; a row with NaN is a gap.
 
     `wander`: variances of the steps from row to row of two random walks, which are zero at the last row. The first is a
-    walk of angle, caused by the gyros' white noise. The second is a walk of rate, the wander of the gyros' bias, whose
-    sum adds to the angle; the bias is estimated at the last row.
+    walk of angle, caused by the gyros' white noise. The second is a walk of rate, caused by the wander of the gyros'
+    bias; the sum of these rates adds to the angle. The bias is estimated at the last row.
     """
     order = max(len(waves.terms), 1)
     angle, rate, size = order, order + 1, order + 2

@@ -129,7 +129,7 @@ def fit(edges: Floats, counts: Floats, sigma: Floats | None = None) -> Fit:
 
 
 class _State:
-    """Log-likelihood at one point (a, h), its gradient (by_a, by_h), and its inverse information (aa, ah, hh)."""
+    """Log-likelihood for parameters a and h, its gradient (by_a, by_h), and its inverse information (aa, ah, hh)."""
 
     def __init__(self, edges: Floats, counts: Floats, a: Floats, h: Floats, known: NDArray[np.bool_]) -> None:
         z = np.clip(h * edges - a, -1e4, 1e4)
@@ -169,8 +169,8 @@ def integer_columns(
         (m, c) mean of every second;
         (c,) sigma of one second's mean, from the Fisher information;
         (c,) sigma that averaging does not reduce: of an undetermined mean, or from the shape of the noise;
-        (c,) flags of axes whose own readings do not determine the mean; noise of the triad's other axes may;
-        (c,) flags of axes that nothing determines, with readings of zero: the mean is within a step of zero.
+        (c,) flags of axes whose own readings do not determine the mean (the noise of the triad's other axes may);
+        (c,) flags of axes whose mean nothing determines, and which read zero: the mean is within a step of zero.
     """
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
@@ -213,7 +213,7 @@ def integer_columns(
 
 
 def _borrowed(own: Fit, pooled: Floats) -> Floats:
-    """Return the noise (c,) for axes with only two integers: median sigma of the triad's other axes; else NaN."""
+    """Return the noise (c,) of axes that show only two integers: median sigma of the triad's other axes; else NaN."""
     result = np.full(len(own.mean), np.nan)
     enough = ~own.identified & (pooled.sum(axis=0) - pooled.max(axis=0) >= MIN_BEYOND_TWO)
     for triad in (slice(start, start + 3) for start in range(0, len(result), 3)):

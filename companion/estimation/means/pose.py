@@ -25,7 +25,7 @@ from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample
 
 LEVEL_COSINE: Final = math.cos(2.0 * DEG)
-"""Cosine of the largest tilt that counts as level. Data sheets give errors "level" and "tilted", without a limit."""
+"""Cosine of the largest tilt at which a compass counts as level; data sheets state errors "level" and "tilted" only."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +78,8 @@ def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
 def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
     """Return the heading of the vehicle, rad, from the compass' own north (magnetic or true), not wrapped.
 
-    A compass reports the azimuth of its own forward axis. The mounting adds the azimuth that this axis has, at the
-    present tilt, while the vehicle heads north.
+    A compass reports the azimuth of its own forward axis. The mounting adds to this the azimuth that the axis would
+    have, at the present tilt, if the vehicle headed north.
     """
     gamma, theta = roll_pitch_from_up(up)
     forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
@@ -104,7 +104,7 @@ class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
     sigma_deg: float
     from_field: bool = False  # True: computed from the device's field and the gradienter's tilt
     wander_deg: float | None = None
-    """Range of the heading, degrees, while no other sensor showed a turn; None: too few seconds."""
+    """Range of the heading, degrees, since any other sensor last showed a movement; None: too few seconds."""
 
 
 FieldUnit = Literal["gauss", "counts"]
@@ -149,7 +149,7 @@ def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats
 
 
 def _resolution(batches: Sequence[Batch]) -> Floats:
-    """Return the step (c,) of readings with one or two values: their distance, or the last decimal; else 0."""
+    """Return the step (c,) of channels with two values (their difference) or one (its last decimal); of others, 0."""
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
     few = few_distinct(np.array([batch.distinct for batch in batches]))
@@ -181,7 +181,7 @@ class FieldHeading:
         self._tilt = sample
 
     def takes_own(self, sample: CompassSample) -> bool:
-        """Add a heading that the device computed; return true if it is used, and not the one from the field."""
+        """Add a heading that the compass computed; return false if one from its magnetic field is used instead."""
         if self._compass.prefers_field:
             return False
         self._own_s, self.from_field, self.hint = sample.t_s, False, ""

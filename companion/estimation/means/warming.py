@@ -2,7 +2,7 @@
 
 A slope s moves the mean of the next minute by s (T + 60 s) / 2 from the mean over a window of length T. The allowance
 uses the window's slope with its standard error. The time t since power-up limits the slope: a box warms by `WARM_UP_K`
-with an unknown time constant, so its rate is at most WARM_UP_K / (e t). A thermometer gives a lower limit.
+with an unknown time constant, so its rate is at most WARM_UP_K / (e t). A measured temperature rate refines this limit.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Path(msgspec.Struct, frozen=True, kw_only=True):
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
     """Slopes of gyro and accelerometer readings (6,), rad/s^2 and m/s^3, and of the temperature in one window.
 
-    `ramp`: significant slopes, else zero; the reported mean is then the end of the fitted line. `variance`: variance of
-    the slope, with the part's flicker and walk; `UNKNOWN` if the window is too short. `level_variance`: variance of the
-    mean as a prediction for the next minutes, without a ramp. `warm_up`: bias change of gyro and accelerometer if the
-    temperature rises by `WARM_UP_K`, rad/s and m/s^2. `rate`: rate of the temperature, K/s, and its variance; None
+    `ramp`: significant slopes, zero for other axes. With a ramp, the reported mean is the end of the line. `variance`:
+    variance of the slope, with the IMU's flicker and walk; `UNKNOWN` if the window is too short. `level_variance`:
+    variance of a mean, without a ramp, over the next minutes. `warm_up`: bias change of gyro and accelerometer if
+    the temperature rises by `WARM_UP_K`, rad/s and m/s^2. `rate`: rate of the temperature, K/s, and its variance; None
     without a thermometer. `path`: None if the temperature does not change significantly.
     """
 
@@ -85,11 +85,11 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         return 0.0 if self.rate is None or self.path is None else self.rate[0]
 
     def ahead(self, triad: Triad) -> Floats:
-        """Return the reported mean (3,), which is the end of a ramp, minus the mean over the window."""
+        """Return the reported mean minus the mean over the window, (3,); with a ramp, the ramp's end is reported."""
         return self.ramp[rows_of(triad)] * self.half_s
 
     def goes_on(self, triad: Triad) -> tuple[Floats, Floats]:
-        """Return the slope (3,) expected for the next seconds, from a ramp or measured warm-up, and its sigma (3,)."""
+        """Return the bias' slope (3,) expected after the window, by ramp or thermometer, and the slope's sigma (3,)."""
         rows, move = rows_of(triad), self.warm_up[0 if triad == "gyro" else 1]
         prior = np.square(self.rate_k_s * move / WARM_UP_K)
         share = np.where(self.ramp[rows] != 0.0, 1.0, prior / (prior + self.variance[rows] + _TINY))
@@ -109,7 +109,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         return _mean_square(prior, self.slope - self.ramp, self.variance) * (self.half_s + NEXT_S / 2.0) ** 2
 
     def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
-        """Explain that sigma of a gyro is mostly due to warm-up; empty if not. `other_variance` (6,): other causes."""
+        """Explain that a warm-up causes most of a gyro's variance; empty if not. `other_variance` (6,): of the rest."""
         if self.unseen(powered_s)[:3].max() <= other_variance[:3].max():
             return ""
         if self.rate_k_s:

@@ -1,4 +1,4 @@
-"""Means over a still window with realistic sigmas, from its one-second batches.
+"""Means over a window without motion, with realistic sigmas, from one-second batches.
 
 Each mean has two sigmas: `sigma_stat` is the noise that remains after averaging, and `sigma_use` is the expected error
 over the next H seconds (method.md sections 2.2, 2.4, 2.5 and 3.2).
@@ -43,18 +43,18 @@ _ALLAN_SPANS: Final = 5
 RAW_BATCHES: Final = 10  # Least seconds of floats, beside integers, that show their own scatter
 RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
 SPOT_WALK: Final = np.repeat([0.0, 0.04 * MG], 3)
-"""Random walk of an unknown accelerometer due to the ground's tilt and the temperature, unit / sqrt(s), in addition to
-the part's own walk. With it, sigma equals the errors of a VN-100 on a desk and three times those of ten Movella DOT."""
+"""Random walk (6,) of an unknown IMU by tilt of the ground and temperature, unit / sqrt(s), beside the IMU's own walk.
+With this walk, sigma equals the errors of a VN-100 on a desk, and three times the errors of ten Movella DOT."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
-"""Share of the usual sample count below which a second lost samples; above it, the 1 s grid causes the shortage."""
+"""Share of the usual sample count: a second with less has lost samples; a smaller shortage is due to the 1 s grid."""
 _GUESSED_FLOOR: Final = 2.56
-"""Margin on the variance of a slope if flicker and walk are estimated from residuals of the line. Chance slopes of ten
-Movella DOT stay below the limit; the warm-up of a PX4 board (sample.ulg) exceeds it."""
+"""Factor on the variance of a slope, if flicker and walk are estimated from the line's residuals. With this factor,
+chance slopes of ten Movella DOT do not count as ramps; the warm-up of a PX4 board (sample.ulg) does."""
 _MOST_WANDER: Final = 0.5  # Largest wander about a ramp, over the change by the ramp in the same time
 _ALLAN_SIGNIFICANT: Final = 3.0
-"""Threshold for Allan variance at T/5 over that of white noise: upper 5 % point for about four degrees of freedom."""
+"""Threshold: Allan variance at 1/5 of the window, over that of white noise; 5 % point of some 4 degrees of freedom."""
 
 
 class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,12 +78,12 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of one IMU over one still window, in the vehicle's axes (FRD).
+    """Means of one IMU over one window without motion, in the vehicle's axes (FRD).
 
-    `drifting`: warnings that a bias curve over temperature may explain. `hidden`: triads with too little noise to
-    spread their integers, so that a mean is good to half a step only. `useless`: triads that are no measurement. On a
+    `drifting`: warnings of drift, omitted later if a bias curve explains it. `hidden`: texts, by triad, on a noise too
+    small to spread the integers: the mean is good to half a step only. `useless`: triads whose mean is unknown. On a
     deck only: `covariance` (6, 6) of all axes, and `by_earth` (3, 3), the share of the Earth's rate ahead, right and
-    down in the gyro means. `mounting`: rows of the rotation from the sensor's axes.
+    down in the gyro means. `mounting`: rows of the rotation from the sensor's to the vehicle's axes.
     """
 
     name: str
@@ -111,9 +111,9 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Window(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of all sensors over one window. `powered_s`: least time since power-up of each IMU, s, at its end.
+    """Means of all sensors over one window. `powered_s`: least time from power-up of each IMU to the window's end, s.
 
-    `turn_rad_s`: mean rate of a deck's turn, about the axis that is vertical by gradienter readings without an offset.
+    `turn_rad_s`: mean rate of a deck's turn about the vertical, which is computed from raw gradienter readings.
     """
 
     start_s: float
@@ -131,10 +131,9 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """Estimate of one IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2.
 
-    `undecided`: integers do not determine the mean yet; more seconds may bring the rare reading that does. `useless`:
-    the mean is only known to be less than a step. `half_step`: floats with fewer than 3 distinct readings. `white`:
-    white noise N, the larger of measurement and profile. `white_variance`: part of `use_variance` that more seconds
-    reduce.
+    `undecided`: integers do not determine the mean yet; rare integers in later seconds may. `useless`: the mean is only
+    known to be within a step of zero. `half_step`: floats with fewer than 3 distinct readings. `white`: white noise N,
+    the larger of the measured one and the profile's. `white_variance`: part of `use_variance` that more seconds reduce.
     """
 
     mean: Floats
@@ -220,14 +219,14 @@ def estimate(
 
 
 def _dominates(slots: NDArray[np.int64], values: Floats, slope: Floats) -> NDArray[np.bool_]:
-    """Return (c,) true if a line changes more than readings wander about it, in 1/5 of the window; not for a step."""
+    """Return (c,) true if, in 1/5 of the window, a line changes more than readings wander about it; a step: false."""
     left = values - slope * (slots - slots.mean())[:, None]
     excess, span = _excess(slots, left, white_noise(slots, left))
     return np.asarray(excess < np.square(slope * span * _MOST_WANDER))
 
 
 def _learned(slots: NDArray[np.int64], values: Floats, least: Floats) -> tuple[Floats, Floats]:
-    """Return flicker B and random walk K (c,) of an unknown part, whose white noise N is at least `least`."""
+    """Return flicker B and random walk K (c,) of an IMU of unknown type, whose white noise N is at least `least`."""
     white = np.maximum(white_noise(slots, values), least)
     parts = [learned_floor(slots, values[:, rows_of(triad)], white[rows_of(triad)]) for triad in TRIADS]
     flicker, walk = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -235,13 +234,13 @@ def _learned(slots: NDArray[np.int64], values: Floats, least: Floats) -> tuple[F
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
-    """Return flicker B (c,): the larger of profile and measured excess of Allan deviation at T/5 over white noise."""
+    """Return flicker B (c,): the larger of the profile's B and B by the excess of Allan variance (`_excess`)."""
     excess, _ = _excess(slots, values, white)
     return np.maximum(np.sqrt(excess) / FLOOR_OF_FLICKER, profile)
 
 
 def _excess(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, int]:
-    """Return the excess (c,) of the Allan variance at T/5 over white noise, zero if not significant; and T/5, s."""
+    """Return the excess (c,) of Allan variance over white noise at 1/5 of the window (0: by chance); and 1/5, s."""
     span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
     if span < 2:
         return np.zeros(values.shape[1]), span

@@ -4,9 +4,9 @@ One axis has white noise N (unit * sqrt(s)), flicker B (unit; the floor of the A
 random walk K (unit / sqrt(s)). Sources: method.md section 2.2; IEEE Std 952.
 
 A recording of a sensor at rest determines N, B and K, each with its error. The method is maximum likelihood of the
-overlapping Allan variances at averaging times t of 1, 2, 4, ... 256 s. A calibration needs no longer times, and within
-them a drift or a bounded wander has its effect on a calibration. The Allan variance at t is N^2 / t + (2 ln 2 / pi) B^2
-+ K^2 t / 3. Each t counts as length / (2 t) independent squares: those of Haar's wavelets, which hold all information.
+overlapping Allan variances at averaging times t of 1, 2, 4, ... 256 s. A calibration needs no longer times: a drift or
+bounded wander affects it through these times only. The Allan variance at t is N^2 / t + (2 ln 2 / pi) B^2 + K^2 t / 3.
+Each t counts as length / (2 t) independent squares: those of Haar's wavelets, which hold all information.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from companion.physics.units import DEG_H, MG
 FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor  # Allan deviation of pure flicker noise over B: 0.664
 
 _FLOOR_REACHED_S: Final = 1000.0
-"""Time, s, at which the assumed random walk K reaches the flicker floor: catalogues lack K (method.md section 2.2)."""
+"""Averaging time, s, at which an assumed K equals the flicker floor: catalogues state no K (method.md section 2.2)."""
 WARM_UP_K: Final = 20.0  # Temperature rise of a board with processor and radio; two sigma
 WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
 """Warm-up bias change of an unknown part, from a BMI088's gyro and a BMI160's accelerometer (method.md section 2.1)."""
 
 
 def allan_model(white: float, floor: float, walk: float | None = None) -> AllanModel:
-    """Make a model from white noise N, Allan floor A (0.664 B) and random walk K; None assumes K for a data sheet."""
+    """Make a model of white noise N, Allan floor A (0.664 B) and random walk K; None: assumed, data sheets lack it."""
     walk = floor * math.sqrt(3.0 / _FLOOR_REACHED_S) if walk is None else walk
     return AllanModel(white, floor / FLOOR_OF_FLICKER, walk)
 
@@ -76,10 +76,10 @@ PROFILES: Final[dict[str, NoiseProfile]] = {
 
 
 def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
-    """Return the given profile, or the catalogue's profile of a named part; None: the cautious one of an unknown part.
+    """Return the given profile, or the catalogue's profile of a sensor type by its name; None: the profile "unknown".
 
     Raises:
-        ConfigError: the catalogue has no part of this name.
+        ConfigError: the catalogue has no sensor type of this name.
     """
     if isinstance(profile, NoiseProfile):
         return profile
@@ -105,7 +105,7 @@ def phi(ratio: Floats | float) -> Floats:
 def floor_variance(
     flicker: Floats | float, walk: Floats | float, mean_s: Floats | float, horizon_s: Floats | float
 ) -> Floats:
-    """Return the prediction variance V(T, H) without white noise, which is the only term that averaging reduces."""
+    """Return the prediction variance V(T, H) without its white-noise term (the only one that averaging reduces)."""
     mean_s = np.asarray(mean_s, dtype=np.float64)
     return np.asarray(
         np.square(flicker) / math.pi * phi(horizon_s / mean_s) + np.square(walk) * (mean_s + horizon_s) / 3.0
@@ -163,7 +163,7 @@ def student_ratio(freedom: float) -> float:
 
 
 def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
-    """Return white noise N (c,) from the Allan deviation between neighbouring seconds, widened if these are few.
+    """Return white noise N (c,) from the Allan deviation between neighbouring seconds; if these are few, N is enlarged.
 
     Without neighbouring seconds (a gradienter slower than 1 Hz), the scatter of the means is used.
     """
@@ -184,9 +184,9 @@ _WALKS_S: Final = np.array([30.0, 100.0, 300.0, 1000.0])  # Averaging times at w
 
 
 def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, Floats]:
-    """Estimate flicker B and random walk K, (3,) each, of a triad of an unknown part from one window.
+    """Estimate flicker B and random walk K, (3,) each, of a triad of unknown type from one window.
 
-    One ratio of Allan floor A to white noise N holds for all three axes. Its prior comes from common parts, and its
+    One ratio of Allan floor A to white noise N holds for all three axes. Its prior comes from common sensors, and its
     likelihood from the window's Allan variances. V(T, H) is linear in B^2 and K^2, so their posterior means suffice.
     `slots` (m,): ascending seconds. `values` (m, 3): means of these seconds. `white` (3,): N.
     """
@@ -210,7 +210,7 @@ def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tu
 # --- from recordings
 
 KNOWN_SIGMAS: Final = 2.0
-"""Ratio of a squared noise figure to its standard error from which the figure counts as known, within 25 %."""
+"""Threshold for N^2, B^2 or K^2 over its standard error; above it, N, B or K counts as known, within 25 %."""
 UPPER_SIGMAS: Final = 1.645  # One-sided 95 %: upper limit of an unknown figure
 LEAST_SLOTS: Final = 8  # Least seconds of a stretch: a shorter one shows white noise only
 LONGEST_S: Final = 256
@@ -234,7 +234,7 @@ class AllanCurve(NamedTuple):
 
 
 class AxisFit(msgspec.Struct, frozen=True):
-    """Noise N, B, K of one axis, fitted to recordings; in the axis' unit times sqrt(s), 1, and over sqrt(s).
+    """Noise of one axis, fitted to recordings: N in unit * sqrt(s), B in unit, K in unit / sqrt(s).
 
     `sigmas`: standard errors of the squares N^2, B^2, K^2. `upper`: one-sided 95 % limits of N, B, K, infinite if the
     recordings are too short. `known`: true for each of N, B, K that the recordings determine.
@@ -247,10 +247,10 @@ class AxisFit(msgspec.Struct, frozen=True):
 
 
 def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> AllanCurve:
-    """Compute the Allan variances of several stretches; each is ascending seconds (m,) and their means (m, c).
+    """Compute the Allan variances of several recordings, each with ascending seconds (m,) and their means (m, c).
 
     Raises:
-        ValueError: every stretch is too short.
+        ValueError: every recording is too short.
     """
     rows = []
     for slots, values in stretches:
@@ -289,7 +289,7 @@ def fit_axis(found: AllanCurve, column: int) -> AxisFit:
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.diag(1e-12 * np.diag(information))))))
 
     def upper(which: int) -> float:
-        """Find the upper 95 % limit of one square: if it were true, so low an estimate would have 5 % probability."""
+        """Find the upper 95 % limit of N^2, B^2 or K^2: a true value that gives so low an estimate in 5 % of cases."""
         limit = theta.copy()
         for _ in range(_UPPER_ROUNDS):
             before = limit[which]

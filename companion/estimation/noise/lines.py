@@ -5,11 +5,11 @@ is the median absolute deviation. It uses one-second means, never samples, becau
 worse than their mean (method.md section 2.4). Sources: Huber, Annals of Mathematical Statistics 35 (1964) 73-101;
 Yohai, Annals of Statistics 15 (1987) 642-656 (the step); Beaton and Tukey, Technometrics 16 (1974) 147-185 (weights).
 
-A line's slope may be a warm-up, whose end is the best estimate, or chance and the part's own wander (section 2.4). An
-untested line costs more than it gains: its end has four times the variance of a mean, and a wandering bias returns. A
-slope must therefore exceed both the effect of white noise and the effect of the part's flicker and random walk.
+If a slope is a warm-up, the line's end is the best estimate. A slope can also be chance, or the sensor's own wander
+(section 2.4). An untested line costs more than it gains: its end has four times a mean's variance, and a wandering
+bias returns. A slope must therefore exceed both the effect of white noise and that of the sensor's flicker and walk.
 
-The slope of a turn (`fit_slope`) has three uncertainties (method.md section 2.6): white noise of the one-second means,
+A slope that measures a turn (`fit_slope`) has three uncertainties (method.md section 2.6): white noise of the means,
 slow wander, and coarse steps, which may hide a slope. The Allan deviation of the readings shows the slow wander.
 """
 
@@ -34,8 +34,8 @@ from companion.physics.statistics import MAD_TO_SIGMA, student_quantile
 
 HUBER_C: Final = 1.345
 BIWEIGHT_C: Final = 6.0
-"""Distance from the centre, in robust sigmas, from which `robust_mean` ignores a value. Simulation of 60 values: clean
-data lose 2.2 % of variance (Huber's mean: 5 %). A knock in 5 % of the values costs 4 % of sigma instead of 26 %."""
+"""Distance from the centre, in robust sigmas, from which `robust_mean` ignores a value. Simulation of 60 values: on
+clean data, variance grows by 2.2 % (Huber's mean: 5 %); with a knock in 5 % of values, sigma by 4 % (Huber: 26 %)."""
 STANDS_OUT: Final = 4.5  # Distance from Huber's mean, in robust sigmas, from which a value may be a knock
 _MEAN_ABS_TO_SIGMA: Final = 1.2533
 _EQUAL: Final = 1e-6
@@ -46,15 +46,15 @@ RAMP_T: Final = 5.0
 """Threshold for the t statistic of a slope that counts as a ramp; higher in a short window. On sensors without a ramp,
 a lower threshold costs more than it gains (method.md section 2.4)."""
 RAMP_FLOORS: Final = 3.0
-"""Threshold for a ramp, in sigmas of the slope that the part's flicker and random walk cause. In one minute of an
-ADIS16405's accelerometer, flicker alone makes 8 % of slopes exceed |t| = 5; their ends add 12 % to the rms error."""
+"""Threshold for a ramp, in sigmas of the slope that the sensor's flicker and walk cause. In one minute of an
+ADIS16405's accelerometer, flicker alone makes 8 % of slopes exceed |t| = 5; their lines' ends add 12 % rms error."""
 RAMP_BATCHES: Final = 8  # Least seconds for a line
 _ONE_IN_10000: Final = 3.8906  # Two-sided normal quantile for one case in 10 000
 
 FEWEST: Final = 3
 _SPANS: Final = 5
 _WALKS: Final = 2.5
-"""Allan variance over that of white noise from which a random walk is assumed; white noise exceeds it once in 40."""
+"""Ratio of Allan variance to that of white noise, above which a walk is assumed; white noise exceeds it once in 40."""
 _LINE_TAKES: Final = 1.6  # Allan variance of a random walk at T/5, before over after subtraction of a line
 
 
@@ -62,7 +62,7 @@ _LINE_TAKES: Final = 1.6  # Allan variance of a random walk at T/5, before over 
 
 
 def _scale(residual: Floats) -> Floats:
-    """Return a robust sigma (c,) of residuals (m, c); the mean deviation if most are equal except for rounding."""
+    """Return a robust sigma (c,) of residuals (m, c): by their median size, or by the mean if that is only rounding."""
     size = np.abs(residual)
     mad = MAD_TO_SIGMA * np.median(size, axis=0)
     mean = _MEAN_ABS_TO_SIGMA * size.mean(axis=0)
@@ -79,7 +79,7 @@ def _weights(residual: Floats, scale: Floats, c: Floats | float) -> Floats:
 def huber_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | float = 0.0) -> Floats:
     """Return Huber's robust mean (c,) of m >= 1 values in each column of (m, c).
 
-    A value farther than `c` robust sigmas has less weight. The robust sigma is at least `least`. Both: scalar or (c,).
+    `c`: robust sigmas beyond which a value has less weight. `least`: lower limit of the robust sigma. Scalars or (c,).
     """
     centre = np.median(values, axis=0)
     scale = np.maximum(_scale(values - centre), least)
@@ -225,10 +225,10 @@ def plain_slope(times: NDArray[np.int64], values: Floats) -> float:
 
 
 def _wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Floats, Floats]:
-    """Estimate flicker B, or else random walk K, of residuals (c,) from the Allan deviation at T/5 over white noise.
+    """Estimate flicker B, or instead random walk K, (c,), from the residuals' Allan deviation at 1/5 of the window.
 
-    The result is widened if spans are few. No sigma includes a walk too small to show in one window. For example, K =
-    0.1 N per s doubles the error of a minute's slope, while its Allan variance is half that of the white noise.
+    The estimate is enlarged if it has few averages. No sigma includes a walk too small to show in one window: K = 0.1 N
+    per s doubles the error of a minute's slope, but the walk's Allan variance is half that of the white noise.
     """
     span = int(slots[-1] - slots[0] + 1) // _SPANS
     if span < 2:
@@ -243,7 +243,7 @@ def _wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[F
 
 
 def hidden_by_steps(step: float, variance: float, *, enough: bool = True) -> float:
-    """Return the largest error (+/-) of the mean of readings rounded to `step` (0 for floats), from their variance.
+    """Return the largest error (+/-) of a mean of readings rounded to `step` (0: floats); `variance`: of the readings.
 
     It is (q / pi) exp(-2 pi^2 sigma^2 / q^2) for step q (method.md section 2.5), at most half a step. If values are too
     few (not `enough`), it is half a step.

@@ -1,1 +1,1 @@
-"""One-second batches of samples, and turns counted from samples."""
+"""One-second batches of samples, and turns of the aircraft integrated from gyro samples."""

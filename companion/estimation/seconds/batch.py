@@ -24,7 +24,7 @@ MAX_LEVELS: Final = 1024
 
 _EVEN: Final = 1.4999  # Counter steps within this ratio of each other count as one sample each
 _OFF_BEAT: Final = 0.25
-"""Largest distance of a counter step, in usual steps, from a whole number: lost samples skip whole steps."""
+"""Largest deviation of a counter step from a multiple of the usual step, in usual steps: a loss skips whole steps."""
 _MOST_OFF_BEAT: Final = 0.2
 """Share of irregular steps above which stamps do not show losses, because the sender sends only some samples."""
 _LEAST_OF_A_PART: Final = 3
@@ -52,8 +52,8 @@ class Batch(msgspec.Struct, frozen=True):
     `white`: white-noise part of the variance, half the mean square of successive differences (von Neumann). `missing`:
     number of lost samples by the device's counter or clock, None if neither counts samples. `counts`: histogram of
     integers; None for floats, and for a range above `MAX_LEVELS`. `allan` (k, c): Allan variances at averaging times of
-    1/2, 1/4 ... 1/32 s, if that is three samples or more. `shared_variance` (6,): variance of an error that all samples
-    of an IMU share, in this second and others.
+    1/2, 1/4 ... 1/32 s that contain three samples or more. `shared_variance` (6,): variance of an error common to all
+    samples of an IMU, which no averaging reduces.
     """
 
     slot: int
@@ -84,7 +84,7 @@ def summary(
     steps: Floats | None = None,
     shared_variance: Floats | None = None,
 ) -> Batch:
-    """Summarise the rows (n, c), n >= 1, of one second. `circle`: unrolled angles. `steps` (c,): LSB of integers."""
+    """Summarise rows (n, c), n >= 1, of one second. `circle`: rows are unrolled angles. `steps` (c,): integers' LSB."""
     n = len(rows)
     ordered = np.sort(rows, axis=0)
     distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
@@ -111,7 +111,7 @@ def summary(
 
 
 def _allan_within(off: Floats) -> Floats:
-    """Return Allan variances (k, c) of one second's rows (n, c): over 1/2, 1/4 ... of it, at least 3 rows each."""
+    """Return Allan variances (k, c) of one second's rows (n, c) at 1/2, 1/4 ... s that contain at least 3 rows."""
     firsts, sizes = _parts_of(len(off))
     depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))
@@ -153,7 +153,7 @@ def unrolled(rows: Floats) -> Floats:
 
 
 def _fresh(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
-    """Return (n,) false for rows that repeat stamp and values of an earlier row, as if sent over a second route.
+    """Return (n,) false for rows that repeat stamp and values of an earlier row: samples that arrive by two routes.
 
     An equal stamp alone is not enough: counters wrap, and some devices' clocks do not advance.
     """
@@ -184,7 +184,7 @@ def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
     """Return true if a channel's lowest or highest value is by far its most frequent one: the end of its range.
 
     Noise rarely reaches its extremes, so many equal values there show the end of the range. Few distinct values prove
-    nothing: the quantised stream of a still sensor has few. Of 50 integers, the lowest is sometimes the most frequent
+    nothing: the quantised stream of a sensor at rest has few. Of 50 integers, the lowest is sometimes the most frequent
     by chance, so its count must exceed the next by four standard deviations.
     """
     if len(ordered) <= _PINNED_SAMPLES:
@@ -213,7 +213,7 @@ def decimal(low: Floats, high: Floats) -> Floats:
 
 
 def few_distinct(distinct: Floats | NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (c,) true if noise does not spread a channel: at most 2 values a second, by their number (m, c)."""
+    """Return (c,) true for channels with at most 2 values in each second; `distinct` (m, c): number of values."""
     return np.asarray(distinct.max(axis=0) < 3)
 
 

@@ -1,8 +1,8 @@
 """Turn of an aircraft at its place, from gyro samples integrated as rotations.
 
-Somebody who turns an aircraft also tilts it. Simulated for half a turn, scales of 1 % and axes 0.5 deg from square, the
-integral of the rate about down is wrong by 0.5 deg at a tilt of 4 deg, by 5 deg at 12 deg. With all three axes it is
-wrong by 0.05 and 0.1 deg. The gyros' scale error of 1.8 deg remains; a closed circle shows it (`align_model`).
+Somebody who turns an aircraft also tilts it. Simulation of half a turn, gyro scales wrong by 1 %, axes 0.5 deg from
+square: the integral of the rate about down is wrong by 0.5 deg at a tilt of 4 deg, by 5 deg at 12 deg. Rotations by all
+three axes are wrong by 0.05 and 0.1 deg. The gyros' scale adds 1.8 deg, which a full circle shows (`align_model`).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from companion.samples import ImuSample
 MAX_SAMPLES: Final = 60_000  # Ten minutes at 100 Hz, 2.4 MB, since the last pose; a longer turn is not counted
 LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
-"""Longest gap beyond the sample interval, s: an aircraft that is turned at 60 deg/s moves 3 degrees in that time."""
+"""Longest gap between samples beyond the usual interval, s: an aircraft turned at 60 deg/s moves 3 degrees in it."""
 AT_REST_S: Final = 0.5  # Longest gap at rest: a turn from rest to rest takes longer
 LATE_S: Final = 0.05
-"""Largest delay of a sample, s. If the clocks differ by more, their rates are unequal, as with a slow simulator."""
+"""Largest delay of a sample, s. Beyond it, host's and device's clocks run at different rates (a slow simulator)."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
-"""Sigma of each turn from non-orthogonal gyro axes while the aircraft is tilted; without scale and time stamps."""
+"""Sigma of each turn by non-orthogonal gyro axes while the aircraft is tilted; errors of scale and time stamps add."""
 
 
 class Counted(NamedTuple):
-    """Turn about the vehicle's z axis, clockwise from above, not wrapped, with one sigma without the gyros' scale."""
+    """Turn about the vehicle's z axis, clockwise from above, not wrapped; sigma excludes the gyros' scale error."""
 
     angle_rad: float
     sigma_rad: float
@@ -50,9 +50,9 @@ class TurnCounter:
     def counted(
         self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix, cut_rad_s: float = 0.0
     ) -> Counted | None:
-        """Integrate the turn between two times at rest, and drop older samples; None if samples are missing.
+        """Integrate the turn between two instants at rest, and drop older samples; None if samples are missing.
 
-        `bias_rad_s` (3,): gyro bias in the vehicle's axes. `cut_rad_s`: step of integers truncated toward zero.
+        `bias_rad_s` (3,): gyro bias, vehicle axes. `cut_rad_s`: step of rates that are truncated toward zero; else 0.
         """
         rows = np.array(self._samples).reshape(-1, 5)
         old = int(np.searchsorted(rows[:, 0], start_s))
