@@ -47,7 +47,7 @@ Phase = Literal["ground", "flight"]
 
 LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
-"""Largest deviation of specific force from g, as a share of g, at which a self-levelling compass is used."""
+"""Largest difference of specific force from g, as a share of g, at which a self-levelling compass is used."""
 STEADY_RAD_S: Final = math.radians(20.0)  # Largest rate at which the compass is used
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
@@ -56,8 +56,8 @@ KEPT_S: Final = 2.0  # Span of orientations stored for late compass readings
 FORCE_SMOOTHED_S: Final = 1.0
 """Averaging time of the specific force's length, s; longer than vibration and gusts."""
 DOUBTED_SHARE: Final = 0.03
-"""Deviation of specific force from g, as a share, that halves its weight: three times accelerometers' scale error. In a
-turn beyond 15 degrees of bank, levelling would add more tilt error than a calibrated gyro's drift."""
+"""Difference of specific force from g, as a share of g, that halves the force's weight: three times the scale error of
+accelerometers. In a turn beyond 15 degrees of bank, levelling adds more tilt error than a calibrated gyro's drift."""
 _UP: Final = (0.0, 0.0, -1.0)
 
 TAU_S: Final = 9.0
@@ -69,7 +69,7 @@ FIRST_S: Final = 0.1  # Time span assigned to the first reading
 BADLY: Final = 1.5
 """Ratio of heading sigma to compass sigma above which the heading counts as poorly known."""
 REFUSED_S: Final = 20.0
-"""Time of continuously rejected compass readings after which the companion stops sending the heading, s."""
+"""Time, s, in which all compass readings are rejected, after which the companion stops sending the heading."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +118,7 @@ class Leveller:
     def update(self, force_m_s2: Triple, span_s: float, tau_s: float) -> float:
         """Add the mean specific force (3,) over `span_s`, in frame E (nearly NED); return its weight, at most 1.
 
-        The filter is a second-order Butterworth low-pass with natural frequency sqrt(2) / tau, so tau may change.
+        The filter is a second-order Butterworth low-pass with natural frequency sqrt(2) / tau; tau can change.
         """
         x, y, z = force_m_s2
         length = math.sqrt(x * x + y * y + z * z)
@@ -186,7 +186,7 @@ class AttitudeEstimator:
         self._leveller = Leveller(settings.gravity_m_s2)
 
     def settle(self, settings: AttitudeSettings) -> None:
-        """Switch to a newer calibration; keep the attitude, and restart the gyro bias' sigma."""
+        """Switch to a newer calibration; keep the attitude, and restart the covariance of the gyro bias from it."""
         kept = self._uncertainty.attitude
         self._settle(settings)
         self._leveller.gravity_m_s2 = settings.gravity_m_s2
@@ -238,9 +238,9 @@ class AttitudeEstimator:
     def update(
         self, samples: Sequence[ImuSample], *, phase: Phase, still: bool = False, airspeed_m_s: float | None = None
     ) -> None:
-        """Process samples, in the sensor's axes and in order of time; they are ignored before an alignment.
+        """Process samples, in the sensor's axes and in order of time; before an alignment, samples are ignored.
 
-        `still` lets the gyro biases be refined; `airspeed_m_s` corrects the centripetal acceleration (omega x V).
+        `still`: motionless, so that gyro biases are refined. `airspeed_m_s`: subtract omega x V from specific force.
         """
         if not self._aligned:
             return
@@ -315,7 +315,7 @@ class AttitudeEstimator:
     # --- compass
 
     def add_heading(self, t_s: float, heading_true_rad: float, sigma_rad: float) -> bool:
-        """Correct the heading by a self-levelling compass' reading of the time `t_s`; return True if it was used."""
+        """Correct the heading by a self-levelling compass' reading of time `t_s`; return True if it was accepted."""
         found = self.kept_at(t_s)
         if found is None or self._leveller.doubt > STEADY_SHARE:
             return False
@@ -335,7 +335,7 @@ class AttitudeEstimator:
         return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return time and attitude (body to NED, newest levelling) of the last step up to `t_s`; None: not stored."""
+        """Return time and attitude (body to NED, newest levelling) at the last stored time up to `t_s`, or None."""
         for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:
                 return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)

@@ -20,7 +20,7 @@ _NO_LENGTH = 1e-150
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the product p q, the rotation by q followed by that by p."""
+    """Return the product p q: the rotation by q, followed by the rotation by p."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return (

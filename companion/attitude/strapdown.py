@@ -33,7 +33,7 @@ STEP_S: Final = 0.02  # Length of the steps over which specific force is average
 TURN_S: Final = 0.004
 """Longest time between two rotations of specific force into frame E (nearly NED): 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
-"""Longest gap between samples, s, that is integrated as usual; a longer one counts as `missing_s`."""
+"""Longest gap between samples, s, without consequence; longer gaps add up as `missing_s`."""
 _ROUNDING_S: Final = 1e-6
 _ANGLE_SQUARE: Final = 1e6
 _FORCE_SQUARE: Final = 1e8
@@ -43,7 +43,7 @@ LOST_S: Final = 1.0
 
 
 class MotionStep(NamedTuple):
-    """Motion over about `STEP_S`: mean specific force, mean rotation rate, and orientation at the end."""
+    """Motion in an interval of about `STEP_S`: mean specific force, mean rotation rate, and orientation at its end."""
 
     t_s: float
     span_s: float
@@ -54,7 +54,7 @@ class MotionStep(NamedTuple):
 
 
 class Strapdown:
-    """Integrator of one IMU's rates in sensor axes; `orientation` rotates from there to frame E (nearly NED)."""
+    """Integrator of one IMU's rates in sensor axes; `orientation` rotates from sensor axes to frame E (nearly NED)."""
 
     def __init__(self) -> None:
         self.orientation: Quaternion = IDENTITY
@@ -146,7 +146,7 @@ SCALE_SHARE: Final = 0.003
 GAP_RATE_RAD_S: Final = math.radians(20.0)
 """Assumed error of the rotation rate while samples were missing."""
 MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
-"""Horizontal acceleration of the aircraft that remains after averaging and does not change the force's length."""
+"""Horizontal acceleration of the aircraft that averaging leaves and the specific force's length does not show."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
 _BIAS_WANDERS_S: Final = 300.0
@@ -156,7 +156,7 @@ _BIAS_WANDERS_S: Final = 300.0
 class Uncertainty:
     """Covariance of the attitude error and of the gyro bias error.
 
-    `bias_covariance` (3, 3) is the calibrated gyro bias', in sensor axes. An accelerometer bias adds a constant tilt.
+    `bias_covariance` (3, 3) is for the calibrated gyro bias, in sensor axes. Accelerometer bias adds a constant tilt.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class Uncertainty:
         self._turned = np.zeros(3)
 
     def propagate(self, span_s: float, ned_from_sensor: Matrix, turned_rad: Array, missing_s: float) -> None:
-        """Add the errors of a span of time in which the sensor turned by `turned_rad` (3,) about its own axes."""
+        """Add the errors that arise in `span_s` while the sensor turns by `turned_rad` (3,) about its own axes."""
         step = np.eye(6)
         step[:3, 3:] = -span_s * ned_from_sensor
         self._covariance = step @ self._covariance @ step.T
@@ -212,11 +212,11 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
-        """Return one sigma (3,) of the mean rate measured over a rest of `seconds`, in sensor axes."""
+        """Return one sigma (3,), in sensor axes, of the mean rate that gyros measure in `seconds` at rest."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:
-        """Update the covariance with a rest of `seconds`; return the gain (6, 3) for the mean rate in sensor axes."""
+        """Update the covariance after `seconds` at rest; return the gain (6, 3) for the mean rate in sensor axes."""
         variance = self._rest_variance(seconds)
         part = self._covariance[:, 3:]
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T

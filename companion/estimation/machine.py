@@ -6,7 +6,7 @@ import enum
 from typing import Final
 
 LONGEST_S: Final = 1e6
-"""Longest time limit that a request may have, s."""
+"""Time limits in a request, s, must be below this value."""
 
 
 class What(enum.Enum):
@@ -52,7 +52,7 @@ class State(enum.Enum):
 
     @property
     def shown(self) -> str:
-        """Coarser name for other programs: restarting and settling count as verifying, undoing as writing."""
+        """Coarser name for other programs: restarting and settling appear as verifying, undoing as writing."""
         return _SHOWN.get(self, self).value
 
     @property

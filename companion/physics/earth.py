@@ -30,7 +30,7 @@ CompassUse = Literal["good", "poor", "none"]
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
     """Return normal gravity by Somigliana's formula (WGS 84; method.md section 3.6).
 
-    The height is above the ellipsoid. Height above sea level will do: it differs by at most 100 m, or 31 micro-g.
+    The height is above the ellipsoid. Height above sea level also serves: it differs by at most 100 m, or 31 micro-g.
     """
     s2 = math.sin(latitude_deg * DEG) ** 2
     surface = 9.7803253359 * (1 + 0.00193185265241 * s2) / math.sqrt(1 - 0.00669437999014 * s2)
@@ -46,7 +46,7 @@ def earth_rate_ned_rad_s(latitude_deg: float) -> Array:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class MagneticField:
-    """Magnetic field of the Earth at a place by WMM2025; the sigmas are the model's own, crust and sun included."""
+    """Magnetic field of the Earth at a place by WMM2025; the model's own sigmas include effects of crust and sun."""
 
     declination_deg: float  # East positive: true heading = magnetic heading + declination
     inclination_deg: float  # Down positive: 90 at the north magnetic pole, -90 at the south

@@ -88,7 +88,7 @@ def rotations(vectors: Floats) -> Floats:
 
 
 def running_products(turns: Floats) -> Floats:
-    """Return the products of the first 1 to n matrices (n, 3, 3), in a few numpy calls (Hillis and Steele's scan)."""
+    """Return products of the first 1, 2, ... n matrices (n, 3, 3), in a few numpy calls (Hillis and Steele's scan)."""
     found, step = turns.copy(), 1
     while step < len(found):
         found[step:] = found[:-step] @ found[step:]

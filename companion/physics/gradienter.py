@@ -1,8 +1,8 @@
 """Conversion between attitude and the two readings of a gradienter (two-axis tilt sensor).
 
 Equation (1) of the method's paper holds only for a sensor whose outputs are the elevations of its own axes. A liquid
-cell reads the slope of the liquid's surface, and many modern devices give Euler angles. The wrong law costs 0.15
-degrees (2.6 mg) at 10/10 degrees (method.md section 1.2). The law is therefore a property of the sensor:
+cell reads the slope of the liquid's surface, and many modern devices give Euler angles. The wrong law causes 0.15
+degrees of error (2.6 mg) at 10/10 degrees (method.md section 1.2). The law is therefore a property of the sensor:
 
 | law     | outputs for (theta, gamma)                       | recovered by                                     |
 |---------|--------------------------------------------------|--------------------------------------------------|

@@ -15,11 +15,11 @@ from companion.physics.frames import Array
 from companion.physics.units import DEG
 
 BOUND_OF_TWO: Final = 3.043
-"""95 % bound of an unknown third component over the length of the two known ones, if all have the same sigma. Student's
-t with two degrees of freedom gives it, 4.303 / sqrt(2). A direction uniform on the sphere gives the same value,
-0.95 / sqrt(1 - 0.95^2)."""
+"""Ratio of the 95 % bound of an unknown third component to the length of the two known ones; all have the same sigma.
+Student's t with two degrees of freedom gives the ratio 4.303 / sqrt(2). A direction uniform on the sphere gives the
+same value, 0.95 / sqrt(1 - 0.95^2)."""
 BOUND_OF_ONE: Final = 12.71
-"""95 % bound of an unknown component over the only known one: Student's t with one degree of freedom."""
+"""Ratio of the 95 % bound of an unknown component to the only known one: Student's t, one degree of freedom."""
 _VERTICAL: Final = 1e-9
 
 
@@ -44,8 +44,8 @@ def heading_rad(field: Array, up: Array) -> float:
 def heading_by_up(field: Array, up: Array) -> Array:
     """Return the gradient (3,) of `heading_rad` by `up`; in a level aircraft -tan I along magnetic east.
 
-    A tilt error makes the vertical field look horizontal. With the inclination I, it turns the heading by tan I times
-    the tilt error about magnetic north (2.5 times at 68 degrees), and by tan theta times that about the heading.
+    A tilt error makes the vertical field look horizontal. With the inclination I, the heading turns by tan I times
+    the tilt error about magnetic north (2.5 times at 68 degrees), and tan theta times the tilt error about the heading.
 
     Raises:
         ValueError: the first axis or the field is vertical: there is no heading.
@@ -75,9 +75,9 @@ def inclination_by_up(field: Array, up: Array) -> Array:
 
 
 def deflection_bound_deg(unseen_gauss: float, horizontal_gauss: float) -> float:
-    """Return the largest turn of a compass by an unseen field across the meridian, at most 180 degrees.
+    """Return the largest heading error by an unseen field across the meridian, at most 180 degrees.
 
-    The turn is 180 degrees if the unseen field is as strong as the measured horizontal field (method.md section 3.5).
+    The error is 180 degrees if the unseen field is as strong as the measured horizontal field (method.md section 3.5).
     """
     if unseen_gauss >= horizontal_gauss:
         return 180.0

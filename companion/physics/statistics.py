@@ -1,6 +1,6 @@
 """Quantiles of Student's t and chi-square distributions, by closed approximations; numpy only.
 
-A probability is given in sigmas, as the normal quantile with the same exceedance: 1.96 is 2.5 % on each side.
+A probability is given in sigmas: the number that a normal value exceeds as often; 1.96 means 2.5 % on each side.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAD_TO_SIGMA: Final = 1.4826
 
 
 def student_quantile(sigmas: float, freedom: float) -> float:
-    """Return the quantile of Student's t that is exceeded as often as `sigmas`; `freedom` > 0 in degrees of freedom.
+    """Return Student's t exceeded as often as `sigmas` by a normal value; `freedom` > 0: degrees of freedom.
 
     Wallace's approximation (Biometrika 46, 124, 1959) is never below the exact value. It is at most 1.3 % too large at
     2 sigma from 3 degrees of freedom on, and at most 2.6 % at 4 sigma from 6 on.
@@ -27,7 +27,7 @@ def student_quantile(sigmas: float, freedom: float) -> float:
 
 
 def chi_square_ratio(freedom: Floats | float, sigmas: float) -> Floats:
-    """Return the quantile of estimated over true variance: chi-square over its degrees of freedom.
+    """Return the quantile of estimated over true variance, which is chi-square over its degrees of freedom.
 
     The approximation is Wilson and Hilferty's (PNAS 17, 684, 1931). With 3 or more degrees of freedom,
     it is within 0.3 % at 2.3 sigma and at most 7 % above the exact value at 4.5 sigma.

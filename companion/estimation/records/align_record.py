@@ -1,4 +1,4 @@
-"""Records of alignments: the gradienter's zero, six-position calibrations, and turns of the aircraft on one place.
+"""Records of alignments: the gradienter's zero, six-position calibrations, and turns of the aircraft on the spot.
 
 The keys are a public interface. An unknown figure is None, never zero.
 """
@@ -21,15 +21,15 @@ from companion.samples import Vector
 FORMAT_VERSION = 1
 _MOST_DEG = 90.0  # Limit of a gradienter's zero and of its sigma
 SAME_START_S = 30.0
-"""Difference of start times, s, within which they are one start: two clocks drift so far apart in weeks. A restart
-changes the start by at least the preceding uptime."""
+"""Largest difference of two start times, s, that count as one start: two clocks drift so far apart in weeks. A restart
+changes the start time by at least the uptime before it."""
 
 Pair = tuple[float, float]
 Kind = Literal["zero", "tilts"]
 
 
 class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Configuration of the gradienter during an alignment; with another one, the alignment is not used."""
+    """Configuration of the gradienter during an alignment; the alignment is used with this configuration only."""
 
     port: str
     protocol: str
@@ -39,9 +39,9 @@ class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Determined(msgspec.Struct, frozen=True, kw_only=True):
-    """Three figures with one sigma each.
+    """Three figures, mostly one per axis, with one sigma each.
 
-    `known` is False for a figure that the poses do not determine; its sigma is then about the prior's.
+    `known` is False for a figure that the poses do not determine; the figure's sigma is then about its prior's.
     """
 
     value: Vector
@@ -50,14 +50,14 @@ class Determined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Level bias of one IMU in vehicle axes (FRD), after the offsets that the autopilot subtracts.
+    """Biases of one IMU in vehicle axes (FRD), after the offsets that the autopilot subtracts.
 
-    It is the effective accelerometer bias when the base is level, as a firmware's level calibration measures it.
+    `level_bias_mg` is the effective accelerometer bias on a horizontal base, as by a firmware's level calibration.
     """
 
     name: str
     temperature_degc: float | None
-    level_bias_mg: Vector  # Effective accelerometer bias when the base is level, as a level calibration measures it
+    level_bias_mg: Vector  # With scale errors and misalignment, which look like a bias there
     level_sigma_mg: Vector
     gyro_bias_deg_h: Determined
 
@@ -65,7 +65,7 @@ class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
 class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
     """Alignment result of one IMU against a gradienter (tilt sensor).
 
-    `accel_bias_mg` is the bias alone, without scale, shear and misalignment, which all look like a bias in one pose.
+    `accel_bias_mg` is the bias alone, without scale, shear and misalignment, which look like a bias at one attitude.
     """
 
     accel_bias_mg: Determined
@@ -125,9 +125,9 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
 class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Six-position calibration of one IMU, in its own axes, after the offsets that the autopilot subtracts.
 
-    `left_out` numbers the positions, from 1, that do not fit the others. `scatter_mg` is the rms of the corrected
-    readings' length minus gravity. `whole_bias_mg` is the bias without any offset, as it is written; None: the record
-    is of an earlier version.
+    `left_out`: numbers, from 1, of the positions that do not fit the others. `scatter_mg` is the rms of the corrected
+    readings' length minus gravity. `whole_bias_mg` is the bias of the output without any offset, as it is written;
+    None: the record is of an earlier version.
     """
 
     name: str
@@ -173,13 +173,13 @@ def check(record: AlignmentRecord | FacesRecord) -> None:
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
     written: dict[str, WrittenParameter] = {}
     whole_bias_mg: Vector | None = None
-    """Level bias without the autopilot's offsets, as it would be written; None: record of an earlier version."""
+    """Effective accelerometer bias on a horizontal base, without the autopilot's offsets; None: older record."""
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Tilt of the autopilot's board in the aircraft: its roll (right side down) and pitch on a level base.
+    """Tilt of the autopilot's board in the aircraft: the board's roll (right side down) and pitch on a horizontal base.
 
-    The accelerometers of `imu` measured it; a six-position calibration has measured their bias and scale.
+    The accelerometers of `imu` measured the tilt; a six-position calibration measured their bias and scale before.
     """
 
     imu: str
@@ -280,7 +280,7 @@ def completed(
     written: dict[str, dict[str, WrittenParameter]],
     level: dict[str, WrittenParameter],
 ) -> HandRecord:
-    """Return the record with warnings and the parameters written: `written` by IMU, `level` for the board's tilt."""
+    """Add warnings and written parameters to a record: `written` by name of the IMU, `level` for the board's tilt."""
     replace = msgspec.structs.replace
     if isinstance(record, AlignmentRecord):
         return replace(record, warnings=warnings)

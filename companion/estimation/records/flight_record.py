@@ -31,7 +31,7 @@ class Split(msgspec.Struct, frozen=True, kw_only=True):
     """Residual bias of one axis after the active offsets, split into its causes; None: the log does not show it.
 
     `in_flight` is the mean from take-off to landing, `ekf` the EKF's estimate in the latter half of the flight.
-    `turn_on` is the mean at rest before the motors start, `temperature` the change from there into the air by the
+    `turn_on` is the mean at rest before the motors start, `temperature` the change from then to the flight by the
     learned curve. `motors` is the step at the motors' start: from vibration rectification, and from temperature if no
     curve is known. `vibration` is the change per m/s^2 of vibration level, `trend` the change per minute of flight.
     """
@@ -47,7 +47,7 @@ class Split(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """Distance of free inertial navigation from the reference after a time; one start in twenty exceeds `worst_m`."""
+    """Error of inertial navigation without GNSS, by the reference, after `seconds`; 1 start in 20 exceeds `worst_m`."""
 
     seconds: float
     starts: int
@@ -83,12 +83,12 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
     key: str
-    """Identity of this arming of the autopilot, equal for every log file that contains it."""
+    """Identity of this arming of the autopilot, equal in all log files that contain this arming."""
     system_id: int | None
     began_at: str | None
     stages: Stages
     reference: str
-    """Source of the solution against which drift is measured: "ekf", or "truth" of a simulator."""
+    """Source of the motion against which drift is measured: "ekf", or "truth" of a simulator."""
     imus: tuple[ImuFlight, ...]
     notes: tuple[str, ...]
 
@@ -116,7 +116,7 @@ def drift_lines(imu: ImuFlight) -> list[str]:
 
 
 def figure(imus: Sequence[ImuFlight]) -> str | None:
-    """Summarise a flight as text: drift of its first IMU at the time nearest to 30 s; None: no IMU has a drift."""
+    """Summarise a flight as text: drift after about 30 s, of the first IMU with a known drift; None: no such IMU."""
     first = next((imu for imu in imus if imu.drift.get("flown")), None)
     if first is None:
         return None

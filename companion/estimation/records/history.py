@@ -2,7 +2,7 @@
 
 The history has biases as *measured*, without autopilot offsets, and never combined with a prior: a prior that learns
 from itself becomes more certain with every calibration. One power-up counts as one point, whatever the number of its
-calibrations, because all of them include its turn-on bias.
+calibrations, because they all include the same turn-on bias.
 
 A start of the daemon reads thousands of points: they are stored as arrays and not tracked by the garbage collector.
 """
@@ -27,20 +27,20 @@ _Sigmas = tuple[_Sigma, _Sigma, _Sigma]
 WEIGHS_FROM: Final = 5
 """Least number of earlier power-ups for a prediction that takes part in the estimate."""
 NEW_AFTER: Final = 3
-"""Number of consecutive power-ups contradicting earlier ones that shows a replaced sensor instead of outliers."""
+"""Number of power-ups in a row that contradict earlier ones: so many show a replaced sensor, fewer are outliers."""
 KEEP_POWER_UPS: Final = 48
 KEEP_POINTS: Final = 8  # Maximum points of a power-up
 NEAR_K: Final = 2.0  # Temperature difference below which points are redundant
 _LATEST: Final = 10
 """Number of latest power-ups that are stored whatever their temperature, because a sensor ages."""
 SAME_START_S: Final = 60.0
-"""Difference of start times, s, within which they are one power-up: the wall clock may have been adjusted."""
+"""Largest difference of two start times, s, that count as one power-up, because the wall clock can be adjusted."""
 
 
 class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """Identity of a power-up: start of the companion computer (`host`), and of the sensor's own device.
 
-    Two are the same if either start matches: too few points make a prior cautious, double counting overconfident.
+    One matching start makes two power-ups the same: one too few makes a prior cautious, one too many overconfident.
     """
 
     host: str
@@ -51,7 +51,7 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
         return self.host == other.host or self.started_with(other)
 
     def started_with(self, other: PowerUp) -> bool:
-        """Return True if the sensor's own device has the same start time in both, so that it stayed powered."""
+        """Return True if the sensor's own device has the same start time in both power-ups: it stayed powered."""
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 
@@ -76,9 +76,9 @@ class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """Biases of one IMU from one calibration, or from a still window that no calibration used (`started_at` empty).
+    """Biases of one IMU from one calibration, or from a motionless window without calibration (`started_at` empty).
 
-    `up` is the up vector of the accelerometer measurement, in vehicle axes. `zero` identifies the gradienter's zero in
+    `up` is the up vector during the measurement, in vehicle axes. `zero` identifies the gradienter's zero in
     use; None without a gradienter.
     """
 
@@ -102,7 +102,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
         return found
 
     def as_chosen(self, *, gyro: bool = True) -> Point:
-        """Mark suspect biases as chosen, because their calibration was requested and is active; `gyro`: gyros, too."""
+        """Mark suspect biases as chosen if their calibration was requested and is active; `gyro`: also the gyro's."""
         found: dict[Triad, MeasuredBias | None] = {"gyro": self.gyro if gyro else None, "accel": self.accel}
         chosen = {t: msgspec.structs.replace(one, chosen=True) for t, one in found.items() if one and one.suspect}
         return msgspec.structs.replace(self, **chosen)
@@ -149,7 +149,7 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
     """Choose the points for a prediction of one triad, grouped by power-up.
 
-    Outliers are left out. `NEW_AFTER` in a row, or a chosen point, show a new sensor: earlier points are left out.
+    Outliers are left out, and all points before `NEW_AFTER` power-ups of outliers in a row, or before a chosen point.
     """
     measured = [point for point in points if point.of(triad) is not None]
     start = max((k for k, point in enumerate(measured) if point.measured(triad).chosen), default=0)

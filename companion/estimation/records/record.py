@@ -55,8 +55,8 @@ class SiteRecord(msgspec.Struct, frozen=True, kw_only=True):
 class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     """Magnetic field at the compass and the Earth's field by WMM2025; inclinations are positive downwards.
 
-    The heading error exceeds its bound in one case of twenty. `heading_from` is the device's own tilt compensation, or
-    ours with the gradienter. `device_minus_field_deg` is the difference of both headings, if the device sends both.
+    The heading error exceeds its bound in one case of twenty. `heading_from`: tilt compensation by the device, or by
+    the companion, of the field. `device_minus_field_deg`: the device's own heading minus the heading from its field.
     None: unknown.
     """
 
@@ -65,7 +65,7 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     heading_from: Literal["device", "field"]
     field_gauss: float | None
     field_expected_gauss: float | None  # The Earth's field and inclination are by WMM2025
-    inclination_deg: float | None  # Down positive; needs a gradienter
+    inclination_deg: float | None  # Down positive; needs a measured tilt
     inclination_expected_deg: float | None
     device_minus_field_deg: float | None
     wander_deg: float | None
@@ -101,7 +101,7 @@ class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
     """Turn rate about the vertical, clockwise seen from above; None: not measured, the ground is assumed fixed."""
     turn_sigma_deg_s: float | None
     told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
-    """Source of the turn rate: "gyros" compare with an earlier rest, "earlier calibrations" with predicted biases."""
+    """Source of the turn rate: "gyros", compared with an earlier rest; "earlier calibrations", with predictions."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -120,18 +120,18 @@ class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
 Prior = dict[Triad, dict[str, Any] | None]
 """Predicted biases of one IMU from earlier power-ups, by triad; None: fewer than three power-ups.
 
-`used`: the prediction took part in the estimate (every prediction is a plausibility gate). `power_ups`: their number.
-`temperature_model`: predicted by a curve. `expected_rad_s` or `expected_m_s2`: today's bias, with `sigma_…`.
-`measured_…`: bias from the readings alone. `shift_sigma`: difference of both in sigmas.
+`used`: the prediction took part in the estimate (every prediction is a plausibility gate). `power_ups`: number of
+power-ups. `temperature_model`: predicted by a curve over temperature. `expected_rad_s` or `expected_m_s2`: predicted
+bias, with `sigma_…`. `measured_…`: bias from the readings alone. `shift_sigma`: measured minus predicted, in sigmas.
 """
 
 
 class Effective(msgspec.Struct, frozen=True, kw_only=True):
-    """Sigma of the accelerometer biases at another attitude than the calibration's, with scale errors times 1 g.
+    """Sigma of the accelerometer biases at another attitude than the calibration's, including scale errors times 1 g.
 
-    The bias of an axis changes by `scale_sigma_m_s2` (one sigma) times the change of its share of gravity,
-    1 - cos(tilt) for the vertical axis of a level aircraft. `sensor_sigma_m_s2` is that of the sensor's own bias, in
-    its own axes, at any attitude.
+    The bias of an axis changes by `scale_sigma_m_s2` (one sigma) times the change of the axis' share of gravity,
+    1 - cos(tilt) for the vertical axis of a level aircraft. `sensor_sigma_m_s2` is one sigma of the bias itself, in the
+    sensor's axes, at any attitude.
     """
 
     scale_from: Literal["assumed", "alignment"]  # "alignment": measured with tilts; "assumed": 0.5 %
@@ -164,9 +164,9 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Result of one IMU: whole biases (output without any offset, minus the true value), sigmas, and what was written.
 
     The covariance is 6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None for a half that was not determined.
-    sigma_use includes an invisible warm-up. Triads `held_back` were not written: they contradict earlier calibrations,
-    and the request did not insist. Triads `unchanged` keep their active offsets, which are as good; their sigma is
-    `..._sigma_in_force_...`.
+    sigma_use includes a warm-up too slow to see. Triads `held_back` were not written: they contradict earlier
+    calibrations, and the request did not insist. Triads `unchanged` keep their active offsets, which are as good as new
+    ones; one sigma of these offsets is `..._sigma_in_force_...`.
     """
 
     name: str
@@ -188,13 +188,13 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
     gyro_sigma_warm_up_rad_s: Vector | None = None
-    """Part of the stated sigma from a warm-up that may be too small to see in the window; only time removes it."""
+    """Part of the stated sigma, for a possible warm-up too slow to see in the window; only time removes it."""
     accel_sigma_warm_up_m_s2: Vector | None = None
     when_warm: WhenWarm | None = None  # None: the board was warm, or the end of its warm-up is unknown
     gyro_id: int | None = None  # Device ids in the autopilot; None: it has none, or the record is of an older version
     accel_id: int | None = None
     gyro_sigma_in_force_rad_s: Vector | None = None
-    """One sigma of the active offsets that this calibration left unchanged; None if it wrote them."""
+    """One sigma of the active offsets that this calibration left unchanged; None: new offsets, or unknown."""
     accel_sigma_in_force_m_s2: Vector | None = None
 
     def of(self, triad: Triad) -> TriadFigures:
@@ -221,7 +221,7 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
         return _each(lambda use, part: math.sqrt(max(use**2 - part**2, 0.0)), own.sigma_use, own.sigma_warm_up)
 
     def confirming(self, before: ImuRecord | None) -> ImuRecord:
-        """Add the sigma of the offsets that this calibration left unchanged; `before` is the record that wrote them."""
+        """Add the sigma of offsets that this calibration left unchanged; `before`: record of the last calibration."""
 
         def confirmed(triad: Triad) -> Vector | None:
             own = self.of(triad)
@@ -235,10 +235,10 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: float) -> float:
-    """Return one sigma of an offset, `earlier` before a second measurement, which left this residual.
+    """Return one sigma of an offset after a second measurement found a `residual`; `earlier`: its sigma before.
 
-    The residual counts by the share that its noise (`averaged`) does not explain. The second measurement alone would
-    give hypot(sigma, residual). The sigmas are not averaged, because part of their errors is common.
+    The residual counts by the share that the measurement's noise (`averaged`) does not explain. The second
+    measurement alone would give hypot(sigma, residual). The sigmas are not averaged: part of their errors is common.
     """
     gain = earlier**2 / max(earlier**2 + averaged**2, sys.float_info.min)
     return min(math.hypot(earlier, gain * residual), math.hypot(sigma, residual))
@@ -252,8 +252,8 @@ def _each(function: Callable[..., float], *vectors: Vector | None) -> Vector:
 class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Arming of the autopilot, and the calibration that was active then.
 
-    "calibrated": its offsets are from the calibration that began at `calibration`. "checked": their origin is unknown,
-    but a measurement confirmed them. "uncalibrated": neither; `reason` gives the cause.
+    "calibrated": the offsets are from the calibration that began at `calibration`. "checked": the offsets' origin is
+    unknown, but a measurement confirmed them. "uncalibrated": neither; `reason` gives the cause.
     """
 
     armed_at: str

@@ -3,12 +3,12 @@
 A confirmed calibration was written and seen in the telemetry, or measured to be right. The error budget limits its
 validity (method.md sections 2.2 and 3.2):
 
-- age: the wander predicted by the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, for at most the
-  configured limit (30 minutes);
-- temperature: the change of the bias by its curve stays below `DRIFT_SIGMAS` sigma; without a curve 3 K, configurable;
-- residual: the output of the rolling window differs from the expected one by less than `RESIDUAL_SIGMAS` of both.
+- age: the wander predicted by the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma, for at most the configured
+  limit (30 minutes);
+- temperature: the bias change by the curve stays below `DRIFT_SIGMAS` sigma; without a curve 3 K, configurable;
+- residual: output and expected output of the rolling window differ by less than `RESIDUAL_SIGMAS` combined sigmas.
 
-Age and temperature count from the last still window that agreed: an aircraft that stands for an hour keeps its
+Age and temperature count from the last motionless window that agreed. An aircraft that stands for an hour keeps its
 calibration without a write.
 """
 
@@ -60,8 +60,8 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
 
     `calibrated_s` is None if the offsets were only measured to be right. `sigma_use` is the stated sigma. `sigma`, for
     comparisons, excludes the coming warm-up, which affects old and new offsets equally. `expected` is the output minus
-    the true value: zero if the autopilot corrects, else the whole bias. `seen`: in the telemetry. `averaged_s`:
-    averaging time.
+    the true value: zero if the autopilot corrects, else the whole bias. `seen`: telemetry shows the offsets' effect.
+    `averaged_s`: averaging time of the calibration.
     """
 
     calibrated_s: float | None
@@ -77,7 +77,7 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
 def held_of(
     imu: ImuRecord, triad: Triad, now_s: float, averaged_s: float, *, corrected: bool, seen: bool
 ) -> Held | None:
-    """Return one triad's state after its calibration; None without a result. `corrected`: by the autopilot."""
+    """Return one triad's state after its calibration; None: no result. `corrected`: the autopilot subtracts it."""
     bias = imu.of(triad).bias
     sigma, settled = imu.sigma_in_force(triad), imu.settled_sigma(triad)
     if sigma is None or settled is None or bias is None:
@@ -111,8 +111,8 @@ class Objection(NamedTuple):
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     """Return the age, s, at which the predicted wander of a bias reaches DRIFT_SIGMAS times its sigma.
 
-    The wander, since a mean over `averaged_s`, excludes white noise. The smallest axis of `sigma` counts. A day is the
-    maximum, far beyond the configured limit.
+    The wander since a mean over `averaged_s` counts, without white noise. The smallest axis of `sigma` counts. The age
+    is at most a day, far beyond the configured limit.
     """
     horizons_s = np.geomspace(1.0, _LONGEST_S, 1200)
     drift = floor_variance(model.flicker, model.walk, averaged_s, horizons_s)
@@ -132,8 +132,8 @@ def judge(
 ) -> list[Objection]:
     """List the reasons against one triad's active calibration; the list is empty while it is good.
 
-    `now_s` is on the clock of `held`; `present` is a still window, or None. `drift` is the change of the bias with the
-    temperature since `held`, and its variance; None: unknown.
+    `now_s` is on the clock of `held`; `present` is a motionless window, or None. `drift` is the bias change by
+    temperature since the confirmation in `held`, and the change's variance; None: unknown.
     """
     name, triad = key
     (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
@@ -172,14 +172,14 @@ def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor:
 
 
 def worst_axis(held: Held, present: Present) -> float | None:
-    """Return the largest signed difference beyond RESIDUAL_SIGMAS combined sigmas; None: all axes agree."""
+    """Return the largest signed change of the output beyond RESIDUAL_SIGMAS combined sigmas; None: all axes agree."""
     return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
     """Return True if new offsets would improve any axis by more than WORTH_SIGMAS sigmas and by more than `floor`.
 
-    The active calibration counts with its own sigma; `floor` is in rad/s or m/s^2.
+    Sigma combines those of the window and of the active calibration, if any; `floor` is in rad/s or m/s^2.
     """
     expected, then = (_NONE, _NONE) if held is None else (held.expected, held.sigma)
     return bool(_off(present, expected, then, WORTH_SIGMAS, floor))

@@ -1,1 +1,1 @@
-"""Estimation of biases from one still window, combination with earlier calibrations, and the result as a record."""
+"""Estimation of biases from a motionless window, combination with earlier calibrations, and the result as a record."""

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 STEP_K: Final = 1.0  # Distance between the rows of a curve
 MOST_ROWS: Final = 60
 _ENOUGH_K: Final = 5.0
-"""Least range of measured temperatures, K, that gives a curve of bias over temperature (method.md section 3.3)."""
+"""Least range of measured temperatures, K, at which a curve is expected (method.md section 3.3)."""
 _DAY_S: Final = 86400.0
 
 
 class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
-    """Biases of one IMU from one still window, in vehicle axes (FRD), each with one sigma.
+    """Biases of one IMU from one motionless window, in vehicle axes (FRD), each with one sigma.
 
-    `started_at` identifies the calibration that used the window; it is empty if none did.
+    `started_at` identifies the calibration that used the window; it is empty if no calibration used it.
     """
 
     at_unix_s: float
@@ -83,9 +83,9 @@ def by_temperature(
     power_up: PowerUp | None,
     now_degc: float | None = None,
 ) -> ByTemperature:
-    """Summarise one IMU's biases over temperature from its bias history and the curves fitted to it.
+    """Summarise one IMU's biases over temperature from its bias history and the curves fitted to the history.
 
-    `power_up` is the present power-up, None if unknown. Without `now_degc`, the temperature of its last window is used.
+    `power_up` is the present one, if known. Without `now_degc`, the temperature of its last window is used.
     """
     groups = by_power_up([point for point in points if point.temperature_degc is not None and point.gyro is not None])
     seen = [_window(point, k) for k, group in enumerate(groups) for point in group]

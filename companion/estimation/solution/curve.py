@@ -5,16 +5,16 @@ The bias in power-up s at the temperature T is
     o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K.
 
 Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run). The cubic is
-common to all. The die is as warm as its thermometer was `lag` earlier, so heating and cooling differ. The fit is
-generalised least squares over means of still seconds at one temperature. The prior of the coefficients is as wide as
-catalogue slopes, so the model is uncertain at temperatures without data.
+common to all. The die is as warm as its thermometer was `lag` seconds earlier, so heating and cooling differ. The fit
+is generalised least squares over means of motionless seconds at one temperature. The prior of the coefficients is as
+wide as catalogue slopes, so the model is uncertain at temperatures without data.
 
 Each power-up's first mean is predicted from the other power-ups. The errors select the lag and the order (cubic or
-mean), and scale tau until the predicted error matches the actual one. The change from the first mean to the last is
-predicted, too; the error scales the uncertainty of changes, and reveals a thermometer outside this IMU.
+mean), and scale tau until predicted and actual errors match. The change from a power-up's first mean to its last is
+also predicted. The error of this change scales the uncertainty of changes, and reveals a thermometer outside the IMU.
 
-The present rate dT/dt predicts the end of a warm-up. A board that warms towards its end as 1 - exp(-t / tau_s) still
-warms by tau_s dT/dt, at any air temperature. Earlier power-ups determine this time constant tau_s.
+The present rate dT/dt predicts the end of a warm-up. A board that warms towards its end as 1 - exp(-t / tau_s)
+has tau_s dT/dt left to warm, at any air temperature. Earlier power-ups determine the time constant tau_s.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ VALID_K: Final = 3.0
 FEWEST: Final = 3
 _CUBIC: Final = 3
 _BETTER: Final = 0.9
-"""Threshold of the ratio of mean square errors, cubic over mean, below which the cubic is used instead of the mean."""
+"""A cubic replaces a constant mean if the cubic's mean square error is below this share of the mean's."""
 _AT_LEAST: Final = 0.5
-"""Least run-to-run variance as a share of the mean square prediction error: noise may be stated too large."""
+"""Least run-to-run variance, as a share of the mean square prediction error; overstated noise would hide more of it."""
 _RANGE: Final = 18.0
-"""Half the search range for the log of the run-to-run variance; its centre is the squared bias change per kelvin."""
+"""Half the search range for the log of the run-to-run variance; the centre is the log of squared bias change per K."""
 _HALVINGS: Final = 25
 _SURELY: Final = 2.0  # Threshold in sigmas above which an error is not chance
 _LITTLE: Final = 1e-6
-"""Lower bound of a variance, relative to the squared bias change per kelvin or to the noise variance."""
+"""Least in-run variance over the squared bias change per kelvin; least predicted variance over the noise variance."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """Prior sigmas of the coefficients c1, c2 and c3, each divided by a sensor's usual bias change per kelvin."""
 _SLOWED_K_S: Final = 0.25 / 60.0  # Least decrease of the rate that determines the end of a warm-up
@@ -65,13 +65,13 @@ _END_LESS_MEAN: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
 CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
 """Run-to-run scatter of biases, one sigma, as in an ADIS16405 (method.md section 1.3)."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
-"""Bias change per kelvin of a BMI088, the worse part in method.md section 2.1."""
+"""Bias change per kelvin of a BMI088, the worse sensor model in method.md section 2.1."""
 
 
 class PowerUpNodes(NamedTuple):
-    """Means of still seconds in one power-up, n rows, in vehicle axes (FRD), rad/s or m/s^2.
+    """Means of motionless seconds in one power-up, n rows, in vehicle axes (FRD), rad/s or m/s^2.
 
-    `states` (n, 2): temperature in degC and its rate in K/s. `variance` (n,): of white noise, averaged over axes.
+    `states` (n, 2): temperature in degC and its rate in K/s. `variance` (n,): of the white noise, averaged over axes.
     """
 
     states: Floats
@@ -90,7 +90,7 @@ class Warm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Along(msgspec.Struct, frozen=True, kw_only=True):
-    """Predicted bias change of one triad within one window, in vehicle axes (FRD); rad/s or m/s^2, slopes per second.
+    """Predicted bias change of one triad within a window, in vehicle axes (FRD), rad/s or m/s^2; slopes are per second.
 
     `shift` is the bias at the window's end minus its mean over the window. `warm` is None if the temperature at the end
     of the warm-up is unknown, or beyond the measured temperatures.
@@ -107,10 +107,10 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
 class Curve:
     """Model of the next power-up's bias over temperature, in vehicle axes (FRD), rad/s or m/s^2.
 
-    `order` is 0 for a mean, 3 for a cubic. `covariance` belongs to the coefficients of an axis with the usual scatter;
-    `widening` (3,) scales it for each axis, `of_changes` (3,) for changes within a power-up. `unexplained` is the share
-    of the squared changes that neither model nor chance explains. `scatter` (3,) is the variance of one more power-up,
-    including its wander.
+    `order` is 0 for a constant mean, 3 for a cubic. `covariance` is the coefficients' for an axis with usual scatter.
+    Factors on it: `widening` (3,) by axis, `of_changes` (3,) for bias changes within a power-up. `unexplained` is the
+    share of these squared changes that neither model nor chance explains. `scatter` (3,) is the variance of the next
+    power-up's bias about the model, including the wander within that power-up.
     """
 
     order: int
@@ -131,18 +131,18 @@ class Curve:
         return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
 
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
-        """Predict the next power-up's bias at a temperature, and its variance, (3,) each; linear beyond the range."""
+        """Predict the next power-up's bias (3,) at a temperature, and its variance (3,); extrapolate linearly."""
         x, (low, high) = self._row(degc, k_s), self.span_degc
         moved = float(np.abs((self._row(high) - self._row(low)) @ self.coefficients).max())
         outside = (max(self.per_kelvin, moved / max(high - low, VALID_K)) * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
     def change(self, then: State, now: State) -> tuple[Array, Array]:
-        """Predict the bias change between two states of a power-up, and its variance, (3,) each; zero for a mean."""
+        """Predict the bias change (3,) between two temperatures (with rates) of a power-up, and its variance (3,)."""
         return self.moves([(-1.0, then), (1.0, now)])
 
     def moves(self, weighted: Iterable[tuple[float, State]]) -> tuple[Array, Array]:
-        """Predict a weighted sum of biases at several states, and its variance, (3,) each; weights add up to zero."""
+        """Predict a weighted sum (3,) of biases at several temperatures, and its variance (3,); weights sum to zero."""
         x, outside_k = np.zeros(self.order + 1), 0.0
         for weight, (degc, k_s) in weighted:
             side = 1.0 if degc > self.span_degc[1] else -1.0
@@ -187,9 +187,9 @@ class Curve:
 
 
 def settling(power_ups: Iterable[Sequence[State]]) -> tuple[float, float] | None:
-    """Estimate a board's thermal time constant and one sigma, s, from earlier power-ups; None: too few show it.
+    """Estimate a board's thermal time constant and one sigma, s, from three or more earlier warm-ups; else None.
 
-    Between its fastest rise and its last state, a board warms by the time constant times the decrease of its rate.
+    From its fastest warming to its last state, a board warms by the time constant times the decrease of the rate.
     """
     found = []
     for states in power_ups:
@@ -266,7 +266,7 @@ class _Fit:
         ) = (np.array(each) for each in zip(*rows, strict=True))  # fmt: skip
 
     def curve(self, span_degc: tuple[float, float]) -> Curve:
-        """Fit with the run-to-run variance at which predicted and actual errors of left-out power-ups match."""
+        """Fit with that run-to-run variance at which the errors for left-out power-ups are as large as predicted."""
         scatter = self._scatter()
         error, variance = self._left_out(scatter)
         shares, normal, right = self._equations(scatter)
@@ -320,7 +320,7 @@ class _Fit:
         return self._first_bias - predicted, variance + self._first_variance + scatter
 
     def _by_others(self, scatter: float, rows: Floats) -> tuple[Floats, Floats]:
-        """Predict each power-up's bias for its polynomial terms `rows` from the others: (n, 3), and variance (n,)."""
+        """Predict each power-up's bias (n, 3) from all others, and the variance (n,); `rows`: its polynomial terms."""
         _, normal, right = self._equations(scatter)
         others = np.concatenate([rows[:, :, None], right.sum(axis=0) - right], axis=2)
         solved = rows[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
@@ -366,14 +366,14 @@ NOTHING: Final = Polynomial()
 
 
 def of_curve(curve: Curve, orientation: Matrix, scale: Vector = (1.0, 1.0, 1.0)) -> Polynomial:
-    """Convert a curve to a firmware's polynomial over the measured temperatures; it is zero at the reference.
+    """Convert a curve to a firmware's polynomial over the measured temperatures, zero at the reference temperature.
 
     The thermometer's lag is left out, because no firmware supports one.
 
     Args:
         curve: in vehicle axes.
         orientation: rotation from the IMU's axes to the vehicle's, 3x3.
-        scale: factor that the firmware applies to the IMU's output afterwards.
+        scale: factor by which the firmware multiplies the IMU's output after the temperature correction.
     """
     low, high = curve.span_degc
     terms = np.zeros((4, 3))

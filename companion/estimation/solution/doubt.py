@@ -25,8 +25,8 @@ Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 TELLS: Final = 9.0
 """Least decrease of chi-square by which one explanation beats another: three sigmas."""
 AGREES: Final = 11.34
-"""Chi-square of three axes that chance exceeds once in a hundred. A prediction beyond it causes no warning yet, but is
-not used in the estimate, because it may belong to another sensor."""
+"""Chi-square of three axes that chance exceeds once in a hundred. A prediction with more is not used in the estimate,
+because it may belong to another sensor. A warning needs a larger difference."""
 _OF_ALL: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",
@@ -76,7 +76,7 @@ class Witness:
         return float(up @ self.difference), math.sqrt(variance)
 
     def gain(self, shift: Array) -> float:
-        """Return the decrease of chi-square, own variance only, if `shift` is subtracted from the difference."""
+        """Return how much chi-square, by own variance only, decreases if `shift` is subtracted from the difference."""
         return float(np.sum((np.square(self.difference) - np.square(self.difference - shift)) / self.own_variance))
 
     def is_explained(self, shift: Array) -> bool:
@@ -106,9 +106,9 @@ def contradictions(
 ) -> list[Doubt]:
     """List all contradictions between measured biases and their predictions.
 
-    Predictions of `today` (this power-up) are more exact. Those of `earlier` power-ups count only if today's cover
-    fewer than `imus` IMUs and agree. `by_reading` (3, 2) is the derivative of accelerometer biases by the gradienter's
-    readings.
+    Predictions from this power-up (`today`) are more exact. Predictions from `earlier` power-ups count only if today's
+    agree with the measurement and cover fewer than all IMUs (`imus`: their number). `by_reading` (3, 2) is the
+    derivative of accelerometer biases by the gradienter's readings.
     """
     gravity: tuple[Cause, Matrix] = ("gravity", up[:, None])
     causes: dict[Triad, list[tuple[Cause, Matrix]]] = {
@@ -126,7 +126,7 @@ def contradictions(
 
 
 def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool) -> list[Doubt]:
-    """Explain all contradictions by one cause common to all IMUs if one fits; otherwise explain each one alone."""
+    """Explain all contradictions by one cause common to all IMUs if it fits; else explain each contradiction alone."""
     against = [witness for witness in witnesses if witness.contradicts]
     others = [witness for witness in witnesses if not witness.contradicts]
     for cause, directions in causes if against else ():
@@ -142,7 +142,7 @@ def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]]
 
 
 def _common(witnesses: Sequence[Witness], directions: Matrix) -> tuple[Array, Array]:
-    """Fit the common shift along `directions` that best explains all differences; return it and its size along each."""
+    """Fit the shift along `directions` (3, n) that best explains all differences; return it and its n components."""
     by = np.vstack([directions / np.sqrt(witness.own_variance)[:, None] for witness in witnesses])
     found = np.concatenate([witness.difference / np.sqrt(witness.own_variance) for witness in witnesses])
     size = np.asarray(np.linalg.lstsq(by, found)[0], dtype=np.float64)
@@ -178,7 +178,7 @@ def _alone(
 
 
 def _of_all(cause: Cause, size: Array, names: str, against: Sequence[Witness]) -> str:
-    """Describe a contradiction of all IMUs for a pilot; `size` is the shift along the directions of its cause."""
+    """Describe a contradiction of all IMUs for a pilot; `size`: change of tilt (rad), gravity or turn rate (SI)."""
     sensors = "accelerometers"
     if cause == "turn":
         fault, sensors = f"the aircraft turns by {float(np.linalg.norm(size)) / DEG_H:.0f} deg/h", "gyros"

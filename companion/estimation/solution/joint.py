@@ -12,9 +12,9 @@ The error of the gradienter's zero is the same in all IMUs. If earlier calibrati
 in p and does not average out. If they used other zeros, several IMUs together determine today's tilt.
 
 A sigma_use (stated sigma) that is too cautious would give the prior too much weight. For K, e_d therefore includes only
-*known* noise. Known are the rest after averaging (sigma_stat), the gradienter's scatter, the platform's turn, and the
+*known* noise. Known are the noise after averaging (sigma_stat), the gradienter's scatter, the platform's turn, and the
 sigma of a zero that was measured or configured. With this smaller K, or any up to twice the optimum, the estimate is no
-worse than without a prior. The covariance is that of the K used, with the whole S_d = cov(e_d).
+worse than without a prior. The result's covariance is for the K used, with the whole S_d = cov(e_d).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ BOUNDS_RAD_S: Final = 0.1 * DEG
 _CONTRADICTS: Final = 4.0  # Threshold in sigmas between the slope of the readings and that of the curve
 _WORTH_SAYING: Final = 2.0  # Least bias change until warm that is reported, in sigma_use
 _END_OF_RAMP: Final = 0.25
-"""Variance of a mean, divided by that of the end of a line fitted to the same values (`RobustLine.end_leverage`)."""
+"""Ratio of variances: mean of some values, over the end of a line fitted to them (`RobustLine.end_leverage`)."""
 
 
 def weigh(solution: Solution, expectation: Expectation) -> Solution:

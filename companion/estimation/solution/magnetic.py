@@ -1,8 +1,8 @@
 """Quality check of a compass heading, by its magnetic field, its steadiness and the Earth's field.
 
 A disturbance of the field has three components. Two are visible, as errors of the strength F and of the inclination I.
-The component across the meridian turns the heading and is invisible. If all three have the same unknown sigma, it
-exceeds `BOUND_OF_TWO` times the root sum of squares of the visible ones in one case of twenty. A disturbance dB turns
+The third, across the meridian, turns the heading and is invisible. If all three have the same unknown sigma, the third
+exceeds `BOUND_OF_TWO` times the root sum of squares of the visible two in one case of twenty. A disturbance dB turns
 the heading by dB / (F cos I). At I = 68 degrees, 1.3 uT turn it by 4 degrees, and a gate of 5 % on the strength misses
 them (method.md section 3.5). The uncertainty of the Earth's field model WMM2025 counts as visible disturbance.
 """
@@ -34,12 +34,12 @@ from companion.physics.units import DEG
 
 STRENGTH_GATE: Final = 0.02
 INCLINATION_GATE_DEG: Final = 1.0
-"""Inclination error that causes a warning, as `STRENGTH_GATE` does for the field's strength (method.md section 3.5)."""
+"""Least inclination error that causes a warning; for the field's strength: `STRENGTH_GATE` (method.md section 3.5)."""
 UNIT_GATE: Final = 0.5
 """Relative deviation from the Earth's field strength beyond which the compass' unit or scale must be wrong."""
 WANDER_WARNING_DEG: Final = 1.5
 DEVICE_WARNING_DEG: Final = 3.0
-"""Difference between a device's own heading and its field's that warns: three sigma of a level HMR3300."""
+"""Largest difference of a compass' own heading from that of its field without warning: 3 sigma of a level HMR3300."""
 USELESS_DEG: Final = 60.0
 """Heading error beyond which a heading is useless for subtracting the Earth's rate from the gyros."""
 _NINETY_FIVE: Final = 1.96
@@ -76,8 +76,8 @@ def assess(
 ) -> CompassHeading:
     """Estimate the true heading from the compass' window, and bound its error.
 
-    Without `up_covariance` the tilt is not from a gradienter, and the inclination is unknown. `may_turn_deg` is a turn
-    of the aircraft within the window that no sensor would show.
+    `up_covariance` is None if the tilt is from accelerometers of unknown bias; the inclination is then unknown.
+    `may_turn_deg` is the largest turn of the aircraft within the window that other sensors would miss.
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
     found = _MeanField() if field is None else _judge(field, compass, local, up, up_covariance)

@@ -4,7 +4,7 @@ A MEMS bias scatters from run to run (an ADIS16405's by 70 deg/h and 2 mg, metho
 today is the mean of the earlier power-ups, or their cubic over temperature (`curve`). The sigma is that of *one more*
 power-up: the scatter, widened by Student's t for few points, and the error of the mean.
 
-With three power-ups, the prediction is a gate for the readings (`joint`); with five, it may take part in the estimate.
+With three power-ups, the prediction is a gate for the readings (`joint`); with five, it can also count in the estimate.
 Within one power-up, only temperature and drift change the bias. Another calibration in the same power-up is therefore
 the best gate, but takes no part in the estimate.
 
@@ -47,8 +47,8 @@ TEMPERATURE_SIGMA_K: Final = 10.0
 _KNOWN: Final = 0.5
 """Largest sigma of a curve's slope, as a share of the catalogue's slope, at which the curve is used."""
 _UNEXPLAINED: Final = 0.1
-"""Largest share of the changes within power-ups that a usable curve leaves unexplained. The IMU's own thermometer
-leaves 0.05 or less (except in one of some hundred simulated aircraft), another one 0.1 to 1 and more."""
+"""Largest share of the bias changes within power-ups that a usable curve leaves unexplained. With the IMU's own
+thermometer it is 0.05 or less (except in one of some hundred simulated aircraft), with another one 0.1 to over 1."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -68,9 +68,9 @@ class PoseEffect:
         return (self.mean + self.misalignment_mean) @ by, np.sqrt(variance)
 
     def _variance(self, gravity_m_s2: float, by: Array) -> Array:
-        """Return the variance (3,) of the bias after the up vector changes by `by`, without misalignment (a rotation).
+        """Return the variance (3,) that a change `by` of the up vector adds to the bias, without that of misalignment.
 
-        The mean effect is known but not subtracted from the offsets to write, so it counts in full.
+        The mean effect is known but not subtracted from the offsets to write, so its square is included.
         """
         return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
 
@@ -86,7 +86,7 @@ class PoseEffect:
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
-        """Return a warning if the aircraft was tilted so far that its level bias differs; otherwise None."""
+        """Return a warning if the aircraft was tilted so far that its bias differs when level; otherwise None."""
         moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
             return None
@@ -116,9 +116,9 @@ class Prediction(msgspec.Struct, frozen=True, kw_only=True):
     """Prediction of one triad's bias today, without autopilot offsets, in vehicle axes (FRD), rad/s or m/s^2.
 
     `variance` is that of today's bias about `value`, without the error of the gradienter's zero. `limit` is the gate in
-    sigmas: 4, or more, at equal probability, if few points determine the scatter. `same_zero` is the share of points
-    measured with today's zero of the gradienter, whose error is then in prediction and measurement. `other_zero_rad` is
-    one sigma of the zero's error in the other points.
+    sigmas: 4; more, at the probability of 4, if few points determine the scatter. `same_zero` is the share of points
+    measured with today's gradienter zero. The error of this zero is in prediction and measurement alike.
+    `other_zero_rad` is one sigma of the error from other zeros.
     """
 
     value: Vector
@@ -155,7 +155,7 @@ _ASSUMED: Final = pose_effect(None)
 def expect(
     points: Sequence[Point], triad: Triad, now: Point, effect: PoseEffect, model: AllanModel
 ) -> Prediction | None:
-    """Predict today's bias, at attitude and temperature of `now`, from earlier power-ups; None: fewer than three."""
+    """Predict today's bias, at attitude and temperature in `now`, from earlier power-ups; None: fewer than three."""
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
@@ -191,7 +191,7 @@ def expect(
 def expect_today(
     last: Point, triad: Triad, now: Point, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
 ) -> Prediction | None:
-    """Predict today's bias from the calibration `last` of this power-up; None: it did not measure this triad.
+    """Predict today's bias from the `last` calibration of this power-up; None: that one did not measure this triad.
 
     The `curve` predicts the bias change with temperature; without one, the catalogue's slope widens the sigma.
     """
@@ -218,7 +218,7 @@ def expect_today(
 
 
 def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
-    """Fit the bias over temperature within a power-up; None: too few data, or they do not follow the temperature.
+    """Fit the bias over temperature within a power-up; None: too few points, or the bias ignores the temperature.
 
     An accelerometer's variance grows with the change of attitude since the first point of the power-up.
     """

@@ -1,8 +1,8 @@
-"""Estimation of biases and covariances from the means of one still window.
+"""Estimation of biases and covariances from the means of one motionless window.
 
-A bias is the mean reading minus the true value, which follows from attitude, gravity and the Earth's rate. It is the
-effective bias at this pose: a scale error times 1 g on the vertical axis looks like a bias (method.md section 2.3). The
-autopilot's offset has to correct that part, too; it is not part of sigma.
+A bias is the mean reading minus the true value, which follows from attitude, gravity and the Earth's rate. The bias is
+the effective one at this attitude: a scale error times 1 g on the vertical axis looks like a bias (method.md section
+2.3). The autopilot's offset has to correct this apparent bias, too; sigma does not include it.
 
 The equations are those of the paper with its errata corrected (method.md section 1.3). An accelerometer's bias is
 mean - g * up, a gyro's is mean - C_n^b w_ie^n. Axes are FRD and NED; `up` is the unit vector of specific force at rest.
@@ -45,10 +45,10 @@ Pair = tuple[Array | None, Array | None]
 class ImuSolution:
     """Estimated bias in one IMU's output after the autopilot's offsets, in vehicle axes (FRD), with its sigmas.
 
-    A bias is the mean minus the true value, (3,); None: not requested or unknown. The whole bias adds the offsets
+    A bias is the mean minus the true value, (3,); None: not requested or unknown. `whole` adds the offsets
     `subtracted` by the autopilot. `covariance` (6x6: gyro rad/s, accelerometer m/s^2) holds for the next minutes,
     without a warm-up, which affects old and new offsets equally. `sigma_stat` (6,) is the noise after averaging.
-    `temperature_degc` and its rate hold at the window's end. `drifting`: texts on drift, or biases when warm.
+    `temperature_degc` and its rate hold at the window's end. `drifting`: texts on drift, or on biases when warm.
     """
 
     name: str
@@ -109,7 +109,7 @@ class ImuSolution:
 class Shared:
     """Bias errors common to all IMUs of one window, because they use the same attitude, gravity and Earth's rate.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of each IMU's own, and couples any two IMUs.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is part of each IMU's covariance, and couples any two IMUs.
     """
 
     up: Array
@@ -146,7 +146,7 @@ class Solution:
 
     @property
     def doubted(self) -> dict[tuple[str, Triad], Doubt]:
-        """Contradictions by IMU and triad; one common to all IMUs is listed for each, even if it does not show it."""
+        """Contradictions by IMU and triad; one that is common to all IMUs is listed for every IMU."""
         return {
             (name, doubt.triad): doubt
             for doubt in reversed(self.doubts)
@@ -172,7 +172,7 @@ def solve(
     any_bias: bool = False,
     otherwise: Otherwise = NOTHING,
 ) -> Solution:
-    """Estimate the biases of every IMU from one still window; `any_bias` allows implausibly large ones.
+    """Estimate the biases of every IMU from one motionless window; `any_bias` allows implausibly large ones.
 
     `otherwise` supplies the tilt if there is no gradienter, and the heading if there is no compass.
 
@@ -272,7 +272,7 @@ def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, 
 
 
 def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
-    """Return the error (3,) in gyro means on a turning deck, because its axis was computed from the raw tilt."""
+    """Return the error (3,) in gyro means because the axis of a deck's turn was computed from the raw tilt."""
     if window.turn_rad_s is None or window.tilt is None or gradienter is None:
         return np.zeros(3)
     said = gradienter.up(window.tilt.x_deg, window.tilt.y_deg)
@@ -318,7 +318,7 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
-    """Return the Earth's rate in the gyro means, (3,): all of it, or the part that remains on a turning deck."""
+    """Return the Earth's rate in the gyro means, (3,): the whole rate, or the share that remains on a turning deck."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)

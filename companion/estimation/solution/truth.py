@@ -2,8 +2,8 @@
 
 A gradienter measures the tilt, a compass the heading. Without a gradienter, accelerometers give the tilt if a
 six-position calibration measured their bias b, scale and shear S (module `alignment.faces`): f = (I + S)^-1 (read - b).
-The length of f must equal gravity; this tilt includes that of the board in the aircraft. Without a compass, the
-autopilot's yaw is the heading.
+The length of f must equal gravity. The tilt from f includes the tilt of the board in the aircraft. Without a compass,
+the autopilot's yaw is the heading.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ UNKNOWN_K: Final = 5.0  # Assumed change of the temperature if it is unknown
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
-"""Largest error of gravity's measured length, in sigmas; beyond it, the six-position calibration is outdated."""
+"""Largest error of gravity's measured size, in sigmas; a larger one shows an outdated six-position calibration."""
 
 
 class OwnHeading(msgspec.Struct, frozen=True):
@@ -63,7 +63,7 @@ class Truth:
     """Attitude that serves as reference: up vector, heading and attitude covariance, in vehicle axes (FRD).
 
     `tilt_from` is None if the tilt is from accelerometers of unknown bias. `reading_sigma_rad` is one sigma of the
-    gradienter's two mean readings, without that of its zero.
+    gradienter's two mean readings, without the error of the zero.
     """
 
     up: Array
@@ -108,7 +108,7 @@ def truth_of(
     warnings: list[str],
     otherwise: Otherwise = NOTHING,
 ) -> Truth:
-    """Estimate the attitude from all sensors except the gyros; add a line to `warnings` for each missing sensor.
+    """Estimate the attitude from all sensors except the gyros; add lines to `warnings` on fallbacks and doubts.
 
     Raises:
         CalibrationRefusedError: the readings are inconsistent, or the nose points up or down.
@@ -221,7 +221,7 @@ def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
 def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> float:
     """Estimate one sigma of the accelerometers' bias change since their six-position calibration.
 
-    `gap_s` is the time since then; None: perhaps another power-up. `kelvin` is the temperature change; None: unknown.
+    `gap_s` is the time since that calibration; None: perhaps another power-up. `kelvin`: temperature change, or None.
     """
     if gap_s is None:
         wander = CATALOGUE_SCATTER["accel"] ** 2

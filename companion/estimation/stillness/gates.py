@@ -1,9 +1,9 @@
-"""Gates on the motion of the aircraft: one verdict per second and sensor, with a text that names the device.
+"""Gates that detect motion of the aircraft: one verdict per second and sensor, with a text that names the device.
 
 Motion of an aircraft is slow compared with the sampling; sensor noise is mostly white. Half the mean square of
 successive differences measures the white part of a second's variance. A gate on the rest of the variance therefore
 works for a sensor of any noise, from its first second on. Noise behind a filter is learned (`own_noise`). Every gate is
-widened by the chance error for the number of samples. Gates on the means, and `turning`, detect a slow steady turn. One
+widened by the chance error for its number of samples. Gates on means, and `turning`, detect a slow steady turn. One
 set of constants serves all sensors; none is tuned to a recording.
 """
 
@@ -27,7 +27,7 @@ from companion.physics.units import DEG, MG
 
 GYRO_MOTION_RAD_S: Final = 0.10 * DEG
 """Limit for the rms of slow changes of the gyro rate in one second. 0.1 deg/s over 10 s is an attitude error as large
-as the gradienter's own. Handling and walking cause 10 to 1000 times more; sensors at rest show less than half."""
+as the gradienter's own error. Handling and walking cause 10 to 1000 times more; sensors at rest show less than half."""
 
 ACCEL_MOTION_M_S2: Final = 10.0 * MG
 """Limit for the rms of slow changes of specific force in one second: 10 mg is a tilt by half a degree."""
@@ -35,20 +35,20 @@ ACCEL_MOTION_M_S2: Final = 10.0 * MG
 GYRO_VIBRATION_RAD_S: Final = 1.0 * DEG
 ACCEL_VIBRATION_M_S2: Final = 50.0 * MG
 """Limit for the total rms of specific force: three times the noisiest common sensor at its full rate. More shows a
-running motor, whose vibration accelerometers rectify: their mean is not the bias. Slow changes have their own limit."""
+running motor. Accelerometers rectify its vibration, so that their mean is wrong. Slow changes have their own limit."""
 
 GYRO_STEP_RAD_S: Final = 0.05 * DEG
-"""Limit for the change of a second's mean rate against the last good seconds. A warm-up of 3 (deg/h)/s, more than ever
-observed, changes the rate by 0.004 deg/s over their mean age of 5 s."""
+"""Limit for the change of a second's mean rate against the last good seconds, whose mean age is 5 s. A warm-up of 3
+(deg/h)/s, more than ever observed, changes the rate by 0.004 deg/s in that time."""
 
 ACCEL_STEP_M_S2: Final = 5.0 * MG
-"""Limit for the change of mean force since the stretch began: a tilt of 0.3 deg. 10 K of warming cause 2 mg at most."""
+"""Limit for the change of mean force in a motionless period: a tilt of 0.3 deg. 10 K of warming cause 2 mg at most."""
 
 GYRO_BIAS_RAD_S: Final = 10.0 * DEG  # Above any turn-on bias specified for a modern part (typically 0.5 to 3 deg/s)
 
 GRAVITY_M_S2: Final = 9.81
 GRAVITY_GATE_M_S2: Final = 1.5
-"""Limit for the error of gravity's size: uncalibrated parts have 0.1 g, more is a wrong unit, dead axis, centrifuge."""
+"""Limit for the error of measured gravity: uncalibrated sensors have 0.1 g; wrong unit, dead axis, centrifuge more."""
 
 TILT_MOTION_DEG: Final = 0.10
 TILT_STEP_DEG: Final = 0.10  # Ten times a field gradienter's noise, and 1.7 mg on a horizontal accelerometer
@@ -59,7 +59,7 @@ HEADING_STEP_DEG: Final = 3.0  # Accuracy class of field compasses; 3 deg cause 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
 _LEAST_RANGE: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
-"""Smallest measuring range of any part. Many equal integers below it come from rest, or turning points of swaying."""
+"""Smallest measuring range of any sensor model. Many equal extremes below it show rest or swaying, not clipping."""
 STUCK_SAMPLES: Final = 10  # Least equal samples of a stuck sensor; fewer may be chance on a quiet one with coarse steps
 STUCK_S: Final = 60  # Seconds after a change in steps during which a coarse stream may show one value
 
@@ -75,13 +75,13 @@ _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
 _CHANCE_OF_FIVE: Final = 3.5  # The same for the largest of five averaging times
 COMMON: Final = (0.045 * DEG, 0.7 * MG)
-"""Noise N of the noisiest common gyro and accelerometer (ADIS16405), SI * sqrt(s): accepted from the first second."""
+"""Noise N of the noisiest common gyro and accelerometer (ADIS16405), SI * sqrt(s), accepted from the first second."""
 _LEAST_HALVINGS: Final = 4  # Of a second: 1/16 s of three samples or more, from 48 Hz on
 _STATIONARY: Final = 2.0  # Largest ratio of noise at rest to its usual variance
 
 
 class GateVerdict(msgspec.Struct, frozen=True):
-    """Verdict of one gate on one second. `words`: reason, with the device's name, why it is not still.
+    """Verdict of one gate on one second. `words`: reason, with the device's name, why that second shows motion.
 
     `fault`: the device, not the aircraft, blocks the calibration. `what`: reason without numbers, to count verdicts.
     """
@@ -96,7 +96,7 @@ STILL: Final = GateVerdict(still=True)
 
 
 def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> GateVerdict:
-    """Make a verdict with a text as in 'gyro fc moves 0.31 deg/s, max 0.10'; enough digits show the difference."""
+    """Make a verdict with a text as in 'gyro fc moves 0.31 deg/s, max 0.10', in which both numbers look different."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
@@ -109,10 +109,10 @@ def _fault(words: str) -> GateVerdict:
 
 
 def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, float]) -> tuple[float, float]:
-    """Return the rms of slow changes over the channels, and the limit for it: the gate, widened for chance.
+    """Return the rms of slow changes over the channels, and its limit: the gate, widened for chance.
 
-    For white noise, variance minus `Batch.white` has a variance of about sigma^4 / n per channel. Here sigma^2 is the
-    second's own `white`, limited to `bounds`, because fast motion looks partly white.
+    For white noise, variance minus `Batch.white` has a variance of about sigma^4 / n per channel. For sigma^2 the
+    second's own `white` is used, limited to `bounds`, because fast motion looks partly white.
     """
     white = batch.white[channels]
     chance = _CHANCE * float(np.clip(white.mean(), *bounds)) / math.sqrt(batch.n * len(white))
@@ -120,10 +120,10 @@ def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, 
 
 
 def _slow_by_density(batch: Batch, channels: slice, gate: float, density: float) -> tuple[float, float]:
-    """Return the rms of slow changes over the channels, and the limit for it, from Allan variances in the second.
+    """Return the rms of slow changes over the channels, and its limit, from Allan variances in the second.
 
-    Density is Allan variance times averaging time. Behind a filter above some 10 Hz, noise has one density at all
-    times; behind a lower filter, its density falls towards short times. Motion adds density at long times.
+    Density is Allan variance times averaging time. Noise has one density at all averaging times if its filter is above
+    some 10 Hz; a lower filter reduces density at short times. Motion adds density at long averaging times.
     """
     parts = parts_of_second(len(batch.allan))
     noise = density * parts
@@ -157,21 +157,21 @@ class ImuGate:
         self._white = profile.gyro.white, profile.accel.white
         self._is_float = np.repeat(steps, 3) == 0.0
         self._few_levels_s = np.zeros(6, dtype=np.int64)
-        """Number of seconds (6,) with few distinct readings since the last second with many."""
+        """Number of seconds (6,) with few distinct readings, counted since the last second with many."""
         self._coarse_slot = [-math.inf, -math.inf]
-        """Latest seconds in which gyro and accelerometer changed in coarse steps, one for each triad."""
+        """Slots of the latest seconds in which the gyro, and the accelerometer, changed in coarse steps."""
         self._densities: deque[Floats] = deque(maxlen=_RECENT)  # Noise densities of seconds without motion
         self._density = np.zeros(6)
         """Noise density N^2, median of the latest seconds without motion; zero before the first of them."""
         self.new_stretch()
 
     def new_stretch(self) -> None:
-        """End the still stretch: drop the reference readings, but not the learned noise."""
+        """End the motionless period: drop the readings with which later ones are compared, not the learned noise."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
 
     def forget_level(self) -> None:
-        """Drop the reference readings after a write of offsets or a restart, which may change all later readings."""
+        """Drop all readings after a write of offsets or a restart, which can change all later readings."""
         self._own.clear()
         self.new_stretch()
 
@@ -205,8 +205,8 @@ class ImuGate:
     def _watch_steps(self, batch: Batch) -> None:
         """Detect a stream of floats with coarse steps: some logs are rounded, and some parts have few digits.
 
-        If the noise is smaller than a step, a still sensor shows one value or toggles between two. One second with few
-        values may come from a frozen sensor; several seconds show coarse steps.
+        If the noise is smaller than a step, a motionless sensor shows one value or toggles between two. A second with
+        few values can come from a frozen sensor; several such seconds show coarse steps.
         """
         levels = batch.distinct
         few = (levels >= 2) & (levels <= _FEW_LEVELS) & (levels * _TIMES_EACH <= batch.n)
@@ -275,13 +275,13 @@ class ImuGate:
 
 
 def _beyond(values: Floats, reference: Sequence[Floats], chance: Floats) -> float:
-    """Return the largest difference of a channel from the mean of the reference, minus the difference by chance."""
+    """Return the largest difference of a channel from its mean in earlier seconds, minus the difference by chance."""
     scatter = math.sqrt(1.0 + 1.0 / len(reference))  # sigma of the difference over that of one mean
     return float((np.abs(values - np.mean(reference, axis=0)) - scatter * chance).max())
 
 
 class PoseGate:
-    """Gate on the motion of the gradienter (two channels, deg) or of the compass (one channel on the circle, deg)."""
+    """Gate on the motion of the gradienter (two channels, deg) or of the compass (one channel, deg, modulo 360)."""
 
     def __init__(self, name: Literal["gradienter", "compass"]) -> None:
         self._name = name

@@ -1,17 +1,17 @@
-"""Noise of a still sensor with any spectrum: learned from its stream, and distinguished from motion by physics.
+"""Noise of a motionless sensor with any spectrum: learned from its stream, and distinguished from motion by physics.
 
-Behind a low-pass filter, the noise of a still sensor can be as slow and as large as the motion of an aircraft. Four
+Behind a low-pass filter, noise of a motionless sensor can be as slow and as large as the motion of an aircraft. Four
 facts distinguish noise from motion:
 
 - Noise behind any filter is flat down to zero frequency, or rises there (flicker). Its density, the Allan variance
   times the averaging time, never grows towards shorter times. A standing aircraft only rocks: its angle is bounded, so
-  its rate has no power at zero frequency, but a peak at the rocking frequency. Its acceleration is alike.
+  its rate has no power at zero frequency, but a peak at the rocking frequency. So has its acceleration.
 - Noise is steady: no second is an outlier among the others.
 - Noise has no favourite axis.
-- No part on the market exceeds a known density.
+- No sensor model on the market exceeds a known density.
 
 The density at averaging times of one second and more gives the chance error of a one-second mean. Variance over density
-is the number of independent values in a second; behind a filter, it is smaller than the number of samples.
+is the number of independent values in a second; behind a filter, there are fewer of them than samples.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 LEARN_S: Final = 30
-"""Seconds of rest needed to learn the noise: they give some 70 degrees of freedom in three axes."""
+"""Least seconds of rest from which noise is learned: their three axes give some 70 degrees of freedom."""
 KEPT_S: Final = 60
 EVERY_S: Final = 5  # Period of learning until both triads are known, then `LEARN_S`
 MOST: Final = (0.07 * DEG, 1.0 * MG)
 """Largest plausible noise N of gyro and accelerometer, SI * sqrt(s): 250 deg/h * sqrt(s) (the noisiest common gyro has
 150), and three times the noisiest common accelerometer."""
 RED: Final = 2.0
-"""Largest ratio of noise densities at averaging times of several seconds and of one, or of one and of half a second.
-Flicker, warm-up and a 1 Hz filter raise the ratio; slow rocking makes it 8 at twice the time."""
+"""Largest ratio of noise densities at two averaging times: several seconds and one second, or one and half a second.
+Flicker, warm-up and a 1 Hz filter raise the ratio; slow rocking makes it 8 from one averaging time to its double."""
 WHITE: Final = 0.8
-"""Share of the variance in successive differences above which noise counts as white, that is, unfiltered."""
+"""Noise is white (unfiltered) if successive differences show more than this share of its variance."""
 ROUND: Final = 40.0
-"""Limit for the ratio of noise variances in the noisiest and quietest direction: axes' sigmas differ up to 3 times."""
+"""Largest ratio of noise variances, noisiest over quietest direction: sigmas of axes differ by factors up to 3."""
 _SIGMAS: Final = 2.5
 _OUTLIER_SIGMAS: Final = 4.5
 _BEYOND: Final = 1.6  # Limit in multiples of the largest density, beyond which a second is motion
@@ -58,8 +58,8 @@ _SHARPEST: Final = 1.5
 class Known(msgspec.Struct, frozen=True):
     """Learned noise of the three axes of one triad at rest, in squares of the triad's unit; each (3,).
 
-    `variance`: of one sample. `white`: the part of it in successive differences (`Batch.white`). `density`: N^2 at low
-    frequencies, which is the variance of a one-second mean.
+    `variance`: of one sample. `white`: share of this variance in successive differences (`Batch.white`). `density`: N^2
+    at low frequencies, which is the variance of a one-second mean.
     """
 
     variance: Floats
@@ -78,10 +78,10 @@ class Known(msgspec.Struct, frozen=True):
 
 
 class OwnNoise:
-    """Learns the noise of one IMU from its seconds, at rest or not; has no result until it is certain.
+    """Estimator of the noise of one IMU from seconds at rest or not; without result until the noise is certain.
 
     `white`: the profile's white noise N of gyro and accelerometer; a configured part may be noisier than common parts.
-    `at_rest`: the operator confirms rest, so three times as much noise is accepted.
+    `at_rest`: the operator confirms rest, so noise up to three times the usual limit is accepted.
     """
 
     def __init__(self, white: tuple[float, float] = (0.0, 0.0), *, at_rest: bool = False) -> None:
@@ -94,13 +94,13 @@ class OwnNoise:
         self.clear()
 
     def clear(self) -> None:
-        """Drop readings with which later ones cannot be compared, but not the learned noise."""
+        """Drop the stored seconds, with which later ones cannot be compared, but not the learned noise."""
         self._seconds.clear()
         self._since = 0
         self._too_much = [False, False]
 
     def hint(self, triad: int) -> str:
-        """Return a hint that apparent motion of gyro (0) or accelerometer (1) may be noise; else empty."""
+        """Return a hint that apparent motion by gyro (0) or accelerometer (1) may be noise; else an empty text."""
         if self._at_rest or self.known[triad] is not None:
             return ""
         if self._too_much[triad]:
@@ -176,7 +176,7 @@ def _noise(seconds: list[Batch], part: slice) -> Known | None:
 
 
 def _ratio(first: float, second: float) -> float:
-    """Return the largest ratio, by chance, of two estimates of one variance, from their degrees of freedom."""
+    """Return the largest ratio by chance of two estimates of one variance; arguments: their degrees of freedom."""
     return math.exp(_SIGMAS * math.sqrt(2.0 / max(first, 1.0) + 2.0 / max(second, 1.0)))
 
 

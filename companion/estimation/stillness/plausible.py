@@ -1,4 +1,4 @@
-"""Detection of readings at rest that no bias explains: gravity along the wrong axis, or biases beyond any part's.
+"""Detection of readings at rest that no bias explains: gravity along the wrong axis, or beyond any sensor's bias.
 
 The cause is a wrong mounting, exchanged axes or a wrong unit. The text names the cause and the remedy. The gates, the
 estimate and `companion check` use this module.
@@ -25,7 +25,7 @@ _COMMON_BIAS_M_S2: Final = 0.05 * G  # Most parts' bias at power-up is below: 0.
 _EXPLAINED: Final = 0.3  # Largest error left, over the error before, if a turned tilt sensor explains it
 _FITS_M_S2: Final = 0.2 * G
 _AS_WELL_M_S2: Final = 0.02 * G
-"""Difference below which two mountings fit equally, as ROLL_180 and PITCH_180 do when level; choose the simplest."""
+"""Difference in fit below which the simpler of two mountings is chosen: ROLL_180 and PITCH_180 fit alike when level."""
 _AXES: Final = "xyz"
 _UNITS: Final = {"g": G, "mg": 1e-3 * G, "cm/s^2": 0.01, "ft/s^2": 0.3048}
 _GRAVITY_M_S2: Final = (8.3, 11.3)
@@ -44,7 +44,7 @@ def implausible(
     sensor_to_vehicle: Matrix,
     remedy: str,
 ) -> dict[Triad, str]:
-    """Return, for each implausible triad of a still IMU, the reason why no bias explains its mean readings.
+    """Return, for each implausible triad of a motionless IMU, the reason why no bias explains its mean readings.
 
     The means and `expected_m_s2`, the specific force by the tilt sensor, are (3,), vehicle axes (FRD). `remedy`: text
     on how to configure another mounting, with {} for the name of that mounting.
@@ -69,7 +69,7 @@ def implausible(
 
 
 def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehicle: Matrix, remedy: str) -> str | None:
-    """Explain why gravity differs from the tilt; None if both agree. The arguments are those of `implausible`."""
+    """Explain why gravity by the IMU differs from the tilt; None if both agree. Arguments: see `implausible`."""
     sizes = float(np.linalg.norm(force_m_s2)), float(np.linalg.norm(expected_m_s2))
     if min(sizes) == 0.0:
         return None
@@ -93,7 +93,7 @@ def misplaced(name: str, force_m_s2: Array, expected_m_s2: Array, sensor_to_vehi
 
 
 def _turned(force_m_s2: Array, expected_m_s2: Array) -> int | None:
-    """Return the turn of the tilt sensor about z, deg, that explains an error above a common bias; None without one."""
+    """Return the turn of the tilt sensor about z, deg, that explains an error above a common bias; None: none does."""
     off = float(np.linalg.norm(force_m_s2 - expected_m_s2))
     if off > _COMMON_BIAS_M_S2:
         for deg in (180, 90, 270):

@@ -1,8 +1,8 @@
 """Angular rate of the platform under a standing aircraft: an estimate with a sigma, not an assumption.
 
 A significant rate blocks a calibration. A smaller rate is not subtracted, because the ground usually does not turn, but
-adds to the sigma of every gyro. A slow tilting of gravity's direction adds to the sigma of level axes; the gates refuse
-a faster one.
+adds to the sigma of every gyro. A slow tilting of gravity's direction adds to the sigma of horizontal axes; the gates
+reject a faster one.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 LEAST_RAD_S: Final = 0.005 * DEG
-"""Least rate that blocks a calibration: a warming compass wanders by some tenths of a degree in a minute."""
+"""Least rate that blocks a calibration: a warming compass drifts by some tenths of a degree in a minute."""
 LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
-"""Least rate that blocks a calibration without a compass: a gyro that warms up unevenly can show as much."""
+"""Least rate that blocks a calibration without a compass: an uneven warm-up of the gyro can show as much."""
 SIGNIFICANT: Final = 4.0
-"""Threshold, in sigmas, for a rate that is checked every second; chance exceeds 3 in one of 100 still minutes."""
+"""Threshold in sigmas for a rate that is checked every second; by chance, 1 of 100 motionless minutes exceeds 3."""
 CHANCE_SIGMAS: Final = 2.0
 EVEN: Final = 0.25  # Share of the rate that each half of the headings must show; a jump shows in one half only
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True):
-    """Angular rate of the platform during a window: about the vertical, and tilting about level axes.
+    """Angular rate of the platform during a window: about the vertical, and tilting about horizontal axes.
 
     `by` None: no sensor measures the rate. `noise_rad_s`: sigma of the gyros without warm-up. `step_rad_s`: error of
-    the window's mean from a turn that may have begun within it. `is_vouched`: a compass has confirmed that the gyros'
-    reference rate at rest contains no turn.
+    the window's mean if a turn began within the window. `is_vouched`: a compass measured the turn during the rest with
+    which the gyros are compared.
     """
 
     rate_rad_s: float = 0.0  # About the vertical, clockwise seen from above; never subtracted
     sigma_rad_s: float = 0.0
     noise_rad_s: float = 0.0
     by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None = None
-    tilting_rad_s: Vector = (0.0, 0.0, 0.0)  # Level part, vehicle FRD
+    tilting_rad_s: Vector = (0.0, 0.0, 0.0)  # Horizontal part, vehicle FRD
     tilting_sigma_rad_s: float = 0.0
     step_rad_s: float = 0.0
     is_vouched: bool = True
@@ -65,7 +65,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_told(self) -> bool:
-        """True if sensors measure the rate; else the ground counts as fixed to the Earth."""
+        """True if the rate is measured and `is_vouched`; otherwise the ground counts as fixed to the Earth."""
         return self.by is not None and self.is_vouched
 
     @property
@@ -76,7 +76,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
     def variance(self) -> float:
         """Return the variance, (rad/s)^2, that the turn adds to the error of a vertical gyro.
 
-        Without a compass, the ground counts as fixed unless the gyros show more than chance.
+        Unless `is_told`, the ground counts as fixed if the gyros show no more than their noise.
         """
         if self.is_told:
             return self.rate_rad_s**2 + self.sigma_rad_s**2 + self.step_rad_s**2
@@ -84,7 +84,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
         return known**2 + self.step_rad_s**2
 
     def covariance(self, up: Array) -> Matrix:
-        """Return the covariance (3, 3), vehicle FRD, that the turn adds to the gyros' errors. `up` (3,): vertical."""
+        """Return the covariance (3, 3), vehicle FRD, that the turn adds to the gyros' errors; `up`: unit vector."""
         level = np.eye(3) - np.outer(up, up)
         tilting = level @ np.array(self.tilting_rad_s)
         return np.outer(up, up) * self.variance + np.outer(tilting, tilting) + level * self.tilting_sigma_rad_s**2
@@ -94,7 +94,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def by_compass(headings: Sequence[Batch]) -> Turn | None:
-    """Estimate the platform's rate from the slope of the heading; a jump of the heading is never significant."""
+    """Estimate the platform's rate from the slope of the heading; a heading that jumps gives no significant rate."""
     if len(headings) < FEWEST:
         return None
     slots = np.array([batch.slot for batch in headings], dtype=np.int64)
@@ -116,7 +116,7 @@ def by_compass(headings: Sequence[Batch]) -> Turn | None:
 
 
 def by_gyros(turns: Sequence[Turn]) -> Turn | None:
-    """Return the most precise rate of several IMUs, or, of those that contradict it, the one nearest to no turn."""
+    """Return the most precise of several IMUs' rates; if others contradict it, that with the fewest sigmas of turn."""
     if not turns:
         return None
     best = min(turns, key=lambda one: one.sigma_rad_s)
@@ -125,7 +125,7 @@ def by_gyros(turns: Sequence[Turn]) -> Turn | None:
 
 
 def by_both(gyros: Turn | None, seen: Turn | None) -> Turn:
-    """Combine gyros and compass; if they contradict each other, use gyros that show no turn, or else the compass."""
+    """Combine gyros and compass; in a contradiction, use the gyros if these show no turn, otherwise the compass."""
     if gyros is None or seen is None:
         return gyros or seen or Turn()
     if not gyros.is_vouched:

@@ -1,13 +1,13 @@
 """Detection of a turn of the ground, second by second, from compass and gyros.
 
-The compass shows a turn as a slope of the heading since the last movement. The gyros show it relative to their level,
-the mean rate at rest. If the heading turns while the gyros stay at their level, the magnetic field changes. If the
-gyros leave their level while the heading is constant, their bias has changed. One gyro without a compass cannot
-distinguish a turn from a new bias.
+The compass shows a turn as a slope of the heading since the last movement. The gyros show it as a change
+from their rest rates, the mean rates at rest. If the heading turns but the gyros stay at their rest rates, the magnetic
+field changes. If the gyros leave their rest rates but the heading is constant, their bias has changed. One gyro without
+a compass cannot distinguish a turn from a new bias.
 
-A gyro's bias does not jump; the rate of a platform that begins to turn does. The level before the current window limits
-the turn within it. The limit depends on white noise of both means, flicker and random walk in between, and warm-up (by
-the thermometer or by the slope of the rates).
+A gyro's bias does not jump; the rate of a platform that begins to turn does. The rest rate before the current window
+limits the turn within the window. The limit depends on white noise of rest rate and window mean, on flicker and random
+walk in between, and on warm-up (by the thermometer or by the slope of the rates).
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from companion.estimation.turning.turn import CHANCE_SIGMAS, SIGNIFICANT, Turn, 
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.units import DEG, DEG_H
 
-LEVEL_S: Final = 5  # Least seconds at rest for a level
+LEVEL_S: Final = 5  # Least seconds at rest for a rest rate
 RESTED_S: Final = 20
-"""Least number of seconds in a window before a step: just after power-up, a warm-up looks like a step."""
+"""Least number of seconds in a window before a step of the rate: just after power-up, a warm-up looks like a step."""
 NOISE_KNOWN_S: Final = 20
-"""Least number of seconds that show their white noise; in a shorter window, the noise of the last one is used."""
+"""Least number of seconds in a window that show its white noise; a shorter window uses that of the last long one."""
 PER_K_RAD_S: Final = 54.0 * DEG_H  # Bias of a common gyro per kelvin (BMI088, method.md section 2.1)
-PER_G_RAD_S: Final = 0.1 * DEG  # Sensitivity of an uncompensated MEMS gyro to gravity: the level depends on the tilt
+PER_G_RAD_S: Final = 0.1 * DEG  # Sensitivity of an uncompensated MEMS gyro to gravity: the rest rate depends on tilt
 EARTH_RAD_S: Final = 15.04 * DEG_H
 WARMING_S: Final = 120.0
-"""Assumed duration of a warm-up, s. A visible one was at most twice as steep before; an invisible one has ended."""
-WARMING_RAD_S2: Final = 0.5 * DEG_H  # Drift of an older level without thermometer, at most by `WARMED_RAD_S`
+"""Assumed duration of a warm-up, s. A visible warm-up was at most twice as steep before; an invisible one has ended."""
+WARMING_RAD_S2: Final = 0.5 * DEG_H  # Drift of an older rest rate without thermometer, up to `WARMED_RAD_S`
 WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
 RAMP_SIGMAS: Final = 1.5
 STEP_SIGMAS: Final = 5.0
 STEP_CHI_SQUARE: Final = 12.0  # Threshold of chi-square by which a step fits better than a cubic (a warm-up)
 ACROSS_SHARE: Final = 0.25
-"""Share of a turn about the vertical that appears on level axes if the vertical is wrong by some degrees."""
-STEADY_SIGMAS: Final = 2.5  # Seconds farther off do not join the level, else a slow turn would become the level
-CLEARED_S: Final = 10  # Seconds at the level after which the latest movement has not started a turn
+"""Share of a turn about the vertical that appears on horizontal axes if the assumed vertical is some degrees off."""
+STEADY_SIGMAS: Final = 2.5  # Seconds farther off do not count as rest, else a slow turn would become the rest rate
+CLEARED_S: Final = 10  # Seconds at the rest rate after which the latest movement has not started a turn
 SMOOTHED_OVER: Final = 5  # Headings in one value of the wander, so that noise does not look like wander
 BLIND_S: Final = 5  # Longest pause, for example while offsets are written, after which headings still belong together
 
@@ -56,19 +56,19 @@ _RATES: Final = slice(1, 4)
 _FORCES: Final = slice(4, 7)
 _READINGS: Final = slice(1, 7)  # Rates and forces, vehicle FRD
 _DEGC: Final = 7  # NaN without a thermometer
-_TURNED: Final = 8  # Variance of the platform's rate by the compass, for seconds of the level; NaN without a compass
+_TURNED: Final = 8  # Variance of the platform's rate by the compass, for seconds at rest; NaN without a compass
 
 
 class ImuLevel:
-    """Comparison of one IMU's rates in the current window with its level: the mean over the seconds at rest before.
+    """Comparison of one IMU's rates in the current window with the rest rate: the mean over the seconds at rest before.
 
     `rotation`: from sensor to vehicle FRD. `steps`: resolution of an integer stream, rad/s and m/s^2; 0 for floats.
 
-    `look` computes the results. `turn`: rate about the vertical, relative to the level; None without a level.
-    `has_changed`: the sensor has changed, because a rate about level axes differs, which no turn of the ground causes.
+    `look` computes the results. `turn`: rate about the vertical, minus the rest rate; None without a rest.
+    `has_changed`: the sensor has changed, because a rate about horizontal axes changed, as no turn does.
     `tilting_rad_s` (3,): rate at which gravity's direction tilts, vehicle FRD. `began`: first second after a step of
     the rate that neither noise nor warm-up explains. `step_rad_s`: error of the window's mean from the likeliest step;
-    0 if that step may be chance. `white`: white noise N about the vertical.
+    0 if chance explains that step. `white`: white noise N about the vertical.
     """
 
     def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
@@ -88,16 +88,16 @@ class ImuLevel:
         self.white = 0.0
 
     def add(self, slot: int, batch: Batch, turned: float | None) -> None:
-        """Add a still second to the window; the second that leaves it joins the level. `turned`: see `end_window`."""
+        """Add a motionless second to the window; the one that leaves it joins `rest`. `turned`: see `end_window`."""
         degc = math.nan if batch.temperature_degc is None else batch.temperature_degc
         self.window.append(np.array([slot, *self._rotation @ batch.mean, degc, math.nan]))
         self._variance = batch.variance
         self.end_window(turned, self._span)
 
     def end_window(self, turned: float | None, kept: int = 0) -> None:
-        """End the window, except for its latest `kept` seconds; the earlier seconds join the level.
+        """End the window, except for its latest `kept` seconds; the earlier seconds join the seconds at rest.
 
-        `turned`: variance of the platform's rate by compass, NaN without a compass; None: no second may join.
+        `turned`: variance of the platform's rate by compass, NaN without a compass; None: drop the earlier seconds.
         """
         while len(self.window) > kept:
             second = self.window.popleft()
@@ -110,7 +110,7 @@ class ImuLevel:
             self.rest.append(second)
 
     def split(self, slot: int) -> None:
-        """Make the window's seconds before a step the new level, and drop the seconds after the step."""
+        """Make the window's seconds before a step at `slot` the new seconds at rest; drop those after the step."""
         turned = self._usual()
         self.rest.clear()
         while self.window and self.window[-1][_SLOT] >= slot:
@@ -121,7 +121,7 @@ class ImuLevel:
         return sum(float(second[_TURNED]) for second in self.rest) / len(self.rest) if self.rest else math.nan
 
     def look(self) -> bool:
-        """Compare the window with the level, if any, and with gravity; return false while the window is too short."""
+        """Compute the results from the window and the seconds at rest; return false while the window is too short."""
         if len(self.window) < FEWEST:
             return False
         window = np.array(self.window)
@@ -149,13 +149,13 @@ class ImuLevel:
         if len(self.rest) >= LEVEL_S:
             self.turn, self.has_changed = self._above_level(window, slope, down)
         up, moves = -down, slope.per_s[3:] / size
-        # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
+        # d up / dt = -rate x up, so that the horizontal part of the rate is (d up / dt) x up.
         self.tilting_rad_s = np.cross(moves - up * (up @ moves), up)
         self.tilting_variance = float(slope.variance[3:].max()) / size**2
         return True
 
     def _above_level(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn, bool]:
-        """Return the turn relative to the level, and true if a rate about level axes differs significantly from it."""
+        """Return the turn relative to the rest rate, and true if rates about horizontal axes changed significantly."""
         count, weight = len(window), len(self.rest)
         level, now = np.array(self.rest).mean(axis=0), window.mean(axis=0)
         off = now[_RATES] - level[_RATES]
@@ -178,7 +178,7 @@ class ImuLevel:
         variance = noise + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
         across = np.abs(off - along * down)
-        # The heading may have changed: the Earth's rate then has another direction in the level plane.
+        # The heading may have changed: the Earth's rate then has another direction in the horizontal plane.
         limit = SIGNIFICANT * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
         turn = Turn(
             rate_rad_s=along,
@@ -211,17 +211,17 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tup
 
 
 class TurnWatch:
-    """Estimates the platform's rate from each second of gyros and compass; `span`: length of the longest window, s."""
+    """Estimator of the platform's rate from seconds of gyros and compass; `span`: length of the longest window, s."""
 
     def __init__(self, span: int) -> None:
         self._span = span
         self._levels: dict[str, ImuLevel] = {}
         self._headings: deque[tuple[bool, Batch]] = deque(maxlen=span)
-        """Seconds of the compass since the last movement, each with a flag: true if it belongs to the still stretch."""
+        """Compass seconds since the last movement, each with a flag: true if it belongs to the motionless period."""
         self._last_slot = 0
-        self._start: int | None = None  # First second of the still stretch
+        self._start: int | None = None  # First second of the motionless period
         self._is_suspect = False
-        """True after a movement or a step, when changed gyro rates may show a turn; otherwise they count as drift."""
+        """True after a movement or a step, when changed gyro rates can show a turn; otherwise they count as drift."""
         self.turn = Turn()  # Rate as of the last second
         self.words = ""
         """Reason, for the pilot, why a turn prevents a calibration; empty: no turn."""
@@ -236,7 +236,7 @@ class TurnWatch:
                 level.rest.clear()
 
     def new_stretch(self) -> None:
-        """End the still stretch; its seconds join the level at rest of each IMU."""
+        """End the motionless period; its seconds become seconds at rest of each IMU."""
         turned = self._turned()
         for level in self._levels.values():
             level.end_window(turned if level.rest or len(level.window) >= LEVEL_S else None)
@@ -258,10 +258,10 @@ class TurnWatch:
         return float(np.ptp(np.convolve(turned, np.full(SMOOTHED_OVER, 1.0 / SMOOTHED_OVER), "valid")))
 
     def add_second(self, slot: int, imus: Mapping[str, Batch], heading: Batch | None, *, good: bool) -> bool:
-        """Add a second in which no sensor but the compass may have moved; return false if it ends the still stretch.
+        """Add a second in which at most the compass moved; return false if the second ends the motionless period.
 
         `slot` must ascend. `heading`: None without a compass, or while the compass settles after a movement. `good`:
-        the second belongs to a still stretch.
+        the second belongs to a motionless period.
         """
         if slot - self._last_slot > BLIND_S:
             self._headings.clear()
@@ -277,9 +277,9 @@ class TurnWatch:
         return self._judge(slot)
 
     def _turned(self) -> float | None:
-        """Return the variance of the platform's rate by compass, NaN without one; None: no second may join a level."""
+        """Return the variance of the platform's rate by compass, NaN without one; None: no second counts as rest."""
         turn = self.turn
-        # With gyros alone, a gradual change counts as drift, and the level follows it.
+        # With gyros alone, a gradual change counts as drift, and the rest rate follows it.
         drifts = turn.by == "gyros" and not self._is_suspect
         if self.words or (not drifts and abs(turn.rate_rad_s) > STEADY_SIGMAS * turn.sigma_rad_s):
             return None
@@ -312,11 +312,11 @@ class TurnWatch:
         return True
 
     def _combined(self, found: list[ImuLevel]) -> Turn:
-        """Combine gyros and compass; an IMU that contradicts the result has changed, and its level restarts."""
+        """Combine gyros and compass; an IMU that contradicts the result has changed and loses its seconds at rest."""
         gyros = by_gyros([one.turn for one in found if one.turn is not None and not one.has_changed])
         seen = by_compass([batch for _, batch in self._headings])
         if seen is None or not seen.is_significant:
-            # A jump of the compass may lie before the still stretch.
+            # A jump of the compass may lie before the motionless period.
             seen = by_compass([batch for good, batch in self._headings if good])
         turn = by_both(gyros, seen)
         others = gyros or turn if turn.is_significant else turn
