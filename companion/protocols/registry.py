@@ -1,6 +1,6 @@
 """Protocols by their names in the configuration, and default line settings of their devices.
 
-A decoder returns the tilt of a frame once, as `TiltSample` or in its `CompassSample`; `part_for` splits it by role.
+A decoder returns a frame's tilt only once, as a `TiltSample` or within a `CompassSample`; `part_for` extracts it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Kind = Literal["imu", "gradienter", "compass"]
 class ProtocolInfo:
     """Protocol as used by one kind of device: its decoder, and the factory setting of the serial line.
 
-    The configuration may set `sigma_deg` (of tilt, or of a level heading) and `tilted_sigma_deg` to other values.
+    `sigma_deg` is for tilt or a level compass, `tilted_sigma_deg` for a tilted compass; the configuration may set both.
     """
 
     name: str
@@ -91,7 +91,7 @@ DEVICES: Final[dict[ProtocolInfo, dict[Kind, dict[str, Any]]]] = {
     # No default law: the compass' frame would have "euler", the inclinometer's frame probably "axis".
     ProtocolInfo("rion", 9600, RionDecoder, RionDialogue): {"gradienter": {}, "compass": {}},
 }
-"""Devices, one per protocol, each with the kinds that it can be used as and the settings that differ by kind."""
+"""Devices, one per protocol, with the kinds as which a device can be used and the settings that differ by kind."""
 
 _KINDS: Final[tuple[Kind, ...]] = ("imu", "gradienter", "compass")
 PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {
@@ -103,7 +103,7 @@ PROTOCOLS: Final[dict[Kind, dict[str, ProtocolInfo]]] = {
 
 
 def main_kind(name: str) -> Kind:
-    """Return the main kind of a protocol's device; raise ConfigError for an unknown protocol."""
+    """Return the first of compass, IMU, gradienter that speaks a protocol; raise ConfigError for an unknown one."""
     kinds: tuple[Kind, ...] = ("compass", "imu", "gradienter")
     for kind in kinds:
         if name in PROTOCOLS[kind]:

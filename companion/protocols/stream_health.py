@@ -20,9 +20,9 @@ SPAN_S: Final = 2.0
 GUESS_EVERY_S: Final = 5.0
 STUCK_S: Final = 1.0
 STUCK_SAMPLES: Final = 20
-"""Equal IMU readings in a row that prove a fault: one of six channels always changes. A tilt sensor may repeat one."""
+"""Equal IMU readings in a row that prove a fault, as one of six channels always changes; tilt readings may repeat."""
 NEAR_DEG: Final = 0.5
-"""Largest difference of readings that counts as unchanged (`near_since_s`): the motion itself may cause a hang."""
+"""Largest change of a reading that `near_since_s` ignores, deg, as a sensor may hang just after a motion begins."""
 
 _HARMLESS: Final = frozenset(
     {

@@ -5,7 +5,7 @@ AHRS_TRIM rotates the reported attitude only, not IMU data. A calibration leaves
 the old offset plus the residual (recipe (a) of docs/reference/autopilots 1.6).
 
 The temperature calibration INS_TCALn_* (AP_InertialSensor_tempcal.cpp, docs/reference/autopilots 10.1) corrects a
-reading in the IMU's axes. Here d is the temperature minus 35 degC, and both temperatures are limited to TMIN and TMAX:
+reading in the IMU's axes. Here d is a temperature minus 35 degC. Temperature and CALTEMP are limited to TMIN and TMAX:
 
     raw - (P(d) - P(d at CALTEMP)) - offset,    P(d) = (c1 d + c2 d^2 + c3 d^3) 1e-6
 
@@ -46,7 +46,7 @@ from companion.rotations import ROTATION_NAMES
 from companion.samples import Vector
 
 INSTANCES: Final = (1, 2, 3, 4, 5)
-"""Numbers of IMUs; 4 and 5 exist since ArduPilot 4.4 for auxiliary IMUs. No message carries their samples."""
+"""Numbers of IMUs; 4 and 5 exist since ArduPilot 4.4 for auxiliary IMUs, whose samples no message carries."""
 
 AT_START: Final = "INS_GYR_CAL"  # 1: the gyros are calibrated at every start
 
@@ -190,7 +190,7 @@ class ArduPilot(Firmware):
         accel: Polynomial | None,
         degc: float,
     ) -> list[Change]:
-        """Plan the changes that write temperature curves (reference 35 degC) and make the offsets hold at `degc`.
+        """Plan the changes that write temperature curves (reference 35 degC), and the offsets that are right at `degc`.
 
         Without a new accelerometer curve, an active old curve stays, limited to the new temperature span. An inactive
         old curve is cleared, because ENABLE would switch it on together with the gyros' curve.

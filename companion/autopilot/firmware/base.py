@@ -43,7 +43,7 @@ class Firmware:
     faster_log = ""
 
     def compass_ratio(self, message: Any) -> float:
-        """Return the compass innovation divided by its gate, from an `estimator_message`; 0: nothing compared."""
+        """Return the compass innovation divided by its gate, from an `estimator_message`; 0: no comparison made."""
         return 0.0
 
     # --- calibration of an IMU, and its write
@@ -75,13 +75,13 @@ class Firmware:
         accel: Polynomial | None,
         degc: float,
     ) -> list[Change]:
-        """Plan the changes that write curves over temperature; the IMU's output at `degc` stays unchanged."""
+        """Plan the changes that write curves of bias over temperature; the IMU's output at `degc` stays unchanged."""
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float
     ) -> tuple[list[Change], Matrix]:
-        """Plan the level for a measured tilt; also return the rotation that it adds, (3, 3), in vehicle axes."""
+        """Plan the changes of the level for a measured tilt; also return their rotation, (3, 3), in vehicle axes."""
         raise AutopilotError(message("firmware_not_supported", what="level"))
 
     # --- heading from outside; `found`: values of `heading_names`
@@ -111,7 +111,7 @@ class Firmware:
     async def find_gate_problem(
         self, parameters: Parameters, system_id: int | None, script_starts_s: float
     ) -> str | None:
-        """Return the settings still missing for the autopilot to ask us before it arms, as text; None: none missing.
+        """Return as text the settings without which the autopilot arms without asking us; None: nothing is missing.
 
         `script_starts_s`: wait before a second check if the script on the autopilot does not run yet.
         """
@@ -127,13 +127,13 @@ class Firmware:
         return []
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
-        """Explain why no ground station is received: return True if that is no fault, and cause and remedy as text."""
+        """Return whether it is normal that no ground station is received, and as text the cause and the remedy."""
         return True, message("no_ground_station_heard", why="none connected?")
 
     # --- derived from the values above
 
     async def read_rivals(self, parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
-        """Read the active parameters that overwrite our offsets, also those switched off that act until the next boot.
+        """Read which parameters overwrite our offsets, including any switched off that still act until the next boot.
 
         `seen` is stored between calls: the number of the boot in which each parameter was last found switched on.
         """
@@ -219,7 +219,7 @@ NO_IMU: Final = 0
 
 
 class SlotMemory:
-    """Memory of each device id's IMU and, since the last restart, of offsets in use and of what overwrites them."""
+    """Remembers each device id's IMU and, for one boot, the offsets in use and the parameters that overwrite them."""
 
     def __init__(self) -> None:
         self._instance_of: dict[tuple[Triad, int], int] = {}

@@ -28,7 +28,7 @@ from companion.samples import Triad, Vector
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rival:
-    """Parameter that makes the autopilot overwrite our gyro offsets, unless it is 0.
+    """Parameter that makes the autopilot overwrite our gyro offsets, unless the parameter is 0.
 
     `at_start`: overwrites only at a start of the autopilot. `from_boot`: read only at a boot, so switching it off has
     no effect before the next boot. `value`: as read; 0: switched off, but active until the next boot. `accelerometers`:
@@ -77,11 +77,11 @@ MAX_ACCEL_OFFSET_M_S2: Final = 3.5  # documented range of ArduPilot's INS_ACCOFF
 ACCEL_SCALE_RANGE: Final = (0.8, 1.2)  # documented range of ArduPilot's INS_ACCSCAL, which ArduPilot does not enforce
 
 FAR_GYRO_RAD_S: Final = 0.022
-"""Step that makes PX4 use new gyro offsets, 1.3 deg/s: over twice the step it ignores, and 22 digits of SCALED_IMU.
+"""Step that makes PX4 use new gyro offsets, 1.3 deg/s: over twice what PX4 ignores, 22 times SCALED_IMU's resolution.
 
 PX4 ignores a vector that differs by at most 0.01 (rad/s, m/s^2) from the one in use (docs/reference/autopilots 4.2).
 PX4 may read the parameters between any two writes, so the value in use may differ by 0.01 from the stored one. A step
-of more than twice that on one axis makes PX4 use the whole vector. The axis is the one nearest to the vehicle's
+of more than 0.02 on one axis makes PX4 use the whole vector. The chosen axis is the one nearest to the vehicle's
 vertical: a wrong value there turns the heading, but does not tilt.
 """
 FAR_ACCEL_M_S2: Final = 0.09  # 9 digits of SCALED_IMU: the least step that `parameters.verify` can detect
@@ -111,7 +111,7 @@ class Range:
 
 # The ranges include any value that an autopilot may have had before, as an undo restores it, but no nonsense.
 _GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
-"""Largest gyro offset that a calibration can still make plausible, plus the step to an intermediate value."""
+"""Largest gyro offset from which one calibration reaches a plausible offset, plus the step to an intermediate value."""
 _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
@@ -236,7 +236,7 @@ def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Ve
 
 
 def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Vector:
-    """Return the offset accel_offset + diag(1/accel_scale) R^-1 residual, float32; never 0, 0, 0 ("uncalibrated")."""
+    """Return accel_offset + diag(1/accel_scale) R^-1 residual, float32; not 0, 0, 0 if that means "uncalibrated"."""
     _require_plausible(calibration, "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2)
     step = (calibration.orientation.T @ np.asarray(residual_m_s2)) / np.asarray(calibration.accel_scale)
     after = _vector(np.asarray(calibration.accel_offset_m_s2) + step)
@@ -249,7 +249,7 @@ def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Ve
 def changes_for(
     calibration: ImuCalibration, gyro_residual_rad_s: Vector | None, accel_residual_m_s2: Vector | None
 ) -> list[Change]:
-    """Plan new offsets, accelerometers first (docs/reference/autopilots 9.3); residual None: leave those offsets.
+    """Plan new offsets, accelerometers first (docs/reference/autopilots 9.3); a residual of None leaves its offsets.
 
     Raises:
         CalibrationRefusedError: a value beyond the limits at the top of this file.
@@ -308,7 +308,7 @@ def output_step(
 ) -> tuple[Vector, Vector]:
     """Return the step of the IMU's output that the changes must cause: rad/s and m/s^2, vehicle FRD.
 
-    `accel_m_s2`: accelerometer output before the changes, which a change of scale multiplies.
+    `accel_m_s2`: accelerometer output before the changes; a change of scale multiplies this output.
     """
     names = calibration.parameters
     by_name = {change.parameter: change.after - change.before for change in changes}

@@ -99,7 +99,7 @@ SCRIPT: Final = {
     )
     for instance in (1, 2, 3)
 }
-"""Messages of our script on ArduPilot, by IMU: means of four calibrated, filtered readings, about eleven a second."""
+"""Messages of our ArduPilot script by IMU, some eleven a second, with means of four calibrated, filtered readings."""
 
 PX4_FLOATS: Final = dataclasses.replace(HIGHRES, name="HIGHRES_IMU+bias", lacks_bias=True)
 """HIGHRES_IMU of the IMU that PX4 uses for flight. PX4 subtracts EKF2's estimate of the bias, so at rest the message

@@ -10,7 +10,7 @@ without it. If active, it counts as a part of the sensor.
 A sensor's offsets are in the slot with its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, SCALED_IMU2 and
 SCALED_IMU3 show the pairs of gyro and accelerometer in the order in which their drivers started. No message has a
 device id (docs/reference/autopilots 4.1, 4.5). PX4 prefers the slot of the same number, so the order of the slots is a
-good guess. The telemetry after a write shows whether it was right, and `SlotMemory` stores that by device id.
+good guess. The telemetry after a write shows whether this guess is right, and `SlotMemory` stores this by device id.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ vector: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. At a start 
 MARGIN: Final = 1.05  # factor on `IGNORED_STEP`, as both sides round to 32 bits
 GATED_TILT_DEG: Final = 0.3
 """Least tilt error that requires a restart if EKF2 keeps it after a write. Biases of an uncalibrated sensor cause
-smaller ones (docs/reference/autopilots 9.3)."""
+smaller errors (docs/reference/autopilots 9.3)."""
 
 _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
@@ -155,7 +155,7 @@ class PX4(Firmware):
         )
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
-        """Return the tilt error left in EKF2, which learns a step of level or accelerometers very slowly."""
+        """Return the tilt error left in EKF2, because EKF2 learns a new level or accelerometer bias very slowly."""
         turned_deg = math.hypot(*(change.after - change.before for change in changes if change.parameter in LEVEL))
         step: dict[str, float] = {}
         for change in changes:
@@ -287,9 +287,9 @@ async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
 def choose_slot(
     memory: SlotMemory, sensor: Triad, instance: int, slots: Sequence[Slot], like: int | None = None
 ) -> Slot:
-    """Choose an IMU's slot (1 to 3) among the slots with a device id: the learned one, otherwise the best guess.
+    """Choose the slot of an IMU (1 to 3) among the slots with a device id: the learned one, otherwise the best guess.
 
-    `like`: device id of the IMU's other sensor, equal if one chip has both. Raises AutopilotError if there is no slot.
+    `like`: device id of the IMU's other sensor, equal if one chip has both. AutopilotError: no slot, or a disabled one.
     """
     prefix = PREFIX[sensor]
     memory.enabled[sensor] = sum(slot.enabled for slot in slots)

@@ -74,7 +74,7 @@ class Parameters(abc.ABC):
 
     @abc.abstractmethod
     async def ensure_same_boot(self, boots: int, doing: str) -> None:
-        """Request the time since boot; raise AutopilotRebootedError (with `doing`) if it restarted since `boots`."""
+        """Request the time since boot; raise AutopilotRebootedError if there were more than `boots` restarts by now."""
 
     async def read_vector(self, names: Names, low: float = -math.inf, high: float = math.inf) -> Vector:
         """Read three numbers, each from `low` to `high`; raise AutopilotError if one is outside."""
@@ -85,7 +85,7 @@ class Parameters(abc.ABC):
         return x, y, z
 
     async def read_integer(self, name: str) -> int | None:
-        """Read a whole number; None: the firmware lacks the parameter. Raises AutopilotError if it is no number."""
+        """Read a whole number; None: the firmware lacks the parameter. Raises AutopilotError if it is not finite."""
         value = await self.read_optional(name)
         if value is not None and not math.isfinite(value):
             raise implausible(name, f"{value}", "a number")
@@ -107,8 +107,8 @@ FailureKind = Literal[
 
 
 POLL_S: Final = 1.1
-"""Time after which every module of PX4 has read a new value: at most once a second (docs/reference/autopilots 9.2). If
-nothing was written for twice this time, each module reads the next value at once."""
+"""Time, s, within which each module of PX4 reads a new value: modules read at most once a second
+(docs/reference/autopilots 9.2). After twice this time without a write, each module reads the next value at once."""
 
 _AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
 
@@ -204,7 +204,7 @@ PendingVector = tuple[PendingChange, list[PendingChange]]  # the axis with an in
 
 
 def by_vector(items: Sequence[PendingChange]) -> tuple[list[PendingChange], list[PendingVector]]:
-    """Split into parameters without an intermediate value, and vectors with one; the order stays."""
+    """Split changes into single parameters, and vectors with an intermediate value on one axis; the order stays."""
     vectors: dict[str, PendingVector] = {
         _AXIS.sub("", item.change.parameter): (item, []) for item in items if item.change.via is not None
     }

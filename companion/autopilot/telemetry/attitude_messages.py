@@ -38,8 +38,8 @@ def vision_position_estimate(
 ) -> mavlink.MAVLink_vision_position_estimate_message:
     """Make the message with the attitude in NED (true north) and without a position.
 
-    ArduPilot discards the whole message if the position is not a number. ArduPilot computes the sigma of yaw as the
-    root of the sum of all three angles' variances, so we leave out the others. PX4 must not get a position.
+    ArduPilot discards the whole message if the position is NaN, so it gets 0; PX4 gets NaN. ArduPilot computes the
+    sigma of yaw from the sum of the variances of roll, pitch and yaw, so it gets only the variance of yaw.
     """
     sigma_roll, sigma_pitch, sigma_yaw = attitude.sigma_rad
     covariance = [0.0] * 21

@@ -107,7 +107,7 @@ class ImuStream:
 
     @property
     def wants_script(self) -> bool:
-        """Return True if the floats of ArduPilot's script are the current source, or better than it."""
+        """Return True if the floats of ArduPilot's script are the current source, or better than the current one."""
         for source in self._sources:
             if source.message.from_script and self._usable(source):
                 return True
@@ -218,7 +218,7 @@ class ImuStream:
         return False
 
     async def _keep(self, source: _Source) -> _Source | None:
-        """Use a source until it fails or the autopilot is lost (return None), or a better one sends (return that)."""
+        """Use a source until a better one sends and return the better one; None: source failed or autopilot lost."""
         loop = asyncio.get_running_loop()
         self._switch(source)
         silent_asks = 0
@@ -288,7 +288,7 @@ class ImuStream:
                     return
 
     def _usable(self, source: _Source) -> bool:
-        """Return True for the script while disarmed, for another source if the EKF bias that it lacks is known."""
+        """Return True for the script while disarmed, for another source unless it needs an EKF bias that is unknown."""
         if source.message.from_script:
             return self._vehicle.arm_state is ArmState.DISARMED
         return not source.message.lacks_bias or self._ekf_bias.known_of(self._instance)

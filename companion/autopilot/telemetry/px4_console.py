@@ -2,14 +2,14 @@
 
 HIGHRES_IMU carries floats of the IMU used for flight, minus the bias estimate of its EKF. No message carries that
 estimate, so `EkfBias` reads it at the console. PX4 publishes it once a second and after a change by 0.001 rad/s or
-m/s^2; it wanders slowly.
+m/s^2; the estimate wanders slowly.
 
 `ImuStatus` reads `vehicle_imu_status` of the other IMUs: means over 0.1 s of raw readings, in the vehicle's axes,
 without any correction (`VehicleIMU.cpp`). A few means a second show a bias below the resolution of SCALED_IMU's
-integers. The integers show whether the aircraft stood still in between.
+integers. The integers show whether the aircraft was motionless in between.
 
 The command `listener` prints topics with five decimals, which resolve 2 deg/h and 1 micro-g. No other command is sent,
-and only while surely disarmed. Each MAVLink port has its own console (docs/reference/autopilots 10.3).
+and `listener` only while surely disarmed. Each MAVLink port has its own console (docs/reference/autopilots 10.3).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Px4Console:
         link.subscribe(mavlink.MAVLink_serial_control_message, self._on_text)
 
     async def listener(self, topic: str, pattern: re.Pattern[str], *which: str) -> re.Match[str] | None:
-        """Print a topic and match its text to `pattern`; None: no answer in time, or no match."""
+        """Let PX4 print a topic and match the text to `pattern`; None: no answer in time, or no match."""
         async with self._lock:
             self.text, self._asked = "", topic
             self._answered.clear()
@@ -83,8 +83,8 @@ _AGAIN_S: Final = 60.0  # pause after `MISSES` answers in a row that were missin
 _TURN_S: Final = 0.5
 _OLD_S: Final = 45.0
 _CALM_S: Final = 60.0
-"""Wait after new offsets, which disturb the EKF's bias estimate for some seconds. On a ship's deck, integer messages
-show the effect of new offsets for 40 s, and floats that return earlier would restart that check."""
+"""Wait after new offsets, which disturb the EKF's bias estimate for some seconds. On a ship's deck, the effect of new
+offsets is checked for 40 s on integer messages; floats that return earlier would restart the check."""
 _UNITS: Final = np.repeat([1e-3, 1e-2], 3)
 _JUMP: Final = 0.5 * _UNITS  # largest change between two reads of a bias in use: 100 deg/h, 0.5 mg
 _STEADY: Final = 0.02 * _UNITS  # largest change within a second before the bias is used: 4 deg/h, 0.02 mg
@@ -127,7 +127,7 @@ class EkfBias:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Suspend reads of the EKF bias in a write of offsets and for `_CALM_S` after it, as the bias steps then."""
+        """Suspend reads of the EKF bias, which new offsets disturb, during a write of offsets and `_CALM_S` after."""
         self._held += 1
         self.forget()
         try:
@@ -179,7 +179,7 @@ class EkfBias:
         return _AT_FIRST_S if self._at_bias else 0.0
 
     async def _read(self) -> bool:
-        """Read alternately which EKF is in use, and its bias; return False if the console did not print it."""
+        """Read, alternating between calls, the EKF in use and its bias; False: the console did not print the answer."""
         self._at_bias = self._primary is not None and (self.instance is None or not self._at_bias)
         if not self._at_bias:
             found = await self._console.listener("estimator_selector_status", _PRIMARY)

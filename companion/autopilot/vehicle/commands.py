@@ -160,7 +160,7 @@ class StandingRequests:
         self._wanted: list[_Wanted] = []
 
     def add(self, message: type[Message], rate_hz: float | None, of: FirmwareName | None = None) -> None:
-        """Request a message from now on, from firmware `of` or any; without a rate only once, again after a restart."""
+        """Request a message of firmware `of` (None: any) from now on; without `rate_hz` once, and once per restart."""
         self._wanted.append(_Wanted(message, rate_hz, of))
 
     def heard(self, message: Message, t_s: float) -> None:

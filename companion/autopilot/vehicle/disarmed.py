@@ -50,11 +50,11 @@ class DisarmedProof:
         """Times from question to answer, s, also of a second answer to the same question."""
         self._begun_s = self._awake_s = math.inf
         self._answered_s = self._proven_s = -math.inf
-        """Times of the latest answered question, and of the latest question followed by a disarmed heartbeat."""
+        """Times of two questions: the latest answered, and the latest with an answer and then a disarmed heartbeat."""
 
     @property
     def slowest_s(self) -> float:
-        """Longest recent time to an answer. A forger may answer before the autopilot, so the slower one counts."""
+        """Longest recent time to an answer. A forger may answer before the autopilot, so the slower answer counts."""
         return min(max(self._answers_s, default=0.0), _LONGEST_WAIT_S)
 
     def begin(self, now_s: float) -> None:
@@ -89,7 +89,7 @@ class DisarmedProof:
         self._proven_s = self._answered_s
 
     def holds(self, now_s: float) -> bool:
-        """Check that a disarmed heartbeat followed a question, and no armed one within the time that answers need."""
+        """Check that a disarmed heartbeat followed a recent question, and no armed one within the time answers need."""
         return self.awake(now_s) and self.slowest_s <= now_s - self._proven_s <= PROOF_HOLDS_S
 
 

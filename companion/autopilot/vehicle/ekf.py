@@ -104,7 +104,7 @@ class EkfWatch:
         self._vehicle.commands.request_message_interval(_AHRS, _AHRS_RATE_HZ)
 
     def _mean(self, at_least_s: float) -> float | None:
-        """Average the last 2 s of readings (of more time on a busy line), largest axis; None: too few readings."""
+        """Average the last 2 s of readings (longer on a busy line), largest axis; None: too few readings."""
         now_s = asyncio.get_running_loop().time()
         taken: list[tuple[float, float, float, float]] = []
         for each in reversed(self._seen):

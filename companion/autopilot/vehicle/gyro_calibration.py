@@ -3,8 +3,8 @@
 The calibration also measures the gyros of all IMUs to some 10 deg/h, with the Earth's rotation in the result
 (docs/reference/autopilots 1.5, 3, 9.3.1). It writes their offsets, calibration temperatures and device ids, and zeros
 the values of absent gyros. The answer comes at its end, after 0.5 to 30 s; while it runs the offsets read zero. A
-second command meanwhile gets an early answer, as if all were done. So the command is sent once; the offsets show its
-end.
+second command meanwhile gets an early answer, as if all were done. So the command is sent once, and the offsets show
+when the calibration ends.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ _CHANGES: Final = 4
 _CHANGES_WITHIN_S: Final = 5.0  # arming and disarming twice within this time is more than pilots do
 _ONLY_ARMED_S: Final = 10.0
 _ONLY_DISARMED_S: Final = 30.0
-"""Time of only "disarmed" heartbeats that ends a contradiction. The second sender may have been silenced; only "armed"
-is believed earlier (`_ONLY_ARMED_S`), as it permits nothing."""
+"""Time of only "disarmed" heartbeats before they are believed again; long, as an "armed" sender may be silenced.
+"armed" heartbeats alone are believed earlier (`_ONLY_ARMED_S`), as they permit nothing."""
 _RESTARTS_S: Final = 1.0  # two restarts within this time mean two autopilots, whose times since boot alternate
 _TWO_HOLDS_S: Final = 5.0  # time after the last sign of a second autopilot for which neither is believed
 
@@ -64,7 +64,7 @@ class ArmingWatch:
         self._armed = armed
 
     def restarted(self, t_s: float) -> None:
-        """Discard earlier "disarmed" heartbeats; "armed" still counts, as a restart can be forged."""
+        """Discard earlier "disarmed" heartbeats; "armed" ones continue to count, as a restart can be forged."""
         self._armed = None
         if t_s - self._restarted_s < _RESTARTS_S:
             self.two_seen(t_s)
@@ -154,10 +154,10 @@ _WRAP_S: Final = 2**32 * 1e-3  # time_boot_ms has 32 bits: it starts again at ze
 class BootClock:
     """Detects restarts from the time since boot, which many messages carry.
 
-    A restart shows in one of two ways. First, the time goes back. Second, after a silence, the time has advanced by
-    less than half of the host's clock and is shorter than the silence. The autopilot then restarted while the link was
+    A restart shows in one of two ways. First, the time goes back. Second, after a silence, the time since boot is
+    shorter than the silence and has advanced by less than half of it. The autopilot then restarted while the link was
     lost, and its time since boot has overtaken the old one. The limit is half, because a simulator may run slower than
-    real time. On a busy machine it may even be slower than half; then a time since boot longer than the silence
+    real time. On a busy machine a simulator may even be slower; then a time since boot longer than the silence
     excludes a restart. The second way must hold for another half second, as the first messages after a pause of our own
     process are old.
     """
@@ -168,7 +168,7 @@ class BootClock:
         self._suspected_s = 0.0
 
     def rebooted(self, boot_s: float, t_s: float) -> bool:
-        """Note a time since boot received at `t_s`; return whether the autopilot restarted since the call before."""
+        """Note a time since boot received at `t_s`; return whether the autopilot restarted since the last call."""
         if self.latest is None:
             self.latest = (boot_s, t_s)
             return False

@@ -147,7 +147,7 @@ class ParameterClient(Parameters):
     async def read_optional(self, name: str) -> float | None:
         """Read a parameter like `read`; return None if the autopilot has no such parameter.
 
-        ArduPilot from 4.7 and PX4 from 1.17 answer an absent name with PARAM_ERROR. Older ones are silent, and often
+        ArduPilot from 4.7 and PX4 from 1.17 answer an absent name with PARAM_ERROR. Older firmware is silent, and often
         ArduPilot 4.8 too, as its PARAM_ERROR may go to another link. Silence means absence only while heartbeats arrive
         and the autopilot answers for another parameter right after. An absent name is remembered until the autopilot
         restarts or announces it.
@@ -194,11 +194,11 @@ class ParameterClient(Parameters):
         """Set a parameter and wait for the autopilot to confirm that value, within 1 ulp.
 
         The value is sent as the type that the autopilot has announced; a REAL32 is rounded to float32. A different
-        value may answer another sender's write, so the wait goes on; if nothing follows, it counts as the answer.
+        value may answer another sender's write, so the wait goes on; if nothing follows, this value is the answer.
 
         Raises:
-            NotDisarmedError: armed or arm state unknown just before a PARAM_SET. If that was a repetition, the first
-                one may have taken effect.
+            NotDisarmedError: armed or arm state unknown just before a PARAM_SET. If that PARAM_SET was a
+                repetition, the first one may have taken effect.
             ParameterTimeoutError: no answer within all retries; the write may have taken effect.
             ParameterMismatchError: the answer has another value.
             ParameterRefusedError: PARAM_ERROR, or the value is not a finite number.
@@ -240,7 +240,7 @@ class ParameterClient(Parameters):
 
     @property
     def integers_bytewise(self) -> bool:
-        """Return True if integers are sent as bytes. For unknown firmware AUTOPILOT_VERSION decides, maybe forged."""
+        """Check that integers are sent as bytes. For unknown firmware AUTOPILOT_VERSION, perhaps forged, decides."""
         if (known := self.vehicle.kind.integers_bytewise) is not None:
             return known
         return bool((self.vehicle.capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
@@ -261,7 +261,7 @@ class ParameterClient(Parameters):
             self._inboxes.remove(inbox)
 
     def _required_tries(self) -> Iterator[int]:
-        """Yield the numbers of the tries of a required request: 1 to 4, and up to 8 while heartbeats arrive."""
+        """Number the tries of a request that must be answered: 1 to 4, and up to 8 while heartbeats arrive."""
         for tries in range(1, _TRIES_MORE + 1):
             if tries > _TRIES and not self.vehicle.alive:
                 return

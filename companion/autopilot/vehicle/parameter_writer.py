@@ -1,4 +1,4 @@
-"""Writes of several parameters as one: all are written, or the old values restored, or the error names the others.
+"""Writes of several parameters as one: all are written, or all restored, or the error names the exceptions.
 
 MAVLink has no transactions, so this is an approximation (docs/reference/autopilots 8): read each old value, write one
 parameter after another, read all back, and check the arm state again. After any failure restore in reverse order. Each
@@ -134,7 +134,7 @@ class ParameterWriter:
             return self.written
 
     async def undo(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
-        """Restore `before` of every change, or of none; refuse if somebody has changed one since.
+        """Restore `before` of every change, or of none; refuse if somebody has changed a parameter since.
 
         Raises the errors of `apply`; in them "rolled_back" means that the value from before the undo is restored.
         """
@@ -195,7 +195,7 @@ class ParameterWriter:
             raise _Failure("wrong slot, orientation or scale", "; ".join(wrong))
 
     async def _write_far(self, item: PendingChange, probe: FarProbe | None) -> str | None:
-        """Write the intermediate value and wait until the autopilot uses it; return the reason if it does not."""
+        """Write the intermediate value and wait until the autopilot uses it; return the reason if a check fails."""
         verify = None if probe is None else probe(item.change.parameter)
         await self._write(item, item.change.far)
         item.is_far = True
@@ -266,7 +266,7 @@ class ParameterWriter:
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
     async def _put_back(self, items: list[PendingChange], *, leave_foreign: bool) -> None:
-        """Restore old values in reverse order until the deadline; vectors with an intermediate value get that first."""
+        """Restore old values, last first, until the deadline; a vector with an intermediate value gets it first."""
         touched = [item for item in reversed(items) if item.sent]
         for item in touched:
             item.outcome, item.left, item.read_back = "failed", True, None  # until read back

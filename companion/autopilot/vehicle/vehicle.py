@@ -1,6 +1,6 @@
 """State of the autopilot as seen over the link: identity, arm state, restarts and place.
 
-`arm_state` follows the heartbeats. It is UNKNOWN once the last one is 2 s old, and after a restart until the next one.
+`arm_state` follows the heartbeats. It is UNKNOWN from 2 s after the last heartbeat, and after a restart until the next.
 It is DISARMED only if no armed heartbeat with the vehicle's ids has come for 3 s, from any sender (`heartbeats`).
 Heartbeats may be old, so code that writes to the autopilot calls `disarmed.ensure` before every message.
 """
@@ -57,7 +57,7 @@ heartbeat."""
 class Vehicle:
     """Autopilot to calibrate: the one with the given system id, otherwise the first real one with a heartbeat.
 
-    The choice is final, and the link adopts the autopilot's system id. `is_carried`: see `TimeAndPlace`.
+    The choice is final, and the link adopts the autopilot's system id. `is_carried`: whether the place may change.
 
     A real autopilot sends heartbeats with a known autopilot type and the type of a vehicle; those of ground stations,
     gimbals, ADS-B receivers and the like are ignored. Component 1 is chosen at once, another component only if it is
@@ -166,7 +166,7 @@ class Vehicle:
     def hear(
         self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: FirmwareName | None = None
     ) -> None:
-        """Call `handler` with every such message of the autopilot; `rate_hz`: also request it (from firmware `of`)."""
+        """Call `handler` with each such autopilot message; `rate_hz`: also request it (only of firmware `of`)."""
         self._link.subscribe(message, self._of_ours(handler))
         if rate_hz is not None:
             self._wanted.add(message, rate_hz, of)
@@ -174,7 +174,7 @@ class Vehicle:
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
         """Request the time since boot and wait for it; afterwards `boots` counts every restart until now.
 
-        Without this request, a quick restart shows only at the next time message. Return False if none came in time.
+        Without this request, a quick restart shows only at the next time message. Return False on timeout.
         """
         request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
@@ -371,7 +371,7 @@ class VehicleTimer:
         self._boot, self._boots = vehicle.boot.latest, vehicle.boots
 
     def has_passed(self, seconds: float) -> bool:
-        """Check that this time has passed on both clocks, or on ours while the autopilot's is unknown."""
+        """Check that this time has passed on both clocks, or on ours if the autopilot's is unknown or far too slow."""
         gone_s = asyncio.get_running_loop().time() - self._t_s
         if gone_s < seconds:
             return False

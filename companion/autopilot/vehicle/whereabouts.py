@@ -1,6 +1,6 @@
 """Time and place reported by the autopilot, after checks against faults and forgery.
 
-A first place is accepted if it is possible and has been repeated. While the aircraft stands still, a place much farther
+A first place is accepted if it is possible and has been repeated. For a motionless aircraft, a place much farther
 off is accepted only after half a minute of reports without contradiction. Until then the old place stays, and `doubt`
 gives the reason why a calibration waits.
 """
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 LATEST_UNIX_TIME_S: Final = 4102444800.0  # the year 2100; a later time is a fault
 
 FAR_M: Final = 10_000.0
-"""Distance from which a place counts as another one: it changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h
+"""Distance from which a place counts as another one. Over it gravity changes by 0.01 mg, the Earth's rate by 0.03 deg/h
 at most. GNSS wanders by less."""
 FAR_HEIGHT_M: Final = 300.0  # least height that matters: 0.1 mg of gravity, half of a usual target; GNSS wanders less
 
@@ -83,7 +83,7 @@ class TimeAndPlace:
         return message("position_in_doubt", change=change, seconds=f"{left_s:.0f}")
 
     def restarted(self) -> None:
-        """Discard the autopilot's reports, but not the accepted place, as the aircraft stands still at a restart."""
+        """Discard the autopilot's reports, but not the accepted place, as the aircraft is motionless at a restart."""
         self.position = self._claim = self._unix_minus_loop_s = None
         self._heard_s = -math.inf
 

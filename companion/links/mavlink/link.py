@@ -46,7 +46,7 @@ class MavlinkLink:
         self.component_id = component_id
         self.turns = 0
         self.received: Counter[str] = Counter()
-        """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
+        """Counts of messages by type, and of "bad" (failed checks), "unknown" (not in the dialect), "handler error"."""
         self.sent = 0
         self.dropped = 0
         self.signing: Signing | None = None
@@ -84,7 +84,7 @@ class MavlinkLink:
         self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
-        """Set or remove a transport: `transmit` sends bytes (False: buffer full), `settled` receives what waits."""
+        """Set or remove a transport. `transmit` sends (False: buffer full), `settled` receives all waiting data."""
         self._transmit, self._settled = transmit, settled
         self._attached += 1
         self._forget_received()
@@ -95,7 +95,7 @@ class MavlinkLink:
         return self._settled()
 
     def send(self, message: mavlink.MAVLink_message, allowed: Callable[[], bool] = lambda: True, /) -> bool:
-        """Send a message now; False: no transport is attached, or its buffer is full.
+        """Send a message now; False: not allowed, no transport is attached, or its buffer is full.
 
         `allowed` is called last, directly before the bytes are sent.
         """
@@ -132,7 +132,7 @@ class MavlinkLink:
     def receive_datagram(self, datagram: bytes, t_s: float, admit: Callable[[Sender], None]) -> None:
         """Handle a datagram of whole messages; `admit` is called with each sender before its message has any effect.
 
-        `admit` is not called for a telemetry radio's own messages, because those carry no signature.
+        `admit` is not called for a telemetry radio's own messages, which carry no signature.
         """
         self.on_bytes.tell("in", datagram, t_s)
         frames = list(self._frames(datagram))

@@ -47,7 +47,7 @@ _TAIL: Final = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN
 _HASH: Final = 6
 
 Reason = Literal["unsigned", "other key", "old", "no key"]
-"""Cause of a refusal. "old": this message, or a much later one from its sender, was received before."""
+"""Cause of a refusal. "old": repeated, late (`LATE_TICKS`, `BEHIND_ITSELF_TICKS`), or beyond `MAX_STREAMS`."""
 
 
 def uptime_s() -> float:
@@ -93,7 +93,7 @@ class SigningClock:
         self._is_set = False
 
     def resume(self, ticks: int, *, is_set: bool) -> None:
-        """Continue from `ticks`, already used; `is_set`: set in this boot, so the system's clock sets it no more."""
+        """Continue from `ticks`, already used; `is_set`: set in this boot, so the system's clock cannot set it."""
         self._base, self._base_s, self._is_set = ticks, self._uptime_s(), is_set
 
     def now(self) -> int:
@@ -194,7 +194,7 @@ MAX_FILE_BYTES: Final = 1024
 
 
 def read_key(path: Path) -> bytes:
-    """Read the 32 bytes of a key file; raise LinkError, which never quotes the file, if it holds no key."""
+    """Read a key of 32 bytes from a file; if it holds no usable key, raise LinkError, which never quotes the file."""
     try:
         with path.open("rb") as file:
             rights = os.fstat(file.fileno()).st_mode

@@ -19,7 +19,7 @@ from companion.messages import message
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
-"""Maximum number of peers that get our messages; later ones are only received. The autopilot may replace a peer."""
+"""Maximum number of peers that get our messages; later peers can only send. The autopilot may replace a peer."""
 MOST_WAITING = 1024
 """Maximum number of datagrams in one reading, before any write; the kernel buffers some 300."""
 MOST_DATAGRAM_BYTES = 65536

@@ -198,7 +198,7 @@ class ByteLink:
             self._collecting = None
 
     def _fits_the_line(self, now_s: float) -> bool:
-        """Check that the line could carry the bytes since `_reads_since`; over USB they may come faster than that."""
+        """Check that the bytes since `_reads_since` came no faster than the line can carry; over USB they may."""
         since_s, bytes_then = self._reads_since
         carried = self.bytes_received - bytes_then
         return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)

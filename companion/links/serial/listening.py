@@ -31,7 +31,7 @@ from companion.protocols.guess import (
 )
 
 SILENT_S: Final = 3.0
-"""Wait at the first line setting before a port counts as silent: a sending device shows bytes at any speed."""
+"""Wait at the first line setting before a port counts as silent: a sending device shows bytes at any setting."""
 LINE_S: Final = 1.0
 LINE_MOST_S: Final = 2.5
 FEW_BYTES: Final = 100

@@ -65,7 +65,7 @@ def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
 
 
 def in_use(port: str, holders: Sequence[Holder]) -> str:
-    """Return the message that a port is in use; `holders` is empty if the rights to see the programs are missing."""
+    """Return the message that a port is in use; `holders`: programs that use it, empty if we lack the right to see."""
     programs = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
     return message("port_in_use", port=port, programs=f" ({programs})" if programs else "")
 
@@ -216,7 +216,7 @@ def port_faults(
     port: str, *, is_fast: bool = False, ours: Sequence[int] = (), among: Sequence[SerialPort] | None = None,
     root: Path = ROOT,
 ) -> list[PortFault]:  # fmt: skip
-    """List the faults of a port, worst first. `is_fast`: an IMU; `ours`: our process ids; `among`: all ports."""
+    """List a port's faults, worst first. `is_fast`: it has an IMU; `ours`: our process ids; `among`: all ports."""
     device = resolve(root, port)
     ports = list_ports(root) if among is None else among
     found = next((one for one in ports if one.device == device), None)
@@ -245,7 +245,7 @@ def port_faults(
 
 
 def same_ports(configured: dict[str, str], root: Path = ROOT) -> list[tuple[str, str, str]]:
-    """List pairs of configuration entries that are one device under two port names, each pair with that device."""
+    """List the pairs of configuration entries whose two port names are one device, and this device."""
     seen: dict[str, str] = {}
     found = []
     for name, port in configured.items():

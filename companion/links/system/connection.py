@@ -138,7 +138,7 @@ async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, add
 
 
 BYTES_PER_S: Final = 262144.0
-"""Limit of incoming bytes, above any sensor's: an IMU at 1 kHz with frames of 200 bytes, plus a margin; 2.6 Mbaud."""
+"""Limit of incoming bytes a second (2.6 Mbaud): an IMU with 1000 frames of 200 bytes a second, plus a margin."""
 BURST_BYTES: Final = 65536.0
 
 

@@ -90,7 +90,7 @@ def set_up_logs(level: str) -> None:
 
 
 def goes_to_journal(stream: TextIO) -> bool:
-    """Check that `stream` is the one in JOURNAL_STREAM; a process with redirected output inherits the variable too."""
+    """Check that JOURNAL_STREAM names `stream`; a process with redirected output inherits the variable too."""
     named = os.environ.get("JOURNAL_STREAM")
     if named is None:
         return False
@@ -102,7 +102,7 @@ def goes_to_journal(stream: TextIO) -> bool:
 
 
 class ServiceManager:
-    """Client of systemd's notify socket, if `address` is set; `watchdog_s`: longest time between WATCHDOG=1."""
+    """Client of systemd's notify socket, if `address` is set; `watchdog_s`: longest time between two WATCHDOG=1."""
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
         self._address = address or ""

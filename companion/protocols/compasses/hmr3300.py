@@ -24,7 +24,7 @@ _COUNTS = re.compile(rb"[+-]?\d{1,6}")
 _FRAGMENT = re.compile(rb"[-+0-9., ]+")
 _COUNTS_LIMIT = 32768
 _SURE = 3
-"""Lines of three numbers in a row after which a single number is a fragment, until as many single numbers follow."""
+"""Consecutive lines of three numbers that settle the format; as many consecutive lines of one number change it."""
 
 
 class Hmr3300Decoder(LineDecoder):

@@ -10,11 +10,11 @@ r"""NMEA 0183 sentences of compasses, and the Honeywell HMR3000's own sentences.
 Sources: the Furuno FR-1500 manual for NMEA 0183 (8.6, from IMO A.382), the JRC JLR-30 manual for THS (appendix 2-2),
 Honeywell's HMR3000 manual (900240 rev. B, p. 11 to 13, later edition p. 16). The talker may be any two characters.
 
-One compass may send several sentences for one reading, and with different norths. Only one sentence is used for
-headings at a time, in this order of precedence: HPR, HDG, HDM, CCD, THS, HDT. Other sentences count as duplicates. A
-sentence of lower precedence takes over after `HOLD_S` without the one in use, but only with the same north. Otherwise
-the heading would jump by the declination. The order for tilt is HPR, CCD, XDR. A `CompassSample` names its north,
-except from HPR, because the device may correct that heading by entered values.
+One compass may send several sentences for one reading, some from magnetic north, some from true north. Only one
+sentence is used for headings at a time, in this order of precedence: HPR, HDG, HDM, CCD, THS, HDT. Other sentences
+count as duplicates. If the sentence in use is absent for `HOLD_S`, one of lower precedence replaces it, but only one
+with the same north. Otherwise the heading would jump by the declination. The order for tilt is HPR, CCD, XDR. A
+`CompassSample` names its north, except from HPR: the device may correct an HPR heading by entered values.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _PLAIN: Final[dict[bytes, tuple[int, int, tuple[bytes, ...] | None, North]]] = {
     # Autonomous, estimated; M was typed in, S is simulated, V not valid.
     b"THS": (_THS, 3, (b"A", b"E"), "true"),
 }
-"""Sentences with a heading only: precedence, number of fields, values of the third (None: a deviation), north."""
+"""Sentences with a heading only: precedence, number of fields, allowed third field (None: a deviation), north."""
 
 _ALARMS: Final = frozenset((b"L", b"P"))
 _STATUSES: Final = frozenset((b"L", b"M", b"N", b"O", b"P", b"C"))

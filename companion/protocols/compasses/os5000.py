@@ -6,7 +6,7 @@ r"""OceanServer OS5000 family of compasses (OS4000 to OS5500): tagged fields aft
 The device's settings select the fields. Source: OS5000 user's guide, format type 0x01 (rev. 3.6, p. 12): the heading is
 "corrected for declination if one is entered", so the configuration must name its north. Magnetic fields are in
 milligauss only after a calibration with the local horizontal field entered; the manual's own example shows 108 gauss.
-A field stronger than any on Earth is therefore left out.
+A magnetic field stronger than any on Earth is therefore left out.
 """
 
 from __future__ import annotations

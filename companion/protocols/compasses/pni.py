@@ -138,7 +138,7 @@ def _possible(names: list[int], values: tuple[float, ...]) -> bool:
 
 
 def _components(frame: bytes, size: int) -> list[tuple[int, int]]:
-    """List the components (id, offset of its value) in the received part of a frame of `size` bytes."""
+    """List the received components of a frame of `size` bytes, each as its id and the offset of its value."""
     here, last = 4, size - 2
     parts: list[tuple[int, int]] = []
     for _ in range(frame[3] if len(frame) > 3 else 0):

@@ -1,7 +1,7 @@
 """Base classes of decoders: framing of lines, sentences and binary frames, counters, and checks.
 
 A decoder never raises, whatever its input. Samples and counts do not depend on how the stream is split into reads. The
-buffer of an unfinished frame is bounded. Only the first byte of a false frame is skipped: a good one may begin in it.
+buffer of an unfinished frame is bounded. Of a false frame only the first byte is skipped: a good one may begin inside.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
 AHEAD_S = 0.5
-"""Seconds by which bytes may be earlier than the baud rate permits; beyond that the line time is 0 (USB, no UART)."""
+"""Largest lead of bytes over the baud rate, s. Beyond it the port has no UART (USB), so a byte's line time is 0."""
 _STALL_S = 10.0
 
 NO_FRAME: Final = 0
@@ -28,7 +28,7 @@ ECHO: Final = "echo of a command"  # own command, or one of another master, on a
 
 
 class RejectedError(Exception):
-    """Error of a frame that cannot be used; its reason is a counter of `Decoder.rejected`. Decoders always catch it."""
+    """Error of an unusable frame. Decoders always catch this error and count its reason in `Decoder.rejected`."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -52,7 +52,7 @@ class Decoder(ABC):
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
         self.frame_bytes = self._earlier_bytes = 0
-        """Length of the latest frame, and length of earlier frames of the same reading."""
+        """Bytes in all frames of the latest reading; bytes in the reading's frames before its last one."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0
@@ -61,7 +61,7 @@ class Decoder(ABC):
         self._buffer = b""  # bytes of a possible frame; never longer than the longest frame
         self._received = self._origin = 0  # stream positions of the last byte and of the buffer
         self._chunks: deque[tuple[int, float]] = deque()
-        """Chunks that still have bytes in the buffer: stream position of each one's end, and time of its read."""
+        """Reads of which bytes are still in the buffer: stream position of the last byte read, and time of the read."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
         samples = self.feed(data, t_s)
@@ -109,7 +109,7 @@ class Decoder(ABC):
         self._chunks.clear()
 
     def _take(self, buffer: bytes, at: int, samples: list[Sample]) -> int:
-        """Append the samples of the frame at `at`, if one is there; return the number of bytes to skip, or `WAIT`."""
+        """Append the samples of a frame that begins at `buffer[at]`; return the number of bytes to skip, or `WAIT`."""
         try:
             size = self._size(buffer, at)
             if size <= 0:  # NO_FRAME or WAIT
@@ -137,7 +137,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def _size(self, buffer: bytes, at: int) -> int:
-        """Return the length of the frame at `at`, `NO_FRAME` for none, or `WAIT` if more bytes are needed.
+        """Return the length of the frame at `buffer[at]`, `NO_FRAME` for none, or `WAIT` if more bytes are needed.
 
         IndexError means `WAIT` too; RejectedError counts the frame and skips only its first byte.
         """
@@ -162,7 +162,7 @@ def xor_checksum(body: bytes) -> int:
 
 
 def body_of_sentence(sentence: bytes) -> bytes:
-    """Return the body of `$body*hh`, or VectorNav's `$body*hhhh` (CRC-16/XMODEM, UM001 3.8); raise RejectedError."""
+    """Check `$body*hh` or VectorNav's `$body*hhhh` (CRC-16/XMODEM, UM001 3.8); return `body` or raise RejectedError."""
     body, _, digits = sentence[1:].rpartition(b"*")
     if len(digits) not in (2, 4) or sentence[-1 - len(digits)] != ord("*"):
         raise RejectedError("no checksum")
@@ -179,7 +179,7 @@ GYRO_LIMIT_RAD_S = 100.0  # 5730 deg/s; the widest ranges sold are 4000 deg/s
 ACCEL_LIMIT_M_S2 = 2000.0  # 204 g; the widest range of a part with a gyro in it is 200 g
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Limit for an IMU, also in kelvin or tenths; `estimation/collector/intake.py` reports impossible values in degC."""
+"""Largest IMU temperature in any unit (degC, kelvin, 0.1 degC); `estimation/collector/intake.py` finds wrong units."""
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:
@@ -215,7 +215,7 @@ def check_vector(vector: Vector) -> None:
 
 
 class LineDecoder(Decoder):
-    r"""Decoder of lines that end in "\n". Only the last `LIMIT` bytes of a longer line are decoded, as `cut`."""
+    r"""Decoder of lines that end in "\n". Only the last `LIMIT` bytes of a longer line are decoded, with `cut` set."""
 
     START = re.compile(rb".", re.DOTALL)
     LIMIT: ClassVar[int] = 80
@@ -244,7 +244,7 @@ class LineDecoder(Decoder):
 
     @abstractmethod
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
-        r"""Decode one line without its "\n"; None: valid, but no sample (yet). Raise RejectedError to count it."""
+        r"""Decode a line without "\n" (`cut`: nor its beginning); None: valid, no sample yet. Raises RejectedError."""
 
 
 class SentenceDecoder(Decoder):

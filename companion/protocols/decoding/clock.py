@@ -3,7 +3,7 @@
 A read is delayed by the line, a USB adapter, or a busy host. So the offset between the two clocks is the running
 minimum of (read time - device time). The minimum may creep upwards, because two crystals drift apart. This estimate is
 causal and immune to stalls (docs/reference/sensors 4.4). If the device's clock went back or fell behind, the device has
-restarted. If it jumped forward, the device was replaced or the host slept. Both start a new mapping.
+restarted. If it jumped forward, the device was replaced or the host slept. In all cases the offset is measured anew.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ CREEP: Final = 100e-6
 """Largest rise of the minimum offset, s/s: two crystals of 50 ppm. A ceramic resonator also needs steps of `STEP_S`."""
 
 STEP_S: Final = 0.005
-"""Delay, s; if all samples of a `SPAN_S` are later than this, the offset between the clocks itself has changed."""
+"""Delay, s. If all samples within `SPAN_S` are delayed by more, the offset between the clocks itself has changed."""
 SPAN_S: Final = 1.0
 SPAN_SAMPLES: Final = 20  # fewest samples in a span: a USB adapter may delay all of a smaller number
 
@@ -29,7 +29,7 @@ LATE_S: Final = 1.0
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
-"""Share by which the two clocks' rates may differ when a wrap is recognised; a stall may add `_WRAP_S`."""
+"""Largest relative difference of the two clocks' rates at which a wrap is recognised; a stall may add `_WRAP_S`."""
 LATE: Final = "late"
 
 

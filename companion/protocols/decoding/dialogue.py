@@ -36,7 +36,7 @@ class Dialogue(ABC):
 
 
 class PollDialogue(Dialogue):
-    """Polls single readings: the next request follows the last answer; none while the device streams by itself."""
+    """Polls single readings: each request follows an answer; no request while the device streams by itself."""
 
     def __init__(self, question: bytes, name: str, *, period_s: float, set_up: bytes = b"") -> None:
         self.period_s = period_s
@@ -79,7 +79,7 @@ class PollDialogue(Dialogue):
 
 
 class WakeDialogue(Dialogue):
-    """Commands that wake a silent device, sent in turn with doubling pauses; none while the device sends anything."""
+    """Wakes a silent device by commands in turn, with doubling pauses; sends none while the device sends anything."""
 
     SAYINGS: ClassVar[tuple[tuple[bytes, str], ...]]
     _quiet_since_s: float | None = None

@@ -1,6 +1,6 @@
 """MicroStrain (HBK, LORD) inertial sensors: packets of the MIP protocol.
 
-    75 65  set  length  (length, descriptor, data)...  F1 F2        big-endian; F1 F2: 8-bit Fletcher over all before
+    75 65  set  length  (length, descriptor, data)...  F1 F2        big-endian; F1 F2: 8-bit Fletcher of all before
 
 Source: 3DM-GX5-35 data communications protocol manual, p. 12; MicroStrain's `mip_sdk`. Fields used from the sensor data
 (set 0x80): 0x04 accelerometer in g, 0x05 gyro in rad/s, 0x12 GPS time of week in seconds. Until the device has a GPS

@@ -11,8 +11,8 @@ of two. Until the range is known, samples far from 1 g in the assumed range are 
 
 *Time*: a sample is older than its datagram by the latency. *Counter*: internal samples, 2000 a second, modulo 256.
 
-*Axes* are those of figure 6-4; a cluster reads +1 g on the axis that points up. The inclinometers become a `TiltSample`
-of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity. So y, nose up, is
+*Axes* are those of figure 6-4; at rest the axis that points up reads +1 g. The inclinometers become a `TiltSample`
+of the law "axis": the elevation of each axis is the arc sine of its share of the measured gravity. So y, nose up, is
 asin(X / |g|). And x, right side down, is -asin(Y / |g|) with Z down (Y right), or +asin(Y / |g|) with Z up (Y left).
 The unit may lie on either side, with X forward. Beyond 60 degrees there is no `TiltSample`. Rates and forces stay in
 the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
@@ -45,12 +45,12 @@ SPECIAL_BYTES: Final[dict[int, int]] = {
 """Sizes, CRC included, of datagrams sent at start-up or on demand, by id; the second id of each pair ends in CR LF."""
 
 _VECTOR = "bHbHbHB"
-"""Struct format of three 24-bit numbers, each as its signed first byte and the rest, and of a status byte."""
+"""Struct format of three 24-bit numbers (each a signed first byte, then 16 unsigned bits) and a status byte."""
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -> tuple[struct.Struct, dict[str, int]]:
-    """Return the struct format of a STIM300 datagram without its CRC, and the index of each block in its values."""
+    """Return the struct of a STIM300 datagram without its CRC, and for each block the index of its first value."""
     code, count = ">x" + _VECTOR, 7
     places: dict[str, int] = {}
     for name, present in (("accel", accel), ("inclination", inclination)):

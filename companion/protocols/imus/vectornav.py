@@ -51,7 +51,7 @@ _GROUPS: Final[dict[int, tuple[str, dict[int, dict[str, int]]]]] = {
         },
     ),
 }
-"""Known groups: formats of their fields in the order of bits, and per bit the index of each used value in the field."""
+"""Groups: formats of all fields in the order of their bits; for some bits, indices of used values within the field."""
 _KNOWN_GROUPS: Final = 0x05
 # Preferred order: rate and acceleration from one group first, and compensated values (as in $VNYMR) before raw ones.
 _SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
@@ -59,7 +59,7 @@ _SOURCES: Final = ("", "imu ", "raw ", "imu raw ")
 
 @functools.lru_cache(maxsize=16)
 def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
-    """Return the struct of a frame without its CRC, and the index of each used value in it; raise RejectedError."""
+    """Return the struct of a frame without its CRC, and the index of each value used; RejectedError: unknown field."""
     places: dict[str, int] = {}
     code, count = f"<{len(header)}x", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
@@ -154,7 +154,7 @@ _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
     b"VNYMR": (12, slice(6, 12), slice(0, 0)),
     b"VNIMU": (11, slice(3, 9), slice(9, 10)),
 }
-"""Sentences: count of numbers, slice of acceleration and rate, slice of the temperature (empty: none)."""
+"""Sentences: count of numbers, slice with acceleration and rate, slice with the temperature (empty: none)."""
 
 
 def _command(body: bytes) -> bytes:

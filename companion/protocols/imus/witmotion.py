@@ -7,9 +7,9 @@
 Numbers have 16 bits, little-endian; SUM is the low byte of the sum of the ten bytes before it. Sources: WitMotion's
 WT901 data sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 by default).
 
-0x55 also occurs in data, and the sum is weak. So a frame is accepted only if another good frame follows at once. A
-single frame would pass at one offset in 10^6 of noise, and for one in 256 frames with a lost byte; a pair passes at one
-in 10^12. The cost: the last frame of a burst waits for the next burst, but its time stays right. The packets of
+0x55 also occurs in data, and the sum is weak. So a frame is accepted only if another good frame follows at once. Noise
+looks like one frame at one offset in 10^6, and like two at one in 10^12; one of 256 frames with a lost byte looks good.
+The cost: the last frame of a burst waits for the next burst, but its time stays right. The packets of
 Bluetooth models (0x61) have no checksum and are not read.
 
 The axes are the device's own, and Z is up. The angles turn Z-Y-X about these axes (WT901 p. 12), so with X forward and
@@ -45,7 +45,7 @@ class WitMotionDecoder(Decoder):
     """Decoder of WitMotion frames into `ImuSample` (from adjacent acceleration and rate) and `TiltSample`."""
 
     _good_at = -1
-    """Stream position of a good frame that followed another one, or that waits for the next one; -1: none."""
+    """Stream position of the newest frame that is known to have a right sum; -1: none."""
     _accel: tuple[int, Vector, float] | None = None
     """Acceleration frame that waits for its rate frame: stream position of its end, m/s^2, degrees Celsius."""
 

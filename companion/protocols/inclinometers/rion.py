@@ -33,7 +33,7 @@ _LENGTHS: Final[dict[int, frozenset[int]]] = {
     0x94: frozenset(range(10, LONGEST, 5)),
     _ANSWER: frozenset((_ANGLES_LENGTH, _LONG_ANGLES_LENGTH)),
 }
-"""Lengths that commands and answers may have, by command byte; for most the documents show only that they are short."""
+"""Allowed frame lengths by command byte; of most commands and answers the documents show only that they are short."""
 
 
 class RionDecoder(Decoder):
