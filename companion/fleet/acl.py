@@ -33,7 +33,7 @@ _READS: Final = (
 
 
 def access_list(aircraft: Sequence[str]) -> list[str]:
-    """Make the lines of the access list for aircraft given as "USER=ID"; if none is given, user names must be ids.
+    """Make the access list's lines for aircraft given as "USER=ID"; without any, each aircraft's user name is its id.
 
     Raises:
         ConfigError: an entry is not USER=ID, or an id has two users.

@@ -37,9 +37,9 @@ logger = logging.getLogger(__name__)
 BATCH: Final = 500
 GATHER_S: Final = 0.1
 ASK_AFTER: Final = 50
-"""Wait after an aircraft's hello message, in units of `GATHER_S`, before items are requested that may be on the way."""
+"""Delay from a hello to the request for missing items, in units of `GATHER_S`: items already sent arrive meanwhile."""
 WAITING: Final = 20 * BATCH
-"""Most received messages that wait to be stored; further ones are dropped, and the aircraft resend them."""
+"""Largest number of received messages that wait to be stored; more are dropped, and the aircraft resend them."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
 BATCH_BYTES: Final = 4 * 1024 * 1024  # Most bytes stored at once; a database makes several copies of them
 AT_ONCE: Final = 50  # Answers sent concurrently; the time that aiomqtt needs for each grows with their number

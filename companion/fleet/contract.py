@@ -48,7 +48,7 @@ class NotTakenError(Exception):
 
 
 class Hello(msgspec.Struct, frozen=True):
-    """Message of an aircraft at each connection: the range of sequence numbers of the items that it stores."""
+    """Message of an aircraft at each connection: the range of numbers of the items that the aircraft stores."""
 
     format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]
     aircraft: _Aircraft
@@ -60,7 +60,7 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class ReceivedItem(msgspec.Struct, frozen=True):
-    """Received item: a result or event of an aircraft. Newer formats may change all but aircraft, epoch, sequence."""
+    """Received result or event of an aircraft. Newer formats may change all fields but aircraft, epoch, sequence."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
     aircraft: _Aircraft
@@ -81,7 +81,7 @@ def _row(table: sa.Table, told: _Object) -> Row:
 
 
 def _fitting(column: sa.Column[Any], value: object) -> Any:
-    """Convert a JSON value to the type of a database column; raise NotTakenError if it does not fit."""
+    """Convert a JSON value to the type of a database column; raise NotTakenError if the value does not fit."""
     kind = column.type
     if value is None and column.nullable:
         return None
@@ -218,12 +218,12 @@ def addressed(topic: str) -> tuple[str, str] | None:
 
 
 def read_hello(aircraft: str, payload: bytes) -> Hello:
-    """Parse a hello; raise NotTakenError if it is invalid, has a newer format, or its topic has another aircraft."""
+    """Parse a hello; raise NotTakenError if it is invalid, has another format, or names a different aircraft."""
     return _decode(aircraft, payload, Hello)
 
 
 def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
-    """Parse an item's key, in any format; raise NotTakenError if it has none or its topic has another aircraft."""
+    """Parse an item except its body; raise NotTakenError if its key is invalid or names a different aircraft."""
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
     return _decode(aircraft, payload, ReceivedItem)
@@ -282,7 +282,7 @@ def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
 
 
 def _same(item: ReceivedItem, rows: Rows, body: _Object) -> str:
-    """Hash an item's content without `undone_at`: equal if an aircraft with a new memory card sends the item again."""
+    """Hash an item's content without `undone_at`: an item that a new memory card sends again has an equal hash."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
     told_again = msgspec.json.encode((item.kind, item.at, content if rows else body), order="deterministic")
     return hashlib.sha256(told_again).hexdigest()[:32]

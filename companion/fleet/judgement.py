@@ -28,13 +28,13 @@ LEARNS: Final = 16
 _WITH_MODEL: Final = 10
 """Number of first power-ups that define an IMU's usual bias, if statistics of its model define the scatter."""
 _OF_MODEL, _OF_OWN = 1.5, 3.0
-"""Largest scatter accepted as usual for an IMU, as a multiple of its model's, or of its own at the first power-ups."""
+"""Largest factor by which an IMU's scatter may exceed its model's, or its own at the first power-ups, as usual."""
 WANDER: Final = (0.03, 0.3)
-"""Limits of a bias's lasting change (sigma) from one power-up to the next, as fractions of its turn-on scatter."""
+"""Least and largest assumed sigma of a bias's lasting change per power-up, as fractions of the turn-on scatter."""
 LEAST_SIZE: Final = 1.8
 LEAST_TIMES: Final = 1.4
 _FEW_TELL: Final = 1.2
-"""Factor on the scatter at an IMU's first power-ups: estimated from few values, the scatter may be too small."""
+"""Factor that enlarges the scatter of an IMU's first power-ups: an estimate from few values may be too small."""
 _LEAST_NOISE: Final = 0.08
 """Least assumed scatter of the natural logarithm of an IMU's noise, as each noise is measured over some ten seconds."""
 _BOUND_DEG: Final = 5.0
@@ -43,7 +43,7 @@ SHOWN_POWER_UPS: Final = 30
 _AXES: Final = [f"{triad} {axis}" for triad in ("gyro", "accel") for axis in "xyz"]
 LEAST_ZERO_SIGMAS: Final = 8.0
 ZERO_USUAL_DEG: Final = 0.05
-"""One-sigma difference between two zeros of a good gradienter (inclinometer), due to the air's temperature; degrees."""
+"""One-sigma difference, degrees, of two zero offsets of a sound gradienter (tilt sensor), due to air temperature."""
 MOST_CALIBRATIONS: Final = 2000
 """Number of latest calibrations of an aircraft that are used: five years at one a day."""
 SAME_POWER_UP_WITHIN: Final = datetime.timedelta(minutes=30)
@@ -61,7 +61,7 @@ class PartHistory(NamedTuple):
 
     Columns of (n, 6) arrays are gyro x y z in rad/s, then accelerometer x y z in m/s^2. `biases` are not combined with
     earlier calibrations. `white` is the white noise, in these units times sqrt(s). `new_zero`, (n,), is True where the
-    gradienter has another zero than at the power-up before.
+    gradienter's zero offset was measured anew since the power-up before.
     """
 
     at: Sequence[datetime.datetime]
@@ -75,7 +75,7 @@ class PartHistory(NamedTuple):
 class PartFinding(NamedTuple):
     """Finding about a sensor that may be failing.
 
-    `axis`: 0 to 2 gyro x y z, 3 to 5 accelerometer x y z, -1 none. `since`: index of the power-up at which it began.
+    `axis`: 0 to 2 gyro x y z, 3 to 5 accelerometer x y z, -1 none. `since`: index of the power-up when the fault began.
     `size`: multiple of the usual value. `moved`: change of the bias, rad/s or m/s^2.
     """
 
@@ -88,7 +88,7 @@ class PartFinding(NamedTuple):
 
 
 def columns_of(history: PartHistory, model: Floats | None) -> Columns:
-    """Make the 12 columns to be tested: 6 biases and their 6 noises. `model`: scatter of other IMUs of this model."""
+    """Make the 12 columns to test: 6 biases, then 6 noises. `model`: scatter of other IMUs of the same model."""
     turn_on = _FEW_TELL * scatter_of_part(history.biases[:LEARNS], history.temperature_degc[:LEARNS])[0]
     wander = np.full(6, WANDER[0])
     first, most_own = np.full(12, LEARNS), np.full(12, _OF_OWN)
@@ -297,7 +297,7 @@ def _biases(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], d
 
 
 def _power_ups(calibrations: list[_CalibrationOfImu]) -> list[_CalibrationOfImu]:
-    """Select the last calibration of each power-up, since the present sensor was installed in this IMU's place.
+    """Select the last calibration of each power-up of the present sensor; earlier sensors of this IMU are left out.
 
     Calibrations soon after each other count as one power-up only if their biases agree, because a clock may be wrong.
     """

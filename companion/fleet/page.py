@@ -47,7 +47,7 @@ _ORDERED: Final = (
     " ORDER BY w.size DESC NULLS LAST, s.untold, s.standing, s.heard_at DESC NULLS LAST, s.aircraft"
     " LIMIT :most"
 )
-"""SQL query of aircraft in the page's order. Ids without a calibration are last: they may be invented by somebody."""
+"""SQL query that selects the aircraft to list. Ids without a calibration come last: anybody may have invented them."""
 
 
 def standing(one: Any) -> tuple[str, str, str]:
@@ -181,7 +181,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:
-    """Return a figure of one IMU for x y z, in deg/h or mg; None if it is unknown for any axis."""
+    """Return the bias or sigma of a gyro (deg/h) or accelerometer (mg), x y z; None if it is unknown for any axis."""
     column = f"{triad}_{what}_{UNITS[triad].name.replace('/', '_')}"
     x, y, z = (getattr(axes[axis], column) for axis in "xyz")
     return None if None in (x, y, z) else (x, y, z)
@@ -219,7 +219,7 @@ def _notes(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _refused(connection: sa.Connection, now: datetime.datetime) -> Markup | None:
-    """Render the latest rejected payloads by topic; by the broker's access list, only a topic's owner can send them."""
+    """Render the latest rejected payloads by topic; the broker's access list lets one aircraft publish to a topic."""
     last = sa.select(rejected).order_by(rejected.c.last_at.desc()).limit(MOST_REFUSED).subquery()
     of = last.c.topic.startswith("fleet/" + known.c.aircraft + "/")
     query = sa.select(last, known.c.name).outerjoin_from(last, known, of).order_by(last.c.last_at.desc())

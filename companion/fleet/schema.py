@@ -27,7 +27,7 @@ OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.Programmin
 
 
 class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
-    """Column type for a time in UTC, with its zone in Python, although SQLite stores text without a zone."""
+    """Column type for a time in UTC. In Python it always has a time zone, although SQLite stores text without one."""
 
     impl = sa.DateTime(timezone=True)
     cache_ok = True
@@ -41,7 +41,7 @@ class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
 
 
 class Words(sa.types.TypeDecorator[str]):
-    """Column type for text; zero characters, which PostgreSQL refuses, are replaced by U+FFFD."""
+    """Column type for text; NUL characters, which PostgreSQL refuses, are replaced by U+FFFD."""
 
     impl = sa.Text
     cache_ok = True
@@ -276,7 +276,7 @@ def bring_up_to_date(connection: sa.Connection) -> None:
 
 
 def views() -> list[tuple[str, str, str]]:
-    """List name, purpose and SQL query of each database view; a view comes after those that it uses."""
+    """List name, purpose and SQL query of each database view; a view comes after the views that it uses."""
     return _VIEW.findall(_VIEWS.read_text(encoding="utf-8"))
 
 

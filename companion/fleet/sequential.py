@@ -1,9 +1,9 @@
 """Statistics of values measured at each power-up (biases, noise): scatter, and tests for a change of mean or scatter.
 
-A Kalman filter predicts each value from the earlier ones: a slowly changing level plus a cubic over temperature. Its
-normalised residuals are summed in two-sided CUSUM tests (Page, Biometrika 41 (1954) 100-115) for a changed level. A
-likelihood-ratio CUSUM of each value's distance from the three before it detects twice the scatter. One value counts at
-most `CLIP` sigmas, so that one knock raises no alarm.
+A Kalman filter predicts each value from earlier ones: a slowly changing mean (the level) plus a cubic in temperature.
+The residuals in sigmas are summed in two-sided CUSUM tests (Page, Biometrika 41 (1954) 100-115) for a changed level.
+For doubled scatter, a likelihood-ratio CUSUM tests each value's distance from the median of the three before it. One
+value counts at most `CLIP` sigmas, so that one knock raises no alarm.
 
 With these limits tests/judgement_study.py finds less than one false alarm per hundred aircraft and month. The columns
 of an IMU are gyro x y z, then accelerometer x y z, vehicle FRD, SI units.
@@ -24,22 +24,22 @@ from companion.physics.statistics import MAD_TO_SIGMA
 LEAST_POWER_UPS: Final = 8
 LEAST_PARTS: Final = 4
 WANDER_LAG: Final = 30
-"""Distance, in power-ups, of two biases whose difference shows the bias's random walk from power-up to power-up."""
+"""Number of power-ups between two biases whose difference measures the bias's random walk over power-ups."""
 _POWER_UPS_PER_TEMPERATURE_TERM: Final = 24
 _OUTLIER_SIGMAS: Final = 3.0
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
-"""Columns with a common scatter: gyros, accelerometers x and y with the gradienter's error, and accelerometer z."""
+"""Columns that share one scatter: gyros; accelerometers x and y, which include the tilt sensor's error; accel z."""
 CLIP: Final = 3.0
 LEAST_SHIFT: Final = 0.5
-"""Reference value of the CUSUM tests, in sigmas: half of the shift of a level that they detect fastest."""
+"""Constant subtracted in each step of the CUSUM sums, in sigmas: half of the change that they detect fastest."""
 LEVEL_LIMIT: Final = 17.0
 SCATTER_LIMIT: Final = 20.0
 _FURTHER: Final = 6.0
-"""Largest excess of the scatter test's sum over its limit, so that the sum falls soon after the scatter falls."""
+"""Largest excess of the scatter test's sum over its alarm limit, so that the sum falls soon after the scatter."""
 _TWICE: Final = (0.375, np.log(2.0))
-"""Factor of z^2 (z: residual in sigmas), and subtracted constant, in the log-likelihood ratio of doubled scatter."""
+"""Log-likelihood ratio of doubled to usual scatter: factor of z^2 (z: residual in sigmas), subtracted constant."""
 OWN_WEIGHT: Final = 8.0
-"""Weight of the initial scatter against an IMU's own, in power-ups: scatters within one model differ by a quarter."""
+"""Weight of the initial scatter, as a number of an IMU's own power-ups: scatters within a model differ by a quarter."""
 _HELD_SIGMAS: Final = 2.5
 _MEAN_SQUARE_OF_HELD: Final = 0.9775  # mean square of a standard normal number clipped to `_HELD_SIGMAS`
 _VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # variance of the median of three standard normal numbers
@@ -53,11 +53,11 @@ _BASE_POWER_UPS: Final = 20
 
 
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Floats:
-    """Estimate the scatter of an IMU's c values at n power-ups in order, (n, c), with temperatures (n,); NaN: unknown.
+    """Estimate the scatter of each of c columns of values at n power-ups, (n, c), at temperatures (n,); NaN: unknown.
 
-    First row of the result, (2, c): turn-on sigma at one temperature, errors of the calibrations included. Second row:
-    sigma of the lasting change per power-up. Both are from the steps between power-ups, corrected for temperature:
-    neither ageing nor one sudden change of the bias makes these steps larger.
+    First row of the result, (2, c): turn-on sigma at one temperature, errors of the calibrations included; ageing or
+    one sudden change hardly alters it. Second row: sigma of the lasting change per power-up. Both come from the median
+    size of differences between power-ups, corrected for temperature.
     """
     return np.array([_column(column, temperature_degc) for column in biases.T]).T
 
@@ -106,10 +106,10 @@ def _sigma(steps: Floats) -> float:
 
 
 class Alarm(NamedTuple):
-    """Change of one column's level or scatter, detected at power-up `at`; `since` is the first power-up of the change.
+    """Change of one column's mean (level) or scatter, detected at power-up `at`; it began at power-up `since`.
 
-    `until`: power-up at which the scatter was usual again; the number of power-ups for "not yet" and for a change of
-    level. `size`: change of the level, or scatter since the change, as a multiple of the usual scatter.
+    `until`: power-up at which the scatter was usual again. If it never was, or if the level changed, `until` is the
+    number of all power-ups. `size`: change of the level, or scatter since `since`, in multiples of the usual scatter.
     """
 
     column: int
@@ -132,11 +132,11 @@ class Columns(NamedTuple):
     """Excess of each value's variance over the usual variance, (n, c), in squared multiples of the usual scatter."""
     temperature_degc: Floats
     wander: Floats
-    """One-sigma change of a column's level from one power-up to the next, (c,), as a multiple of the usual scatter."""
+    """One-sigma change of a column's mean from one power-up to the next, (c,), as a multiple of the usual scatter."""
     relevel: NDArray[np.bool_]
-    """True at power-ups where the reference of a measurement was replaced, so that the level may jump; (n, c)."""
+    """True, (n, c), at the first power-up after the tilt sensor's zero was measured anew: a column's mean may jump."""
     first: NDArray[np.int_]
-    """Number of first power-ups that define the usual level and scatter of each column, (c,), at least 3."""
+    """Number of first power-ups that define the usual mean and scatter of each column, (c,), at least 3."""
     most_own: Floats  # (c,) largest scatter of a column accepted as usual, as a multiple of the usual scatter
     least: Floats  # (c,) least change of level, or scatter, that raises an alarm
     unit: Floats
@@ -239,7 +239,7 @@ def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
 
 
 def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
-    """Fit level and temperature polynomial to one column's first power-ups; return them, covariance, sum of squares.
+    """Fit a cubic in temperature to one column's first power-ups; return coefficients, covariance, sum of squares.
 
     Huber weights reduce the effect of calibrations during which the aircraft was knocked.
     """

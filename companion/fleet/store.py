@@ -43,7 +43,7 @@ _AGAIN: Final = 500  # Stored items parsed per transaction after an update that 
 
 
 class BatchResult(NamedTuple):
-    """Result of a batch: item numbers to confirm and to request, by aircraft and epoch (id of a numbering); rejects."""
+    """Result of a batch: item numbers to confirm and to request, by (aircraft, id of numbering); rejected messages."""
 
     confirmed: dict[tuple[str, str], list[int]]
     wanted: dict[tuple[str, str], list[list[int]]]
@@ -117,7 +117,7 @@ class Store:
             return None
 
     def take(self, messages: Sequence[Incoming]) -> BatchResult:
-        """Store a batch of messages in the database; refused ones go to the table `rejected` with their reasons.
+        """Store a batch of messages in the database; refused messages go to the table `rejected` with their reasons.
 
         Raises:
             LinkError: the database cannot be reached, or fails; nothing of the batch may be confirmed.
@@ -199,7 +199,7 @@ class Store:
         connection.execute(insert.on_conflict_do_nothing(), values)
 
     def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
-        """Return one INSERT statement for all rows, and its values; for PostgreSQL as JSON, which is 3 times faster."""
+        """Return one INSERT statement for all rows, and its values: as JSON for PostgreSQL, which is 3 times faster."""
         insert, names = self._insert(table), list(rows[0])
         if self._insert is sqlite.insert:
             return insert, rows
@@ -256,7 +256,7 @@ class Store:
             connection.execute(sa.delete(table).where(table.c.digest.in_(beyond)))
 
     def _reject(self, message: Incoming, reason: str, now: datetime.datetime) -> BatchResult:
-        """Record a message that the database refuses; confirm an item, or its aircraft would resend it for ever."""
+        """Record a message that the database refuses; confirm it if it is an item, or it would be resent for ever."""
         outcome = BatchResult({}, {}, [(message, reason)])
         to = addressed(message.topic)
         item = None
@@ -303,7 +303,7 @@ def _raw(item: ReceivedItem, message: Incoming) -> Row:
 
 
 def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str, str], list[list[int]]]:
-    """List ranges of items that the database lacks and that these aircraft store, by their last hello messages."""
+    """List the ranges of items that these aircraft store, by their last hello messages, but the database lacks."""
     one, items = schema.aircraft.c, schema.items.c
     of = one.aircraft.in_(sorted(which))
     before = sa.select(one.aircraft, one.epoch, one.last, (one.first - 1).label("number")).where(of)

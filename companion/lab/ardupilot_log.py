@@ -76,7 +76,7 @@ def _boot(start: BootMessages) -> Boot:
 
 
 def _lanes(start: BootMessages) -> Floats:
-    """Find the EKF core in use over time, (n, 2): time and core (every core logs it); core 0 if none is logged."""
+    """Return time and number of the EKF core in use, (n, 2), which every core logs; core 0 if the log has none."""
     told = next((start.rows("XKF4", core) for core in start.instances("XKF4")), np.zeros((0, 2)))
     told = told[(told[:, 1] >= 0) & (told[:, 1] < _IMUS)]
     return told if len(told) else np.zeros((1, 2))

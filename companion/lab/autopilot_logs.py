@@ -89,7 +89,7 @@ class BootMessages:
 
 
 def ascending(rows: Floats) -> Floats:
-    """Select rows with ascending time (first column); drop a single row with a time ahead of the next, as damaged."""
+    """Select rows with ascending time (first column); drop as damaged a single row that is later than the next row."""
     rows = rows[np.isfinite(rows[:, 0])]
     if not len(rows):
         return rows
@@ -167,7 +167,7 @@ def dataflash(path: Path, fields: Fields) -> Iterator[BootMessages]:
 
 
 def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
-    """Return the header and the layout of the messages that a format message describes; None: it is damaged."""
+    """Return header and layout of the messages that a format message describes; None if that message is damaged."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT
 
     number, length, *said = np.frombuffer(data, _FMT)[0].tolist()
@@ -241,9 +241,9 @@ def ulog(path: Path, topics: Topics) -> BootMessages:
 class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
     """Readings of one IMU in one flight log, with temperature, vibration and EKF biases.
 
-    `means`: each reading is the mean since the previous one, not an instant. `degc` and `vibration` (m/s^2) have rows
-    of time and value. `estimated` has EKF biases, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), sigma of
-    each; NaN: unknown. Readings at `failed_s` are left out: the autopilot marked the IMU as failed.
+    `means`: each reading is a mean since the reading before, not a momentary value. `degc` and `vibration` (m/s^2) have
+    rows of time and value. `estimated` has EKF biases, (n, 9): time, gyro x y z (rad/s), accelerometer z (m/s^2), their
+    four sigmas; NaN: unknown. Readings at `failed_s` are left out: the autopilot marked the IMU as failed.
     """
 
     number: int  # Number from 1, as in the configuration
@@ -301,7 +301,7 @@ def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]
 
 
 def in_use(choices: Floats, t_s: Floats) -> Floats:
-    """Return the choice in use at each time, from rows (n, 2) of time and choice; the first also counts before."""
+    """Return the choice in use at each time, from rows (n, 2) of time and choice; the first row also counts before."""
     return np.asarray(choices[np.maximum(np.searchsorted(choices[:, 0], t_s, side="right") - 1, 0), 1])
 
 

@@ -1,4 +1,4 @@
-"""Estimation of biases from a log: from its longest still part, or from adjacent windows to check sigma."""
+"""Estimation of biases from a log: from its longest time at rest, or from adjacent windows to check sigma."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ PAUSE_S: Final = 3.0
 HORIZON_S: Final = 180.0
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
 _SAME_RAD: Final = 1.0 * DEG
-"""Largest rotation of the measured gravity that still counts as one pose; it exceeds any effect of a bias' drift."""
+"""Largest rotation of the measured gravity, rad, for an unmoved sensor: a drift of the bias rotates gravity less."""
 _EXACT_DEG: Final = 1e-4
 _LATITUDE_DEG: Final = 45.0
 """Substitute for an unknown latitude; its value does not matter, because the Earth's rate cancels between windows."""
@@ -65,7 +65,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     """Pose, place and sensor model of an IMU, which its log does not contain; None (unknown) widens the sigmas.
 
     `powered` is the least time in s from power-on to the log's beginning. `mounting` rotates from IMU to vehicle axes
-    (FRD). `profile` is the IMU's model, or learned noise figures. `any_bias` accepts biases beyond those of any sensor.
+    (FRD). `profile` is the IMU's model, or learned noise figures. `any_bias` accepts larger biases than sensors have.
     """
 
     pitch_deg: float | None = None
@@ -82,7 +82,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Object]:
-    """Estimate the biases from the longest still part of a log; return the record, and the part used, for JSON."""
+    """Estimate the biases from a log's longest time at rest; return the record, and that time as a JSON object."""
     return _Pass(log, given, max_still_s).run()
 
 
@@ -169,7 +169,7 @@ class _Pass:
         return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
 
     def _aged(self, measurement: Measurement) -> Measurement:
-        """Add the power-on time before the log to a measurement without a pause since the log's beginning."""
+        """Count the time powered before the log too, unless a pause separates the measurement from the log's start."""
         begun_s = measurement.begun_s.get(self._log.imu, math.inf)
         powered = self._given.powered
         if self._log.clock_from_start:
@@ -225,8 +225,8 @@ def _posed(window: Window, given: Given) -> Window:
 class WindowResult(NamedTuple):
     """Result of one window of a log, samples `start` to `end`, calibrated by itself.
 
-    `biases` (3, 6) are bias, sigma after averaging, stated sigma; None: refused, for the reason `why`. `by_pose` (6,)
-    is the reading of a bias-free sensor in this pose; it is constant between two moves.
+    `biases` (3, 6) are bias, sigma after averaging, stated sigma; None: the calibration was refused, for reason `why`.
+    `by_pose` (6,) is the reading of a bias-free sensor in this pose; it is constant between two moves.
     """
 
     start: int
@@ -240,7 +240,7 @@ class WindowResult(NamedTuple):
 def calibrated(log: StillLog, given: Given, length_s: float) -> Iterator[WindowResult]:
     """Calibrate every window of `length_s` seconds independently, as if the sensor had just been started.
 
-    A pose that is not given is computed from the window's mean and counts as exact, so sigma is the sensor's alone.
+    A pose that is not given is computed from the window's mean and counts as exact: sigma has the sensor's errors only.
 
     Raises:
         StorageError: the log has more than `MOST_WINDOWS` windows.
@@ -288,10 +288,10 @@ def _without_bias(given: Given) -> Floats:
 def windows(log: StillLog, given: Given, length_s: float) -> tuple[int, dict[str, int], list[Object]]:
     """Check a sensor's stated sigma: compare the biases of each window with those of the windows after it.
 
-    In 95 of 100 cases they agree within 2 sigma. The pose is equal in both and cancels. A move ends the comparison.
+    If sigma is right, 95 of 100 differences stay within 2 sigma. Errors of the pose cancel; no comparison spans a move.
 
     Returns:
-        Number of windows; number of failed ones by reason (figures in the reason are ignored), the commonest first;
+        Number of windows; number of failed windows by reason (figures in it are ignored), the commonest reason first;
         comparisons by axis, empty if no two consecutive windows gave a result.
     """
     results = list(calibrated(log, given, length_s))
@@ -309,7 +309,7 @@ def uncounted(why: str) -> str:
 
 
 def _posed_by(force: Floats, given: Given) -> Given:
-    """Fill in unknown values: the pose from the specific force (3,), and a place; both then count as exact."""
+    """Fill in unknown values: the pose from the specific force (3,), and a place; pose and place count as exact."""
     mean = rotation_matrix(given.mounting) @ force
     roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
     return msgspec.structs.replace(
@@ -333,8 +333,8 @@ def _figures(imu: ImuRecord) -> Floats | None:
 def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[Object]:
     """Compare each window's biases with the mean of the `span` windows after it; one result per axis, SI units.
 
-    `rms` is that of the differences, `sigma_use` the median of the stated sigmas. `ratio` is the rms of difference over
-    sigma (1: sigma is right), `share` the part within 2 sigma; both allow for white noise of the later windows.
+    `rms` is the rms difference, `sigma_use` the median of the stated sigmas. `ratio` is the rms of difference over
+    sigma (1: sigma is right), `share` the fraction within 2 sigma; here sigma includes the later windows' white noise.
     """
     misses, uses, seen = [], [], []
     for at, one in enumerate(found):

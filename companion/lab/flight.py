@@ -98,7 +98,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
 
 
 def _key(boot: Boot, stages: Stages) -> str:
-    """Make the key of a flight from its parameters, in which both firmwares count their starts and run time."""
+    """Make a flight's key by a hash of its parameters, in which both firmwares count their starts and run time."""
     sensors = [(imu.number, imu.gyro_id, imu.accel_id) for imu in boot.imus]
     told = [boot.firmware, stages.armed_s, sensors, sorted(boot.parameters_at(stages.armed_s).items())]
     return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
@@ -208,7 +208,7 @@ async def _imu(
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
-    """Compare readings before the motors' start with a standstill, in windows; no solution is as exact as that."""
+    """Compare the readings before the motors' start with zero motion, in windows: no solution would be as exact."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:
@@ -259,7 +259,7 @@ def _offset_sets(
     found: Increments,
     in_air: tuple[float, float],
 ) -> dict[str, tuple[Floats, Floats]]:
-    """Return the output changes (SI) to compare: "before" restores the offsets before the calibration, "flown" is 0."""
+    """Return the output changes (SI) to compare: "before", as if the earlier offsets were active; "flown", zero."""
     sets: dict[str, tuple[Floats, Floats]] = {}
     if calibration is not None and before:
         inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])

@@ -1,8 +1,7 @@
-"""Free inertial navigation over a flight, and the biases that the flight shows.
+"""Free (unaided) inertial navigation over a flight, and the biases that the flight shows.
 
-Navigation uses the readings as corrected by the firmware, without aid. They are integrated once, from the log's
-beginning. A start later in the flight is one rotation and one shift of that result, so many starts cost no more than
-one (method.md section 3.7).
+The readings, as corrected by the firmware, are integrated once, from the log's beginning. Navigation from a later start
+is this result, rotated and shifted: many starts cost no more than one (method.md section 3.7). No other sensor is used.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ _OUTLIER: Final = 50.0
 
 
 class Navigation(NamedTuple):
-    """Trajectory by an estimator, or the true one of a simulator, with the Earth's rate and gravity there.
+    """Trajectory from the autopilot's estimator, or the true one of a simulator; the Earth's rate and gravity at it.
 
     Quaternions (n, 4) rotate body FRD to NED; velocity (n, 3) and position (n, 3) are NED in m/s and m. The Earth's
-    rate is zero for an unknown place, and in a simulator without it.
+    rate is zero for an unknown place, and for a simulator whose Earth does not turn.
     """
 
     t_s: Floats
@@ -98,7 +97,7 @@ class Increments(NamedTuple):
 
 
 def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
-    """Integrate readings (n, 6) in rad/s and m/s^2; `means`: each is a mean since the previous one, not an instant."""
+    """Integrate readings (n, 6), rad/s and m/s^2; `means`: each is a mean since the one before, not momentary."""
     dt = np.diff(t_s)
     rates = readings[1:] if means else 0.5 * (readings[1:] + readings[:-1])
     grown = rates * dt[:, None]
@@ -133,9 +132,9 @@ def without_earth(found: Increments, solution: Navigation) -> Increments:
 
 
 def lag_s(found: Increments, solution: Navigation) -> float:
-    """Estimate the delay of the readings by filters, s, by comparison with the navigation solution's attitude.
+    """Estimate the delay, s, that filters cause in the readings, from the navigation solution's attitude.
 
-    The rotation of delayed readings over a short time is off by the change of rate times the delay.
+    Over a short time, the rotation from delayed readings is wrong by the change of the rate times the delay.
     """
     span = max(round(_LAG_SPAN_S / float(np.median(found.dt_s))), 1)
     rate = found.angle / found.dt_s[:, None]
@@ -274,7 +273,7 @@ _AT_REST: Final = 0.02
 _LEVEL_M_S2: Final = 5.0 * MG
 """Assumed error of the two horizontal accelerometers; a tilt rotates a part of it into the vertical."""
 _LEAST_SPREAD: Final = 0.15
-"""Least scatter of vibration, as a share of its median, from which a bias' slope over vibration is estimated."""
+"""Least scatter of vibration, as a share of its median, for an estimate of the bias's slope over vibration."""
 _LEAST_TREND_S: Final = 60.0
 
 
@@ -288,7 +287,7 @@ def split(
     """Split the biases of the gyro's three axes and of the accelerometer's vertical axis into their causes.
 
     `before` are windows before the motors' start, `flight` those in the air, `levels` (n,) the vibration in the air,
-    m/s^2. `warmth` is the part of the step at the motors' start that temperature explains.
+    m/s^2. `warmth` is the part of each bias's step at the motors' start that temperature explains.
     """
     found = []
     for k, axis in enumerate(AXES):
@@ -319,7 +318,7 @@ def _tilt(windows: Floats) -> float:
 
 
 def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
-    """Average windows over `span_s`; the solution errs by `end` at both ends, and by `constant` throughout."""
+    """Average windows of `span_s` in all; sigma has the solution's errors: `end` at each end, `constant` throughout."""
     if len(values) < _LEAST:
         return None
     freedom = len(values) - 1

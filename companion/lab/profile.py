@@ -1,4 +1,4 @@
-"""Noise profile of an IMU from recordings at rest: still stretches, a fit of each axis, one model for each triad.
+"""Noise profile of an IMU from recordings: intervals at rest, a fit of each axis, one model for each triad.
 
 If the recordings are too short for a figure, it is borrowed from another profile, within the bounds that they show.
 """
@@ -25,13 +25,13 @@ from companion.samples import TRIADS, rows_of
 
 MIN_SECONDS: Final = 16  # Least seconds of a stretch: a shorter one shows no flicker or walk
 LEAST_STILL_S: Final = 60
-"""Least total time at rest for a noise profile, s; a calibration itself measures as long."""
+"""Least total time at rest for a noise profile, s: as long as a calibration measures."""
 _MIN_GOOD: Final = 10
 _NAMES: Final = ("N", "B", "K")
 
 
 Rest = tuple[NDArray[np.int64], Floats]
-"""One still stretch: seconds (m,) that the gate accepted, ascending; means (m, 6) in rad/s and m/s^2, IMU axes."""
+"""Interval at rest: whole seconds (m,) accepted by the gate, ascending; their means (m, 6), rad/s, m/s^2, IMU axes."""
 
 
 def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
@@ -47,13 +47,13 @@ def seconds_of(t_s: Floats, readings: Floats) -> list[Batch]:
 
 
 def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> tuple[list[Rest], int, str]:
-    """Find the stretches of a recording in which the IMU was still, with the daemon's stillness gate.
+    """Find the intervals of a recording in which the IMU was motionless, with the daemon's stillness gate.
 
     Times (n,) ascend; readings are (n, 6) in rad/s and m/s^2; rows that are not finite are left out. `profile` is the
     noise that the gate allows until it has learned the actual noise.
 
     Returns:
-        The stretches, the number of whole seconds, and the commonest reason of a rejection; empty: none was rejected.
+        The intervals, the number of whole seconds, and the commonest reason to reject a second; empty: none rejected.
     """
     batches = seconds_of(t_s, readings)
     own = OwnNoise(at_rest=True)
@@ -101,7 +101,7 @@ def seconds_at_rest(stretches: Iterable[Rest]) -> int:
 def fit_profile(
     name: str, stretches: Sequence[Rest], fallback: NoiseProfile
 ) -> tuple[NoiseProfile, list[AxisFit], list[str]]:
-    """Estimate the noise of one IMU from all its stretches at rest.
+    """Estimate the noise of one IMU from all its intervals at rest.
 
     Returns:
         The profile; the fits of gyro x y z and accelerometer x y z, in rad/s or m/s^2; the figures borrowed from
@@ -127,7 +127,7 @@ def fit_profile(
 
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:
-    """Choose a noise model that is not too optimistic for any of three axes; list the figures that no axis shows."""
+    """Choose a noise model that is not too optimistic for any of three axes; list which of N, B, K no axis shows."""
     other = fallback.white, fallback.flicker, fallback.walk
     chosen, unknown = [0.0, 0.0, 0.0], []
     for which in range(3):

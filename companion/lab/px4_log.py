@@ -65,7 +65,7 @@ def _whole(rows: Floats) -> Floats:
 
 
 def _sampled(rows: Floats) -> Floats:
-    """Order rows by the sample's time (second column); older PX4 versions have only the message's (first column)."""
+    """Order rows by sample time (second column); older PX4 versions have only the message's time (first column)."""
     at_s = rows[:, 1] * US
     return ascending(_whole(np.column_stack([np.where(np.isfinite(at_s), at_s, rows[:, 0]), rows[:, 2:]])))
 

@@ -149,7 +149,7 @@ def _records(file: IO[bytes]) -> Iterator[Any]:
 
 
 def _check_size(chunk: Any) -> None:
-    """Check a chunk's unpacked size, also that in its zstd frame: unpacking allocates it, whatever the chunk states."""
+    """Check the unpacked size stated by a chunk and by its zstd frame: unpacking allocates what the frame states."""
     import zstandard
 
     size: int = chunk.uncompressed_size
@@ -165,7 +165,7 @@ def _check_size(chunk: Any) -> None:
 
 @contextlib.contextmanager
 def reporting_damage(path: Path, topic: str) -> Iterator[None]:
-    """Convert to StorageError the errors of a message that no companion can have written."""
+    """Convert errors from a message that no companion can have written to StorageError."""
     try:
         yield
     except _UNUSABLE as error:
@@ -227,7 +227,7 @@ class Playback:
                 self._found.append((Role(name, "imu"), sample))
 
     def _sample(self, message: Any, t_s: float, state: ImuState, samples: ImuSamples) -> ImuSample | None:
-        """Return the IMU's sample in a MAVLink message; None: the message has no usable one."""
+        """Return the IMU's sample in a MAVLink message; None: the message has no usable sample."""
         sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
         source = next((each for each in sources if each.message is type(message)), None)
         header = message.get_header()

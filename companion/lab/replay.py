@@ -135,7 +135,7 @@ class Replay:
     def _measure(
         self, collector: RollingCollector, measured: Measured, now_s: float
     ) -> Measurement | CalibrationRefusedError | None:
-        """Measure the recorded window again; None: the recording lacks some of its seconds."""
+        """Measure the recorded window again; return None if the window began before the recording."""
         if measured.start_s < self._begun_s:
             return None
         try:

@@ -43,7 +43,7 @@ COLUMNS: Final[dict[str, tuple[str, float]]] = {
 """Quantity by column name, and the factor from its unit to s, rad/s, m/s^2 or degrees Celsius."""
 HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
-"""Allowed median specific force of a log at rest; beyond it, a unit or a column has a wrong name."""
+"""Allowed median specific force of a log at rest; outside this range, a unit or a column has a wrong name."""
 
 PASSED_OVER: Final = ("-", "_")  # Names in --columns of a column that is not read
 _SEPARATORS: Final = (";", "\t", ",", " ")
@@ -58,10 +58,10 @@ _MOST_NAMED: Final = 12
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     """Readings of one IMU at rest in one run: a file, or several consecutive ones.
 
-    Readings (n, 6) are in rad/s and m/s^2, axes as recorded; integers are left out, so that there may be none.
-    `profile` is that of the configuration at the time. `clock_offset_s` is UTC minus the recording's clock. `breaks_s`
-    are times of steps that are not noise, such as a write of offsets or a restart. `left_out` counts ignored lines by
-    reason. `clock_from_start`: times count from the autopilot's power-on.
+    Readings (n, 6) are in rad/s and m/s^2, axes as recorded; samples in integers are left out, so that n may be 0.
+    `profile` is the noise profile configured for the recording. `clock_offset_s` is UTC minus the recording's clock.
+    `breaks_s` are times of steps that are not noise, such as a write of offsets or a restart. `left_out` counts ignored
+    lines by reason. `clock_from_start`: times count from the autopilot's power-on.
     """
 
     imu: str

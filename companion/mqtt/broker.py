@@ -51,7 +51,7 @@ class Broker:
 
     @contextlib.asynccontextmanager
     async def connected(self, most_bytes: int, **options: Any) -> AsyncIterator[aiomqtt.Client]:
-        """Connect while the context lasts; `most_bytes`: longest packet that the broker may send (only with MQTT 5).
+        """Connect until the context ends; `most_bytes`: longest packet that the broker may send (MQTT 5 only).
 
         Raises:
             LinkError: the connection failed or ended, with the cause.
@@ -201,8 +201,8 @@ _STATES: Final = {
     141: _SILENT,
     142: "has another client called {id!r}: a second companion for this vehicle? (change mqtt.base_topic)",
 }
-"""Error texts by reason code: codes from 128 on are of MQTT 5 (section 2.4), those below of the library paho. The
-library converts reason codes of MQTT 3.1.1 to those of MQTT 5."""
+"""Error texts by reason code: codes from 128 on are MQTT 5's (section 2.4), lower codes are those of the library paho.
+The library converts reason codes of MQTT 3.1.1 to codes of MQTT 5."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
@@ -233,7 +233,7 @@ def _is_unanswered(error: BaseException) -> bool:
 
 
 def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
-    """Describe in one line why a connection could not be made, or was lost (`reached`); omit the broker's address."""
+    """Describe in one line why no connection was made or, if `reached`, why it was lost; omit the broker's address."""
     code = _reason_code(error)
     if code in _BAD_PASSWORD:
         user = f"user {settings.username!r}: unknown, or the password is wrong"

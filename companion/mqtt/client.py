@@ -1,6 +1,6 @@
 """MQTT client that reconnects after every loss and sends messages from an outbox of limited size.
 
-It runs in the MQTT process: a broker that sends more than fits that process's memory cannot end the daemon.
+It runs in the MQTT process: messages of a broker that exhaust this process's memory cannot end the daemon.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ WORTH_S: Final = 10.0  # Least duration of a connection that resets the wait bef
 MAX_PACKET_BYTES: Final = 64 * 1024
 """Longest message that the broker may send us; only MQTT 5 has such a limit."""
 MAX_WAITING: Final = 1000
-"""Most received messages that wait to be handled; more are dropped without an answer. aiomqtt fills this queue faster
-than it empties it, so some hundred requests at once must fit. With 64 KiB each they fit the process's memory."""
+"""Largest number of received messages that wait to be handled; more are dropped without an answer. A burst of some
+hundred requests fills this queue faster than we empty it. 1000 messages of 64 KiB fit the process's memory."""
 MAX_ANSWERS: Final = 64
 LONG_BYTES: Final = 1024  # Messages above this length may be too long for a broker
 MOST_TRIES: Final = 3
-"""Attempts to send one long message, each ended by a lost connection, after which the message is given up."""
+"""Number of attempts to send one long message: if the connection is lost in each, the message is given up."""
 
 
 class Incoming(NamedTuple):
@@ -66,7 +66,7 @@ class Parcel(msgspec.Struct, eq=False):
 
     @property
     def is_given_up(self) -> bool:
-        """True if the connection was lost more than `MOST_TRIES` times while this long message was sent."""
+        """True for a long message after `MOST_TRIES` attempts to send it, each ended by a lost connection."""
         return self.tries > MOST_TRIES and len(self.payload) > LONG_BYTES
 
 
@@ -75,8 +75,8 @@ class Outbox:
 
     - kept: retained by the broker. Only the latest value of each topic is stored. It is sent again at every connection,
       because a restarted broker may have lost it. The topics are few and our own.
-    - answers: each is sent, in order, even if the connection was lost in between. If 64 are waiting, the oldest
-      droppable answer, such as a refusal, is dropped. If none is droppable, the oldest of all is dropped.
+    - answers: each is sent, in order, even if the connection was lost in between. If 64 are waiting, one is dropped:
+      the oldest droppable one (such as a refusal); without it the new one, if droppable; else the oldest of all.
     - telemetry: only the latest value of each topic is stored, and none without a connection.
     """
 
@@ -95,7 +95,7 @@ class Outbox:
         return len(self._unsent) + len(self._answers) + len(self._telemetry)
 
     def keep(self, topic: str, payload: bytes, *, again: bool = False) -> None:
-        """Send a retained payload if it differs from the last, or if `again`. An empty payload deletes the topic."""
+        """Queue a retained payload; an empty one deletes the topic. Skip the topic's present payload unless `again`."""
         if again or self.kept(topic) != payload:
             self._kept[topic] = self._unsent[topic] = Parcel(topic, payload, retain=True)
             self._notify()
@@ -119,7 +119,7 @@ class Outbox:
             self._notify()
 
     def opened(self) -> None:
-        """Note that a connection has been made, and queue all retained messages again."""
+        """Note that a connection has been made, and queue all retained messages again, except those given up."""
         self._open = True
         self._unsent = {topic: parcel for topic, parcel in self._kept.items() if not parcel.is_given_up}
         self._notify()
@@ -158,9 +158,9 @@ class Outbox:
 class MqttLink:
     """Connection to the broker: sends the messages of `outbox` and passes received ones to `on_message`.
 
-    The broker disconnects a client when a second one with its id connects. `will` is the last will (topic, payload): a
-    message that the broker publishes, retained, when the connection is lost. Subscribe to its topic too, to verify that
-    our own messages come back. `on_message` must not block.
+    The broker disconnects a client when another connects with the same id. `will` is the last will (topic, payload): a
+    message that the broker publishes, retained, when the connection is lost. Its topic must be in `subscriptions` too:
+    the link verifies that our own messages come back. `on_message` must not block.
     """
 
     def __init__(

@@ -44,7 +44,7 @@ _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 class Daemon:
-    """Latest status and attitude that the daemon sent; the event `news` is set at each change or loss of the stream.
+    """Latest status and attitude from the daemon; the event `news` is set at each message and when the stream is lost.
 
     `clock_agrees` is True if the autopilot's GNSS time confirms the clock of this computer.
     """
@@ -105,7 +105,7 @@ class Daemon:
 
 
 class Request(msgspec.Struct):
-    """MQTT request with its last response. `problem` is why it is invalid; empty: it can be sent to the daemon."""
+    """MQTT request with its last response. `problem`: why the request is invalid; empty if it may go to the daemon."""
 
     command: str
     transaction: Transaction = None
@@ -116,7 +116,7 @@ class Request(msgspec.Struct):
 
 
 def parse(command: str, payload: bytes) -> Request:
-    """Parse the payload of an MQTT request: empty, or a JSON object with known keys. Errors go to `problem`."""
+    """Parse the payload of an MQTT request: nothing, or a JSON object with known keys; errors go into its `problem`."""
     request = Request(command)
     try:
         _read(request, payload)
@@ -206,7 +206,7 @@ class Requests:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def _is_repeat(self, request: Request) -> bool:
-        """Return True if this transaction id is already known; if so, send its latest answer again."""
+        """Return True if a request with this transaction id is known; if so, send the latest answer to it again."""
         if request.transaction is None:
             return False
         known = self._known.get((request.command, request.transaction))

@@ -63,14 +63,14 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_deg": 1,
     "inclination_expected_deg": 1,
 }
-"""Decimals of sent figures that reveal the location (gravity, magnetic field, ...): it is then known to about 1 km."""
+"""Decimals of sent figures that reveal the location (gravity, magnetic field, ...): rounded, they show it to 1 km."""
 _WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "effective": None}
 """Values sent in place of figures whose digits would reveal the local gravity and the latitude."""
 _EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 
 
 class AircraftFleet:
-    """Fleet client of one companion: sends items of the present aircraft, and those stored of earlier aircraft.
+    """Fleet client of one companion: sends items of the present aircraft, and stored items of earlier aircraft.
 
     `link` returns the connection to the broker, or None. `offload` runs a blocking call in a thread. `run` is a task.
     """
@@ -150,7 +150,7 @@ class AircraftFleet:
             self._items.close()
 
     async def _try(self, step: Callable[[], Awaitable[None]]) -> str | None:
-        """Run a step and return its error as text, so that a failure to save does not block sending, nor vice versa."""
+        """Run a step and return its error as text: a failure to save items must not block sending, nor vice versa."""
         try:
             await step()
         except Exception as error:
@@ -216,7 +216,7 @@ class AircraftFleet:
         await self._add(current.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
-        """Return a function that rates a timestamp: "good" if it is of this run and GNSS time confirms the clock."""
+        """Return a function that rates a timestamp: "good" if made since our start and GNSS time confirms the clock."""
         run_s = asyncio.get_running_loop().time() - self._started_s
         began = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=run_s)
         since, agrees = began.isoformat(timespec="milliseconds"), self._daemon.clock_agrees
@@ -292,7 +292,7 @@ class AircraftFleet:
         self._sent, self._wait_s = 0, CONFIRMED_WITHIN_S
 
     async def _send(self) -> None:
-        """Send the next few items once those sent before are confirmed or timed out.
+        """Send the next few items once all items sent before are confirmed or have timed out.
 
         After the last item, sending restarts at the first unconfirmed one, so that no item blocks the others.
         """

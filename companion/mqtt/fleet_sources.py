@@ -76,7 +76,7 @@ class Sources:
         self._settled = False
 
     def has_news(self) -> bool:
-        """Return True if a file may have been written since the last call, and once more after each change.
+        """Return True if a file may have been written since the last call, and again at the first call after that.
 
         The repetition is needed because a second write in one tick of the file system's clock changes no timestamp.
         """
@@ -95,7 +95,7 @@ class Sources:
             yield from source(current)
 
     def _changed(self, prefix: str, stamps: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-        """Yield key and stored value of each source that changed since it was read; delete marks of deleted sources."""
+        """Yield key and mark value of each source that changed since it was read; delete marks of deleted sources."""
         marks = self._items.marks(prefix)
         for key, stamp in stamps.items():
             before = marks.pop(prefix + key, Mark("", ""))
@@ -198,7 +198,7 @@ class Sources:
 
 
 def _parts(current: CurrentAircraft, record: _Keys) -> dict[str, str]:
-    """Return the device ids of a record's IMUs as JSON, by key of their mark; IMUs without ids are left out."""
+    """Return the device ids of a record's IMUs as JSON, by key of the IMU's mark; IMUs without ids are left out."""
     ids = {imu.get("name", ""): {key: imu.get(key) for key in ("gyro_id", "accel_id")} for imu in record.imus}
     known = {name: each for name, each in ids.items() if any(value is not None for value in each.values())}
     return {f"{IMU}{current.aircraft}/{name}": msgspec.json.encode(each).decode() for name, each in known.items()}

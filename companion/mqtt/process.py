@@ -110,7 +110,7 @@ class MqttProcess:
             await self._publish_as(Topics(self._base()))
 
     async def _publish_as(self, topics: Topics) -> None:
-        """Publish and handle requests under one base topic, until the vehicle gets another one."""
+        """Publish and handle requests under one base topic, until the vehicle's MAVLink system id changes."""
 
         def respond(command: str, response: Object) -> None:
             droppable = response["state"] == "refused" or "repeated" in response
@@ -199,8 +199,8 @@ def summary(status: Object) -> Object:
 class Pace:
     """Limit on how often the daemon's state is published.
 
-    A change of the field `state` is published at once, any other change within a second. If only texts with the age of
-    an event change, they are published every ten seconds.
+    A change of the field `state` is published at once, any other change within a second. Texts that state the age of an
+    event change all the time: changes of these texts alone are published every ten seconds.
     """
 
     def __init__(self) -> None:

@@ -51,7 +51,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def disk_shortage(folder: Path) -> str | None:
-    """Return a text if the disk is too full for a recording on request; None if not, or if that is unknown."""
+    """Return a text if the disk is too full for a recording on request; None if it has room, or that is unknown."""
     try:
         usage = shutil.disk_usage(folder)
     except OSError:
@@ -107,7 +107,7 @@ class RecordingFile:
         return 0 if self._file is None else int(self._file.tell())
 
     def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
-        """Append messages, finish the chunk and sync it to disk. The first call begins with the header `beginning`."""
+        """Append messages, finish the chunk and sync it to disk. The first call writes the header `beginning` first."""
         if self._file is None:
             return
         try:
@@ -195,7 +195,7 @@ def create_on_request(path: Path) -> RecordingFile:
 
 
 class Ring:
-    """Ring of recording files: the oldest are deleted to limit the size. Numbered, as the wall clock may be wrong."""
+    """Ring of recording files: the oldest are deleted. File names are numbers, because the wall clock may be wrong."""
 
     def __init__(self, folder: Path, most_bytes: int) -> None:
         self.folder, self.most_bytes = folder, most_bytes

@@ -37,14 +37,14 @@ Message = tuple[str, float, bytes]  # topic, time on the daemon's clock, data
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Message at the start of a recording, and at its restart after a gap."""
+    """Message at the start of each recording file, and at a restart after a gap."""
 
     lost: int = 0  # messages dropped just before, because the disk was too slow
     continues: bool = False  # True: this file begins where the previous one of the ring ends
 
 
 class ImuState(msgspec.Struct, frozen=True, kw_only=True):
-    """State of one IMU of the autopilot from the message's time on: its sample messages and calibration parameters."""
+    """State of one autopilot IMU from this message's time on: calibration, and name of the message with its samples."""
 
     sender: tuple[int, int]  # system and component id of the autopilot
     firmware: FirmwareName | None
@@ -55,7 +55,7 @@ class ImuState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RawOutput(msgspec.Struct, frozen=True):
-    """Mean output of an IMU in floats, corrected by the active offsets; the stream of samples has integers."""
+    """Mean output of an IMU as floats, corrected by the active offsets; its single samples are only integers."""
 
     imu: str
     output: tuple[float, float, float, float, float, float]
@@ -64,7 +64,7 @@ class RawOutput(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """Measured window. All values but its start and end may depend on samples from before the recording."""
+    """Measurement over a time window. All fields but start and end may depend on samples from before the recording."""
 
     start_s: float
     end_s: float
@@ -171,7 +171,7 @@ class Tape:
             self._waiting.append((topic, t_s, data))
 
     def put_state(self, topic: str, t_s: float, data: bytes) -> None:
-        """Add a state message: it applies until the next one on its topic, and later files begin with it."""
+        """Add a state message. It applies until the topic's next one; later files begin with each topic's latest."""
         self._states[topic] = (topic, t_s, data)
         self.put(topic, t_s, data)
 

@@ -105,7 +105,7 @@ def in_order(labels: Sequence[str]) -> Axis:
 
 
 def dates(values: Sequence[float]) -> Axis:
-    """Make an axis of UTC times (s since 1970), evenly spaced; labels are dates, or times of day within one day."""
+    """Make an axis of UTC times (s since 1970) at equal distances, labelled with dates or, within one day, times."""
     moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
     form = "%H:%M" if len({each.date() for each in moments}) == 1 else "%-d %b %y"
     return in_order([each.strftime(form) for each in moments])
@@ -117,10 +117,10 @@ def _nice(step: float) -> float:
 
 
 class Plot:
-    """SVG plot in one frame with axes; what is drawn later covers what was drawn earlier.
+    """SVG plot in one frame with axes. Markers cover lines and areas; otherwise later shapes cover earlier ones.
 
-    `x_label`: "" for ticks without a label, None for neither, as in a plot above another one. `name` and `told` are
-    title and description for a screen reader.
+    `x_label`: "" for ticks without a label; None for neither ticks nor label, as in a plot above another plot. `name`
+    and `told` are title and description for a screen reader.
     """
 
     def __init__(

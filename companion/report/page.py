@@ -35,7 +35,7 @@ _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'
 
 _STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
 _LEAST_K: Final = 4.0
-"""Least width of a temperature axis, so that a tenth of a kelvin does not fill it."""
+"""Least width of a temperature axis, K, so that a tenth of a kelvin does not fill it."""
 
 _Window = tuple[float, Vector, Vector]
 
@@ -82,7 +82,7 @@ def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tupl
 
 
 class PlotPoint(msgspec.Struct, frozen=True):
-    """Bias of one gyro or accelerometer, x y z, in one calibration; rad/s or m/s^2."""
+    """Bias and sigma of one gyro or accelerometer, x y z, in one calibration; rad/s or m/s^2."""
 
     number: int
     unix_s: float | None
@@ -118,7 +118,7 @@ def seconds_of(moment: datetime.datetime) -> float | None:
 
 
 def clock_is_sound(points: Sequence[PlotPoint]) -> bool:
-    """Return True if all times are known and ascend; without a clock battery, each boot starts in the past."""
+    """Return True if all times are known and ascend: without a battery the clock restarts in the past at each boot."""
     known = [point.unix_s for point in points]
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 

@@ -1,4 +1,4 @@
-"""Files with old parameter values: a journal, to end an interrupted write, and the undo steps of finished writes.
+"""Files with old parameter values: a journal, to undo an interrupted write, and the undo steps of finished writes.
 
 `journal.json` is saved before the first parameter is written and deleted after the last. If it exists at start, the
 daemon ended in the middle of a write. `undo-N.json` holds the values from before the last writes on the vehicle with
@@ -117,7 +117,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _joined(older: Changed | None, newer: Changed) -> Changed:
-    """Join two changes of one parameter; return only the newer one if another value was set between them."""
+    """Join two changes of one parameter; return only the newer change if somebody else changed the value in between."""
     if older is None or older.after != newer.before:
         return newer
     via = newer.via
@@ -136,18 +136,18 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
     @property
     def all(self) -> tuple[ChangeSet, ...]:
-        """Return all undo steps, including the single one in files of earlier versions."""
+        """Return all undo steps, including the single step in files of earlier versions."""
         return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
 
     def and_then(self, latest: ChangeSet) -> Undoable:
-        """Return the undo steps with a write added; automatic calibrations in a row form one step."""
+        """Return the undo steps with a write added; consecutive automatic calibrations form one step."""
         steps = self.all
         while steps and latest.origin.what == steps[0].origin.what == AUTOMATIC:
             latest, steps = latest.after(steps[0]), steps[1:]
         return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
 
     def without(self, latest: ChangeSet) -> Undoable:
-        """Return the undo steps left once `latest` is restored; unchanged if that is not part of the latest step."""
+        """Return the undo steps left after write `latest` is undone; all if `latest` is not in the newest step."""
         steps = self.all
         if not steps or not (latest == steps[0] or (latest.origin.at and latest.origin.at == steps[0].origin.at)):
             return self
@@ -176,7 +176,7 @@ class ChangeLog:
             return []  # `check_writable` has reported the error
 
     def check_writable(self) -> None:
-        """Raise StorageError if no file can be written here; called at start, to report the fault before any write."""
+        """Raise StorageError if the storage directory is not writable; called at start, before any parameter write."""
         write_atomically(self._probe, b"")
         remove_durably(self._probe)
 

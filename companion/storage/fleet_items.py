@@ -1,7 +1,7 @@
 """Store of numbered items (results and events) for the fleet, by aircraft.
 
-One SQLite file (`fleet.sqlite` in the storage directory) holds the items, and as "marks" the sources already read. Both
-change in one transaction, so that a power cut neither loses nor repeats an item. If the file is full, the oldest
+One SQLite file (`fleet.sqlite` in the storage directory) has the items, and "marks": which sources were already read.
+Both change in one transaction, so that a power cut neither loses nor repeats an item. If the file is full, the oldest
 confirmed items are dropped first. Every call blocks.
 """
 
@@ -84,7 +84,7 @@ class FleetItems:
         self._lock = threading.Lock()
 
     def close(self) -> None:
-        """Close the file after the end of a call in another thread; the next call opens it again."""
+        """Wait for a call in another thread to end, then close the file; the next call opens it again."""
         with self._lock:
             self._drop()
 
@@ -95,7 +95,7 @@ class FleetItems:
                 connection.close()
 
     def add(self, aircraft: str, entries: Iterable[SourceItems], now: str) -> None:
-        """Save items with new numbers, and the marks. If unconfirmed items must be dropped for room, add an event."""
+        """Save items with new numbers, and the marks. Add an event if unconfirmed items must be dropped for room."""
         with self._transaction() as db:
             for entry in entries:
                 for item in entry.items:
@@ -131,7 +131,7 @@ class FleetItems:
             return [Waiting(number, of, epoch, sequence, Item(*told)) for number, of, epoch, sequence, *told in found]
 
     def confirm(self, aircraft: str, epoch: str, ranges: Iterable[Range], now: str | None) -> bool:
-        """Mark items as confirmed or, if `now` is None, unconfirmed; return False if `epoch` is not the present one."""
+        """Mark items as confirmed, or unconfirmed if `now` is None; return False if numbering `epoch` is outdated."""
         with self._transaction() as db:
             if db.execute("SELECT 1 FROM aircraft WHERE (id, epoch) = (?, ?)", (aircraft, epoch)).fetchone() is None:
                 return False

@@ -137,7 +137,7 @@ def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> N
 
 
 def given_profile(wanted: str, directory: Callable[[], Path]) -> str | NoiseProfile:
-    """Find a noise profile by name: of an IMU in the catalogue, a saved profile, or a file (with / or .json).
+    """Find the noise profile that `wanted` names: an IMU in the catalogue, a saved profile, or a file (/ or .json).
 
     `directory` is called only for a saved profile. Raises ConfigError if there is no such profile, StorageError for a
     damaged file.

@@ -52,7 +52,7 @@ class NumberedFiles(Generic[T]):
         return StateFile(self.folder / f"{number:06d}.json", self.kind, newest=self.newest_format, mode=self.mode)
 
     def save(self, value: T) -> int:
-        """Save a value as the next file and return its number; delete the oldest files. Raises StorageError."""
+        """Save a value as the next file and return its number; delete the oldest above `keep`. Raises StorageError."""
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 1
         self.file(number).write(value)
@@ -116,7 +116,7 @@ class FlightStore(NumberedFiles[KeptFlight]):
     mode = 0o644  # root reads the logs and writes flights; the service, under its own account, reads them
 
     def save(self, value: KeptFlight) -> int:
-        """Save a flight, in place of an earlier result from the same log if there is one; return its number."""
+        """Save a flight, in place of an earlier result of the same flight if there is one; return the file's number."""
         for number, one in self.latest():
             if one.flight.key == value.flight.key:
                 self.file(number).write(value)
@@ -135,7 +135,7 @@ def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of one alignment, for which somebody placed or turned the aircraft."""
+    """Outcome of one alignment, during which somebody placed or turned the aircraft."""
 
     what: str  # "zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1
     state: str  # "done", "failed", or "predicted" of version 0.1

@@ -1,8 +1,8 @@
 """State files: written atomically, with a checksum, validated when read, and set aside if they are unusable.
 
-No content of a state file may end or block the daemon, or be accepted in part. A FIFO, a device or a folder in place
-of a file is not even opened. The checksum, the last key of the JSON object, is the SHA-256 of the bytes before it. A
-file without a checksum, from an earlier version, is accepted if its content is valid.
+Whatever a state file contains, it cannot end or block the daemon, and it is accepted as a whole or not at all. A FIFO,
+a device or a folder in place of a file is not even opened. The checksum, the last key of the JSON object, is the
+SHA-256 of the bytes before it. A file without a checksum, from an earlier version, is accepted if its content is valid.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
-    """List the first regex group of matching file names, sorted; [] without the folder. Raises StorageError."""
+    """List what the first group of `kind` matches in file names, sorted; [] without the folder. Raises StorageError."""
     try:
         names = [entry.name for entry in folder.iterdir()]
     except FileNotFoundError:
