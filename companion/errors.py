@@ -27,7 +27,7 @@ class DaemonDeniedError(DaemonUnreachableError):
 
 
 class NobodyHeardError(CompanionError):
-    """A ground command receives nothing from a vehicle or from its companion on the telemetry link."""
+    """A ground command receives nothing from the vehicle, or nothing from the companion, on the telemetry link."""
 
 
 class StorageError(CompanionError):
@@ -63,7 +63,7 @@ class ParameterRefusedError(AutopilotError):
 
 
 class ParameterMismatchError(ParameterRefusedError):
-    """The autopilot confirmed the write of a parameter with another value than the requested one."""
+    """The autopilot confirmed the write of a parameter, but with another value than the requested one."""
 
 
 class AutopilotRebootedError(AutopilotError):

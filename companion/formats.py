@@ -14,7 +14,7 @@ _FIRST_USE: Final = threading.Lock()
 
 
 def decode(data: bytes, kind: Any, newest: int | None) -> Any:
-    """Parse JSON as type `kind`; raise msgspec.MsgspecError for other data or a `format_version` above `newest`."""
+    """Parse JSON as type `kind`; raise msgspec.MsgspecError for other JSON or a `format_version` above `newest`."""
     if newest is not None:
         said = msgspec.json.decode(data, type=dict[str, msgspec.Raw]).get("format_version")
         if said is not None and (version := msgspec.json.decode(said, type=int)) > newest:

@@ -24,7 +24,7 @@ def rows_of(triad: Triad) -> slice:
 class ImuSample(msgspec.Struct, frozen=True, gc=False):
     """Angular rate and specific force of one IMU at one instant.
 
-    An accelerometer measures the specific force: (0, 0, -9.8) m/s^2 in FRD when level at rest.
+    An accelerometer measures the specific force: (0, 0, -9.8) m/s^2 in FRD if it is horizontal and at rest.
     """
 
     t_s: float
@@ -32,13 +32,13 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     accel_m_s2: Vector
     temperature_degc: float | None = None
     sequence: int | None = None
-    """Sample counter of the device, without its wrap-around (`Decoder.receive`); None: the protocol has no counter."""
+    """Sample counter of the device, continued at wrap-around (`Decoder.receive`); None: the protocol has no counter."""
     t_device_s: float | None = None
-    """Time on the device's clock, without its wrap-around (`Decoder.receive`); None: the protocol has no clock."""
+    """Time on the device's clock, continued at wrap-around (`Decoder.receive`); None: the protocol has no clock."""
     breaks: int = 0
-    """Number of restarts and clock jumps of the device before this sample; each may have changed its biases."""
+    """Number of restarts and clock jumps of the device before this sample; each can have changed the biases."""
     shared_variance: tuple[float, ...] | None = None
-    """Variance of an error that neighbouring samples share: gyro x, y, z, accelerometer x, y, z; None: no error."""
+    """Variance of an error common to neighbouring samples: gyro x, y, z, accelerometer x, y, z; None: no such error."""
 
 
 class TiltSample(msgspec.Struct, frozen=True, gc=False):

@@ -11,7 +11,7 @@ _HEARTBEAT_S: Final = 2.0  # maximum age of the autopilot's heartbeat before the
 
 
 StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str, str]
-"""One row of the status, for a connected part or a warning: verdict, name, text, remedy (empty if there is none)."""
+"""One row of the status, for a connected device or a warning: verdict, name, text, remedy (empty: none)."""
 
 
 def headline(status: Object) -> str:
@@ -19,7 +19,7 @@ def headline(status: Object) -> str:
 
 
 def rows(status: Object) -> list[StatusRow]:
-    """List the rows of a daemon's status: first the connected parts, then the problems and warnings."""
+    """List the rows of a daemon's status: first autopilot and devices, then connections, problems and warnings."""
     vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]
     heartbeat_s, signing = vehicle["heartbeat_age_s"], vehicle["signing"]
     found = [_row(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]

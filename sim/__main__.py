@@ -15,7 +15,7 @@ MODULES: Final = {
     "rest": "sim.rest",
     "fly": "sim.flying.cli",
 }
-"""Modules whose `main` gets the arguments after the command; all other commands get the command as well."""
+"""Modules by command. Their `main` receives the arguments after the command; in all other modules, the command too."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

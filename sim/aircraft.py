@@ -1,4 +1,4 @@
-"""The one virtual aircraft: where it stands, how it is held, how warm it is. Everything else measures this truth.
+"""The virtual aircraft: place, pose, motion, temperature. Everything else in the simulator measures this truth.
 
 Frames: navigation NED, body FRD. Angles: heading clockwise from true north, pitch nose up +, roll right side down +
 (method 1.1). Time is the aircraft's own, in seconds from 0; `begin` ties it to an event loop's clock.
@@ -37,14 +37,14 @@ class Site:
     longitude_deg: float = 116.0
     height_m: float = 50.0
     declination_deg: float = 0.0
-    """East of true north +: magnetic heading = true heading - declination."""
+    """Declination, east of true north +: magnetic heading = true heading - declination."""
     inclination_deg: float = 58.1
-    """Inclination of the magnetic field, down +; `scenario.site_at` takes it from a model."""
+    """Inclination of the magnetic field, down +; `scenario.site_at` computes it by a model."""
     field_gauss: float = 0.53
 
     @functools.cached_property
     def field_ned_gauss(self) -> Array:
-        """The Earth's magnetic field (3,), north, east, down."""
+        """Return the Earth's magnetic field (3,): north, east, down."""
         declination, inclination = math.radians(self.declination_deg), math.radians(self.inclination_deg)
         across = math.cos(inclination)
         return self.field_gauss * np.array(
@@ -56,12 +56,12 @@ class Site:
         return normal_gravity_m_s2(self.latitude_deg, self.height_m)
 
     def north_east_m(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """North and east, in metres, of a place some hundred metres away."""
+        """Return how far north and east, in metres, a place at some hundred metres lies."""
         east_deg = (longitude_deg - self.longitude_deg) * math.cos(math.radians(self.latitude_deg))
         return (latitude_deg - self.latitude_deg) * _EARTH_M_PER_DEG, east_deg * _EARTH_M_PER_DEG
 
     def place_deg(self, north_m: float, east_m: float) -> tuple[float, float]:
-        """Latitude and longitude of a place some hundred metres away."""
+        """Return latitude and longitude of a place some hundred metres to the north and east."""
         east_deg = east_m / _EARTH_M_PER_DEG / math.cos(math.radians(self.latitude_deg))
         return self.latitude_deg + north_m / _EARTH_M_PER_DEG, self.longitude_deg + east_deg
 
@@ -71,15 +71,15 @@ class Iron:
     """Disturbances of the magnetic field at the compass."""
 
     body_gauss: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Hard iron: magnets that are a part of the aircraft, in its axes (forward, right, down)."""
+    """Hard iron: field of magnets in the aircraft, in its axes (forward, right, down)."""
     dipole_a_m2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Moment of a magnet on the ground, north, east, down: a car is some 100 to 300 A m^2."""
     dipole_at_m: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    """Position of the magnet relative to the compass, north, east, down."""
+    """Position of this magnet relative to the compass, north, east, down."""
 
     @functools.cached_property
     def ground_ned_gauss(self) -> Array:
-        """The ground magnet's field at the compass (3,): mu0 / 4 pi (3 (m r) r - m) / |r|^3, 1 T = 1e4 gauss."""
+        """Return the ground magnet's field at the compass (3,): mu0 / 4 pi (3 (m r) r - m) / |r|^3, 1 T = 1e4 gauss."""
         moment, place = np.array(self.dipole_a_m2), np.array(self.dipole_at_m)
         distance = float(np.linalg.norm(place))
         towards = place / distance
@@ -95,9 +95,9 @@ class Truth(NamedTuple):
     """Ideal readings in body axes at n times."""
 
     rate_rad_s: Array
-    """Angular rate against inertial space, Earth rate included (n, 3)."""
+    """Angular rate relative to inertial space (n, 3), which includes the Earth's rotation."""
     force_m_s2: Array
-    """Specific force (n, 3): (0, 0, -g) when level at rest."""
+    """Specific force (n, 3): (0, 0, -g) for a horizontal aircraft at rest."""
 
 
 class VirtualAircraft:
@@ -126,7 +126,7 @@ class VirtualAircraft:
         self._gravity_ned = np.array([0.0, 0.0, site.gravity_m_s2])
         self._earth_rate_ned = earth_rate_ned_rad_s(site.latitude_deg)
         self.iron = Iron()
-        """Magnetic disturbances; may be changed at any time."""
+        """Magnetic disturbances; can be changed at any time."""
         self._epoch_s: float | None = None
         self._still: tuple[float, float, Array, Truth] | None = None
         self._stands_until_s = math.inf
@@ -136,7 +136,7 @@ class VirtualAircraft:
         self._moved: tuple[bytes, Truth] | None = None
 
     def begin(self, loop_s: float) -> None:
-        """Let aircraft time 0 be this instant of the loop's clock, unless it has begun already."""
+        """Set aircraft time 0 to this instant of the loop's clock, unless aircraft time has begun already."""
         if self._epoch_s is None:
             self._epoch_s = loop_s
 
@@ -168,21 +168,21 @@ class VirtualAircraft:
         return np.array([self._temperature(t) for t in t_s.tolist()])
 
     def angles_rad(self, t_s: float) -> tuple[float, float, float]:
-        """True roll, pitch, heading (not wrapped)."""
+        """Return true roll, pitch and heading at a time; the heading is not wrapped."""
         roll, pitch, heading = self.angles_over(np.array([t_s]))[0].tolist()
         return roll, pitch, heading
 
     def angles_over(self, t_s: Array) -> Array:
-        """True roll, pitch, heading (n, 3) at ascending times (n)."""
+        """Return true roll, pitch, heading (n, 3) at ascending times (n)."""
         return self._euler(t_s)[0]
 
     def pose_at(self, t_s: float) -> Pose:
-        """True pose, heading in [0, 360)."""
+        """Return the true pose at a time, with the heading in [0, 360)."""
         roll, pitch, heading = self.angles_rad(t_s)
         return Pose(math.degrees(pitch), math.degrees(roll), math.degrees(heading) % 360.0)
 
     def matrices(self, t_s: Array) -> Array:
-        """NED to body at times (n), ascending: (n, 3, 3)."""
+        """Return the rotations from NED to body (n, 3, 3) at ascending times (n)."""
         return bodies_from_ned(self.angles_over(t_s))
 
     def body_from_ned(self, t_s: float) -> Array:
@@ -194,18 +194,18 @@ class VirtualAircraft:
         return self._posed[1]
 
     def field_gauss(self, t_s: float) -> Array:
-        """Magnetic field at the compass (3,), body axes, disturbances included."""
+        """Return the magnetic field at the compass (3,) in body axes, disturbances included."""
         ned = self.site.field_ned_gauss + self.iron.ground_ned_gauss
         field: Array = self.body_from_ned(t_s) @ ned + np.array(self.iron.body_gauss)
         return field
 
     def declination_rad(self, t_s: float) -> float:
-        """Declination of a perfect compass here: of the place, plus the effect of iron."""
+        """Return the declination that a perfect compass would need: that of the place plus the effect of iron."""
         north, east, _ = self.body_from_ned(t_s).T @ self.field_gauss(t_s)
         return math.atan2(east, north)
 
     def mounted_angles_rad(self, t_s: float, mounting: Array) -> tuple[float, float, float]:
-        """Roll, pitch, heading of a device mounted with this sensor-to-vehicle matrix."""
+        """Return roll, pitch and heading of a device mounted with this sensor-to-vehicle matrix."""
         return angles_of(mounting.T @ self.body_from_ned(t_s))
 
     def truth(self, t_s: Array) -> Truth:
@@ -229,7 +229,7 @@ class VirtualAircraft:
         return Truth(rate[0], force[0])
 
     def _still_at(self, t_s: float) -> tuple[float, float, Array, Truth] | None:
-        """(from, until, attitude, truth) of the quiet time around t_s; None while something moves."""
+        """Return start, end, attitude and truth of the motionless time around `t_s`; None: something moves."""
         if self._still is not None and self._still[0] <= t_s < self._still[1]:
             return self._still
         if not self.still_at(t_s):
@@ -242,7 +242,7 @@ class VirtualAircraft:
         return self._still
 
     def _euler(self, t_s: Array) -> tuple[Array, Array]:
-        """Roll, pitch, heading (n, 3) in rad and their derivatives."""
+        """Return roll, pitch, heading (n, 3) in rad, and their derivatives."""
         angles = self._pose_rad[None].repeat(len(t_s), 0)
         rates = np.zeros_like(angles)
         for motion in self._motions:

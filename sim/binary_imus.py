@@ -31,17 +31,17 @@ def mip_packet(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
 
 
 class _Commanded(ImuDevice):
-    """A device that answers messages of a known form."""
+    """An IMU that answers known messages."""
 
     def __init__(self, imu: ImuModel, **line: Any) -> None:
         super().__init__(imu, **line)
         self._pending = b""
 
     ANSWERS: ClassVar[dict[bytes, tuple[bytes, bool | None]]]
-    """Per message: the answer, and whether the device streams afterwards (None: unchanged)."""
+    """Answer to each known message, and whether the device streams afterwards (None: unchanged)."""
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Obey each whole known message; skip unknown ones."""
+        """Obey each complete known message; skip unknown ones."""
         answer = b""
         self._pending += data
         while True:
@@ -68,7 +68,7 @@ class MipImu(_Commanded):
         mip_packet(0x01, (command, b"")): (mip_packet(0x01, (0xF1, bytes((command, 0)))), streaming)
         for command, streaming in ((0x01, None), (0x02, False), (0x06, True))
     }
-    """Ping, to idle, resume; 0xF1 acknowledges."""
+    """Answers, with acknowledgement 0xF1, to: ping, go idle, resume."""
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
         return [
@@ -98,7 +98,7 @@ class XsensImu(_Commanded):
         xbus_message(0x30): (xbus_message(0x31), False),
         xbus_message(0x3F): (b"", False),
     }
-    """GoToMeasurement, GoToConfig, WakeUpAck."""
+    """Answers to GoToMeasurement, GoToConfig and WakeUpAck."""
 
     def banner(self) -> bytes:
         return xbus_message(0x3E)
@@ -155,7 +155,7 @@ class Stim300(ImuDevice):
     LATENCY_S = 506e-6
     TICKS_A_SECOND = 2000
     RANGE_CODE, ACCEL_BITS = 0, 19
-    """Accelerometers of 10 g: the code in the configuration datagram, and the bits after the point."""
+    """Code of 10 g accelerometers in the configuration datagram, and their number of bits after the binary point."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class Stim300(ImuDevice):
         return b"".join(stim_datagram(each) for each in (part, serial, bytes(settings)))
 
     def frames_until(self, t_s: float) -> list[Frame]:
-        """Return the frames, which describe a moment shortly before they are sent."""
+        """Return the frames; each describes a moment shortly before its transmission."""
         return [frame._replace(sampled_s=frame.sampled_s - self.LATENCY_S) for frame in super().frames_until(t_s)]
 
     def encode(self, times_s: Array, first: int) -> list[bytes]:
@@ -216,14 +216,14 @@ WIT_Z_UP = (180.0, 0.0, 0.0)
 
 
 def wit_packet(kind: int, values: Sequence[float], last: int = 0) -> bytes:
-    """Encode three numbers cut to 16 bits, a fourth, and the sum."""
+    """Encode a packet of three numbers limited to 16 bits, a fourth number, and the checksum."""
     cut = [max(-32768, min(32767, round(value))) for value in values]
     body = bytes([0x55, kind]) + struct.pack("<4h", *cut, last)
     return body + bytes([sum(body) % 256])
 
 
 def wit_angles_deg(aircraft: VirtualAircraft, t_s: float, mounting: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw, turned Z-Y-X from east, north, up to the device's own axes, of its apparent attitude."""
+    """Return roll, pitch, yaw of the device's apparent attitude: rotations Z-Y-X from east, north, up to its axes."""
     x, y, z = (mounting.T @ aircraft.truth_at(t_s).force_m_s2).tolist()
     roll, pitch = math.degrees(math.atan2(y, z)), math.degrees(math.atan2(-x, math.hypot(y, z)))
     north, east, _ = (aircraft.body_from_ned(t_s).T @ mounting[:, 0]).tolist()

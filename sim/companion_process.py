@@ -55,7 +55,7 @@ class CompanionProcess:
         self._process: asyncio.subprocess.Process | None = None
 
     def command(self, *words: str) -> list[str]:
-        """A command line of the companion with this configuration."""
+        """Return a command line of the companion with this configuration."""
         return [sys.executable, *self._entry, "-c", str(self.folder / "companion.toml"), *words]
 
     def log(self) -> str:

@@ -40,8 +40,8 @@ class FluidCompass(Magnetic, Gradienter):
 class NmeaCompass(FluidCompass):
     """HMR3000 (Honeywell 900240): HPR, and HDT as other makers' compasses send it.
 
-    It comes from the factory with no sentence enabled. `$PTNT,HPR*78` and the like ask for one. Tilt is the elevation
-    of the board's axes (p. 15).
+    From the factory, the compass has no sentence enabled. Questions such as `$PTNT,HPR*78` request one sentence. Tilt
+    is the elevation of the board's axes (p. 15).
     """
 
     protocol = "nmea"
@@ -89,7 +89,7 @@ class NmeaCompass(FluidCompass):
 class Os5000(FluidCompass):
     """OceanServer OS5000: `$C` sentences (user's guide, format type 0x01).
 
-    `<esc>R` and a number set its rate, 0 stops it. Its tilt comes from accelerometers.
+    `<esc>R` and a number set the output rate, 0 stops the output. The tilt comes from accelerometers.
     """
 
     protocol = "os5000"
@@ -123,13 +123,13 @@ def _circle(angle_deg: float) -> str:
 
 
 def rion_packet(command: int, data: bytes = b"") -> bytes:
-    """0x68, length, address 0, command, data, and the sum of all but the first."""
+    """Return a packet: 0x68, length, address 0, command, data, and the sum of all bytes but the first."""
     body = bytes([len(data) + 4, 0, command]) + data
     return b"\x68" + body + bytes([sum(body) % 256])
 
 
 def rion_decimal(angle_deg: float, digits: int, decimals: int) -> bytes:
-    """Encode two digits a byte; the first digit is the sign."""
+    """Encode an angle with two decimal digits per byte; the first digit is the sign."""
     text = f"{round(abs(angle_deg) * 10**decimals):0{digits - 1}d}"
     return bytes.fromhex(("1" if angle_deg < 0.0 and int(text) else "0") + text)
 
@@ -143,7 +143,7 @@ class RionCommands:
         self._pending = b""
 
     def take(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Return the whole commands received so far."""
+        """Return the complete commands received so far."""
         commands = []
         self._pending += data
         while len(self._pending) >= 2:
@@ -163,8 +163,8 @@ class RionCommands:
 class RionCompass(Compass):
     """HCM370B: pitch nose up, roll right side down, heading (magnetic), to a hundredth of a degree; 9600 8N1.
 
-    It comes in the mode in which it only answers; 0C 01 makes it speak by itself, which it remembers (HCM370B and
-    HCM705B manuals).
+    The factory mode only answers requests; 0C 01 starts automatic output, also after a power-off (HCM370B and HCM705B
+    manuals).
     """
 
     protocol = "rion"
@@ -178,7 +178,7 @@ class RionCompass(Compass):
         self._commands = RionCommands()
 
     def power_on(self, t_s: float) -> bytes:
-        """Start in the mode that was set last."""
+        """Start in the mode that was last set."""
         said = super().power_on(t_s)
         self.streaming = self.automatic
         return said
@@ -204,7 +204,7 @@ class RionCompass(Compass):
 
 
 def pni_packet(frame_id: int, payload: bytes = b"") -> bytes:
-    """Byte count, frame id, payload, CRC-16/XMODEM."""
+    """Return a packet: byte count, frame id, payload, CRC-16/XMODEM."""
     head = (len(payload) + 5).to_bytes(2, "big") + bytes([frame_id]) + payload
     return head + binascii.crc_hqx(head, 0).to_bytes(2, "big")
 
@@ -212,8 +212,8 @@ def pni_packet(frame_id: int, payload: bytes = b"") -> bytes:
 class PniCompass(Compass):
     """PNI TRAX: heading (magnetic), pitch nose up and roll right side down (PNI TRAX manual r06, p. 36-50).
 
-    It comes in poll mode: kGetData is answered with the components that kSetDataComponents has chosen, which a new
-    power-on forgets unless kSave has come. kStartContinuousMode and kStopContinuousMode are obeyed.
+    The factory mode is poll mode: the answer to kGetData has the components that kSetDataComponents has chosen. A
+    power-off without kSave deletes this choice. kStartContinuousMode and kStopContinuousMode are obeyed.
     """
 
     protocol = "pni"
@@ -221,7 +221,7 @@ class PniCompass(Compass):
     default_rate_hz = 10.0
     STREAM = 21
     FACTORY_COMPONENTS: Final = (5, 79)
-    """Heading and its status. The factory setting of the device is not documented."""
+    """Component ids of the factory setting: heading and its status. The real factory setting is not documented."""
 
     def __init__(self, aircraft: VirtualAircraft, *, continuous: bool = False, **more: Any) -> None:
         super().__init__(aircraft, **more)
@@ -262,7 +262,7 @@ class PniCompass(Compass):
         }
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """Obey frames with a right CRC; pass over everything else byte by byte."""
+        """Obey frames with a correct CRC; skip everything else byte by byte."""
         answer = b""
         self._pending += data
         while len(self._pending) >= 2:

@@ -1,9 +1,9 @@
 """`make demo`: the real daemon calibrates a virtual aircraft, and the truth judges it.
 
 `companion setup` finds the serial ports (ptys) of IMU, gradienter and compass and the autopilot double on UDP, and
-writes the configuration; it is told the IMUs' parts and nothing else. The daemon runs with that file as its own
-process. Afterwards an observer on the autopilot's second link measures what is left in its telemetry. Exit code 0 only
-if every axis lies within 3 sigma_use of the truth and the flight controller's residual is within 10 deg/h and 0.3 mg.
+writes the configuration; its only input is the IMUs' sensor types. The daemon runs with that file as its own process.
+Afterwards an observer on the autopilot's second link measures the residuals in its telemetry. The exit code is 0 if
+every axis lies within 3 sigma_use of the truth and the flight controller's residual is within 10 deg/h and 0.3 mg.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ async def _run(folder: Path, seed: int) -> int:
 
 
 async def _serve(scenario: Scenario, folder: Path, udp: int, stack: contextlib.AsyncExitStack) -> GroundStation:
-    """Start the autopilot: it sends to a UDP port of this machine, and to the ground station."""
+    """Start the autopilot, which sends to a UDP port of this machine and to the ground station."""
     station, up = GroundStation("ardupilot"), asyncio.Event()
     air = await open_udp(station, listen=(LOOPBACK, 0))
     stack.callback(air.close)
@@ -114,7 +114,7 @@ def _models(scenario: Scenario) -> dict[str, ImuModel]:
 
 
 async def _set_up(companion: CompanionProcess, scenario: Scenario, udp: int) -> None:
-    """Let `companion setup` write the configuration; it is told which parts the IMUs are."""
+    """Let `companion setup` write the configuration; the only input is the IMUs' sensor types."""
     parts = [word for name, model in _models(scenario).items() for word in ("--part", f"{name}={model.spec.name}")]
     print(f"\nSetting up (half a minute at most): companion setup --yes {' '.join(parts)}", flush=True)
     ports = [str(companion.folder / name) for name in scenario.ports]
@@ -133,7 +133,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 def _report(scenario: Scenario, record: Record, begin_s: float, end_s: float, residual: Array, stored: Array) -> bool:
-    """Print truth and result; return whether all is within limits."""
+    """Print truth and result; return True if all results are within the limits."""
     pose = record["pose"]
     print(
         f"\npose found: pitch {pose['theta_deg']:.3f}, roll {pose['gamma_deg']:.3f},"

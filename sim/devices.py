@@ -1,4 +1,4 @@
-"""Serial devices of the virtual aircraft: their quantities and their bytes.
+"""Serial devices of the virtual aircraft: the quantities that they measure and the bytes that they send.
 
 A device knows no port and no loop: `frames_until(t_s)` gives every frame that is complete by an aircraft time, so that
 a test can have minutes of traffic at once; `sim.pty_device` serves the same frames on a pty in real time.
@@ -24,7 +24,7 @@ from sim.imu_model import ImuModel
 
 Law = Literal["axis", "slope", "euler"]
 _COMMAND_LIMIT = 64
-"""Longest unfinished command, bytes; a longer one is dropped."""
+"""Maximum length of an unfinished command in bytes; a longer one is dropped."""
 
 
 class Frame(NamedTuple):
@@ -38,7 +38,7 @@ class Frame(NamedTuple):
 
 
 def nmea(body: str) -> bytes:
-    """`$body*hh` with the XOR of the body, and CR LF."""
+    """Return the sentence `$body*hh` with the XOR of the body, and CR LF."""
     return f"${body}*{reduce(xor, body.encode(), 0):02X}\r\n".encode()
 
 
@@ -47,7 +47,7 @@ class SerialDevice(ABC):
 
     Args:
         rate_hz: frames per second; None: the device's own rate.
-        clock_ppm: excess speed of its clock over the aircraft's.
+        clock_ppm: excess speed of the device's clock over the aircraft's.
     """
 
     protocol: str
@@ -66,13 +66,13 @@ class SerialDevice(ABC):
         self._next = 0
 
     def power_on(self, t_s: float) -> bytes:
-        """Start at this time; return the device's first output (often nothing)."""
+        """Start the device at this time; return its first output (often nothing)."""
         self._start_s, self._next = t_s, 0
         self.streaming = True
         return self.banner()
 
     def banner(self) -> bytes:
-        """Output at power-on."""
+        """Return the output at power-on."""
         return b""
 
     @property
@@ -80,7 +80,7 @@ class SerialDevice(ABC):
         return self._start_s + self._next * self._period_s
 
     def line_time_s(self, size: int) -> float:
-        """Transmission time of so many bytes."""
+        """Return the transmission time of so many bytes."""
         return size * self.bits_per_byte / self.baud
 
     def frames_until(self, t_s: float) -> list[Frame]:
@@ -112,7 +112,7 @@ COUNTS_PER_GAUSS = 4000.0
 
 
 class Magnetic:
-    """Magnetic heading and field of a mounted device; mixed into its class."""
+    """Magnetic heading and field of a mounted device; a mixin for device classes."""
 
     aircraft: VirtualAircraft
     _mounting: Array
@@ -225,7 +225,7 @@ class HMR3300(Compass):
 
 
 def _tidy(value: float, digits: int) -> str:
-    """Format a decimal without a minus before zero."""
+    """Format a decimal number; write zero without a minus sign."""
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0.0 else text
 
@@ -236,7 +236,7 @@ class Gradienter(SerialDevice):
     x: right side down +, y: nose up +, by one of three laws of the apparent gravity in the sensor's own axes
     (forward, right, down): "axis": elevation of each axis; "slope": slope of the liquid, atan of a ratio of components;
     "euler": roll and pitch themselves. The fluid follows with a first-order lag of 0.43 s, and like every pendulum it
-    takes acceleration for tilt. Beyond the range the digits become signs.
+    shows acceleration as tilt. Beyond the range, signs replace the digits.
     """
 
     protocol = "inclinometer_xy"
@@ -265,7 +265,7 @@ class Gradienter(SerialDevice):
         self._fluid: tuple[float, Array] | None = None
 
     def tilt_deg(self, t_s: Array) -> Array:
-        """Apply the law to the apparent gravity at times (n): x and y (n, 2), before lag, offset and noise."""
+        """Return the tilt x and y (n, 2) by the law, for the apparent gravity at times (n), without lag and errors."""
         gravity = -(self.aircraft.truth(t_s).force_m_s2 @ self._mounting)
         forward, right, down = (gravity / np.linalg.norm(gravity, axis=1, keepdims=True)).T
         if self.law == "axis":
@@ -285,7 +285,7 @@ class Gradienter(SerialDevice):
         return self._line("X", x) + self._line("Y", y)
 
     def reading_deg(self, t_s: float) -> tuple[float, float]:
-        """Reading x, y with lag, offset and noise."""
+        """Return the reading x, y with lag, offset and noise."""
         noise = self.noise_deg * self._random.standard_normal(2)
         x, y = self._settle(t_s) + np.asarray(self.offset_deg) + noise
         return float(x), float(y)

@@ -42,13 +42,13 @@ def normal_gravity_m_s2(latitude_deg: float, height_m: float = 0.0) -> float:
 
 
 def earth_rate_ned_rad_s(latitude_deg: float) -> Array:
-    """The Earth's rotation seen from the ground, north, east and down."""
+    """Return the Earth's rotation relative to space (3,): north, east and down."""
     latitude = math.radians(latitude_deg)
     return EARTH_RATE_RAD_S * np.array([math.cos(latitude), 0.0, -math.sin(latitude)])
 
 
 def axis_rotation(axis: int, angle_rad: float) -> Array:
-    """Rotation matrix about a coordinate axis (0, 1, 2), right-handed."""
+    """Return the right-handed rotation matrix about a coordinate axis (0, 1, 2)."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -58,7 +58,7 @@ def axis_rotation(axis: int, angle_rad: float) -> Array:
 
 
 def mounting_matrix(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Array:
-    """Sensor axes to vehicle axes for a sensor turned by yaw, then pitch, then roll about its own axes."""
+    """Return the rotation from sensor to vehicle axes; the sensor is turned by yaw, pitch, roll about its own axes."""
     return (
         axis_rotation(2, math.radians(yaw_deg))
         @ axis_rotation(1, math.radians(pitch_deg))
@@ -67,12 +67,12 @@ def mounting_matrix(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Array:
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """The matrix that takes a vector from north, east, down into the body's forward, right, down."""
+    """Return the rotation from north, east, down to the body's forward, right, down."""
     return axis_rotation(0, -roll_rad) @ axis_rotation(1, -pitch_rad) @ axis_rotation(2, -yaw_rad)
 
 
 def bodies_from_ned(angles_rad: Array) -> Array:
-    """Matrices (n, 3, 3) for roll, pitch, yaw (n, 3)."""
+    """Return the rotations from NED to body (n, 3, 3) for roll, pitch, yaw (n, 3)."""
     sr, sp, sy = np.sin(angles_rad).T
     cr, cp, cy = np.cos(angles_rad).T
     rows = [

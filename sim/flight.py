@@ -23,7 +23,7 @@ _STEP_S: Final = 2e-3
 
 
 def smooth(u: Array) -> Array:
-    """Step from 0 to 1 over u in [0, 1], with three continuous derivatives."""
+    """Return a step from 0 to 1 over u in [0, 1], with three continuous derivatives."""
     u = np.minimum(np.maximum(u, 0.0), 1.0)
     squared = u * u
     result: Array = squared * squared * (35.0 - u * (84.0 - u * (70.0 - 20.0 * u)))
@@ -31,7 +31,7 @@ def smooth(u: Array) -> Array:
 
 
 def smooth_integral(u: Array) -> Array:
-    """Integral of `smooth` from 0; its slope is 1 after u = 1."""
+    """Return the integral of `smooth` from 0; its slope is 1 after u = 1."""
     v = np.minimum(np.maximum(u, 0.0), 1.0)
     squared = v * v
     inside = squared * squared * v * (7.0 - v * (14.0 - v * (10.0 - 2.5 * v)))
@@ -41,22 +41,22 @@ def smooth_integral(u: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route(ABC):
-    """A flight from `start_s` on (aircraft time); before it the angles are those of the start, the speed is 0."""
+    """A flight from `start_s` on (aircraft time); before, the angles are those of the start and the speed is 0."""
 
     start_s: float = 0.0
 
     @abstractmethod
     def angles_rad(self, t_s: Array) -> Array:
-        """Roll, pitch, heading (n, 3) of the vehicle; headings are not wrapped."""
+        """Return roll, pitch, heading (n, 3) of the vehicle; headings are not wrapped."""
 
     @abstractmethod
     def velocity_m_s(self, t_s: Array) -> Array:
-        """Velocity (n, 3) in NED."""
+        """Return the velocity (n, 3) in NED."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BankedCircles(Route):
-    """A fixed wing in a level, coordinated turn that never ends: the trap of every leveller.
+    """A fixed-wing aircraft in an endless, coordinated turn at constant height, in which levelling by gravity fails.
 
     It gathers speed over `launch_s`, flies straight for `straight_s`, and rolls into the turn.
     """
@@ -73,7 +73,7 @@ class BankedCircles(Route):
         return rate * smooth(u), rate * self.entry_s * smooth_integral(u)
 
     def angles_rad(self, t_s: Array) -> Array:
-        """Bank that the turn needs; no pitch."""
+        """Return angles with the bank that the turn needs, without pitch."""
         rate, turned = self._turn(t_s)
         bank = np.arctan(rate * self.airspeed_m_s / STANDARD_GRAVITY_M_S2)
         return np.column_stack([bank, np.zeros_like(bank), turned])
@@ -95,7 +95,7 @@ class Shuttle(Route):
     begin_s: float = 3.0
 
     def velocity_m_s(self, t_s: Array) -> Array:
-        """Velocity along one line over the ground; the acceleration is a sine."""
+        """Return the velocity along a line over the ground; the acceleration is a sine."""
         peak = STANDARD_GRAVITY_M_S2 * math.tan(math.radians(self.lean_deg))
         omega = 2.0 * math.pi / self.period_s
         since = t_s - self.start_s
@@ -103,7 +103,7 @@ class Shuttle(Route):
         return np.column_stack([speed * math.cos(0.4), speed * math.sin(0.4), np.zeros_like(speed)])
 
     def angles_rad(self, t_s: Array) -> Array:
-        """Lean such that the thrust, along -z of the body, gives the acceleration."""
+        """Return angles at which the thrust, along -z of the body, gives the acceleration."""
         acceleration = _derivative(self.velocity_m_s, t_s)
         swing = 2.0 * math.pi / self.swing_period_s
         heading = math.radians(self.swing_deg) * smooth((t_s - self.start_s) / 5.0)
@@ -128,8 +128,8 @@ def _derivative(function: object, t_s: Array) -> Array:
 class MovingAircraft(VirtualAircraft):
     """A `VirtualAircraft` that stands until its route begins.
 
-    The route's angles are added to the pose's heading; the pose's roll and pitch are how the box of sensors is fixed in
-    the vehicle. "Body" is that box, for the truth and for every sensor on it.
+    The route's angles are added to the pose's heading; the pose's roll and pitch are the mounting of the box of sensors
+    in the vehicle. "Body" is that box, for the truth and for every sensor on it.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class MovingAircraft(VirtualAircraft):
         self._stands_until_s = route.start_s - 2.0 * _STEP_S
         self._box = bodies_from_ned(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
         self._coriolis = 2.0 * np.cross(self._earth_rate_ned, np.eye(3))
-        """Acceleration (3, 3) per component of the velocity, north, east, down."""
+        """Coriolis acceleration (3, 3) for each component of the velocity, north, east, down."""
 
     def matrices(self, t_s: Array) -> Array:
         angles = self.route.angles_rad(t_s) + np.array([0.0, 0.0, math.radians(self.pose.heading_deg)])

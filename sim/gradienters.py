@@ -17,7 +17,7 @@ from sim.earth import Array, mounting_matrix
 
 _COMMAND_LIMIT: Final = 64
 _STORING: Final = ("SO-", "XYC", "XY-SET", "XY-MEMS")
-"""First letters of the Jewell commands whose effect outlasts its power."""
+"""First letters of the Jewell commands whose effect outlasts a power-off."""
 
 
 class Jewell(Gradienter):
@@ -84,8 +84,8 @@ class Jewell(Gradienter):
 class BeiInclinometer(Gradienter):
     """BEI INC or AGS: the lines of the MEAS family at 8E1, other letters (BEI manual, p. 10 to 12).
 
-    `polled` is its stored mode. In the setup level, entered with "prog" while stopped, the letters that in the user
-    level hold until power-off are stored.
+    `polled` is its stored mode. Some letters set a mode until power-off. The same letters store the mode in the setup
+    level, which "prog" enters while the output is stopped.
     """
 
     bits_per_byte = 11

@@ -1,8 +1,8 @@
-"""A person who handles the aircraft: turns it on its spot, tilts it, restores it.
+"""A person who handles the aircraft: turns it on its spot, tilts it, puts it back.
 
-A spot is a plane. However the aircraft is turned on it, its down axis stays the plane's normal, except for the error of
-placing it by hand. Typed lines drive it while a simulation runs (`python -m sim all --hands`), or the requests of
-companion and autopilots (`follow`).
+A spot is a plane. In all headings on a spot, the aircraft's down axis is the plane's normal, except for the error of
+placing the aircraft by hand. Typed lines move the aircraft while a simulation runs (`python -m sim all --hands`), or
+the requests of companion and autopilots (`follow`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HELP: Final = (
     " | wait SECONDS"
 )
 PLACEMENT_DEG, PROPPED_DEG = 0.02, 4.0
-"""Placing error on marks by careful hands, and propping error, one sigma."""
+"""Sigmas of the error when placing the aircraft on marks by careful hands, and when propping it up; degrees."""
 _EXAMPLES: Final = (
     "turn 180: clockwise on its spot; tilt 20 0: nose up; hold 0 180: on its back, whatever the spot; spot 3 0:"
     " onto another one, which slopes; back: onto its spot; bump 0.3 0: the spot tips; grip 20: a hand stays on it;"
@@ -42,7 +42,7 @@ SIDES: Final = {
     "left side down": (0.0, -90.0),
     "right side down": (0.0, 90.0),
 }
-"""Pitch and roll of each side, by the companion's words."""
+"""Pitch and roll for each side, by the name that the companion uses."""
 _SIDE = "|".join(SIDES)
 _MISSING = re.compile(rf"(?:between ({_SIDE}) and ({_SIDE})|({_SIDE})): ")
 _TURN = re.compile(r"turn it (?:by|on by) (\d+) deg")
@@ -55,7 +55,7 @@ class Hands:
         aircraft: the aircraft, standing on its spot.
         placement_deg: one sigma of the angle between down axis and the spot's normal at each placing, each axis.
         propped_deg: one sigma of pitch and roll errors when propped up by hand.
-        seed: seed of both.
+        seed: seed of both errors.
         takes_s: duration of each movement.
     """
 
@@ -78,37 +78,37 @@ class Hands:
         self._number = 0
 
     def turn(self, t_s: float, degrees: float) -> float:
-        """Turn it on its spot from aircraft time `t_s`; return the time at which it stands again."""
+        """Turn the aircraft on its spot from aircraft time `t_s`; return the time at which it is motionless again."""
         self._turned_deg += degrees
         return self.back(t_s, degrees)
 
     def back(self, t_s: float, turn_deg: float = 0.0) -> float:
-        """Place it on its spot, turned by about `turn_deg`."""
+        """Put the aircraft back on its spot, turned by about `turn_deg`."""
         attitude = axis_rotation(2, -math.radians(self._turned_deg)) @ self._spot
         miss = np.radians(self._placement_deg) * self._random.standard_normal(2)
         attitude = axis_rotation(0, miss[0]) @ axis_rotation(1, miss[1]) @ attitude
         return self._go(t_s, attitude, turn_deg)
 
     def tilt(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
-        """Prop it up relative to its pose on the spot: nose up, right side down."""
+        """Prop the aircraft up relative to its pose on the spot: nose up, right side down."""
         attitude = axis_rotation(2, -math.radians(self._turned_deg)) @ self._spot
         attitude = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg)) @ attitude
         return self._go(t_s, attitude)
 
     def hold(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
-        """Prop it up in any orientation relative to the horizon: nose up, right side down."""
+        """Prop the aircraft up in any orientation relative to the horizon: nose up, right side down."""
         pitch_off, roll_off = self._propped_deg * self._random.standard_normal(2)
         return self._go(t_s, self._held(pitch_deg + pitch_off, roll_deg + roll_off))
 
     def grip(self, t_s: float, seconds: float) -> float:
-        """Hold it: it trembles by some tenths of a degree, and ends as it began."""
+        """Hold the aircraft in the hands: it trembles by some tenths of a degree, and ends in its initial pose."""
         self._number += 1
         tremor = Handling(start_s=t_s, duration_s=seconds, angle_deg=0.4, acceleration=0.1, seed=self._number)
         self._aircraft.add(tremor)
         return tremor.end_s
 
     def follow(self, words: str, t_s: float) -> bool:
-        """Obey a request of `companion align`; return whether the words were one."""
+        """Obey a request of `companion align`; return False if the words are no such request."""
         if (missing := _MISSING.search(words)) is not None:
             up = np.mean([_up(*SIDES[name]) for name in missing.groups() if name is not None], axis=0)
             up /= np.linalg.norm(up)
@@ -122,7 +122,7 @@ class Hands:
         return True
 
     def spot(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
-        """Place it on another spot with this initial pose."""
+        """Place the aircraft on another spot, with this initial pose."""
         self._spot, self._turned_deg = self._held(pitch_deg, roll_deg), 0.0
         return self.back(t_s)
 
@@ -130,7 +130,7 @@ class Hands:
         return body_from_ned(*(math.radians(a) for a in (roll_deg, pitch_deg, self._now.heading_deg)))
 
     def bump(self, _t_s: float, pitch_deg: float, roll_deg: float) -> None:
-        """Tip the spot itself, in the aircraft's first heading; it shows at the next placing."""
+        """Tip the spot itself, relative to the aircraft's first heading; the change shows at the next placing."""
         tipped = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg))
         self._spot = tipped @ self._spot
 
@@ -188,7 +188,7 @@ def _up(pitch_deg: float, roll_deg: float) -> Array:
 
 
 async def take_lines(hands: Hands, aircraft: VirtualAircraft, say: Callable[[str], None]) -> None:
-    """Obey standard input, a terminal or a script, line by line until it ends."""
+    """Read lines from standard input, a terminal or a script, and obey each, until the input ends."""
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)

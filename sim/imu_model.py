@@ -1,4 +1,4 @@
-"""A MEMS IMU with a wandering bias, and the true bias at hand.
+"""A MEMS IMU with a wandering bias, whose true value can be read at any time.
 
 Noise terms and figures are those of method 2.2: white noise N (unit * sqrt(s), two-sided PSD N^2), flicker B (PSD
 B^2 / (2 pi f), Allan floor 0.664 B), rate random walk K. The slow part (flicker and walk) is one path in time, the same
@@ -20,16 +20,16 @@ from sim.earth import STANDARD_GRAVITY_M_S2, Array, mounting_matrix
 from sim.thermal import Curve, Piece
 
 DEG_H = math.radians(1.0) / 3600.0
-"""rad/s per deg/h."""
+"""One deg/h in rad/s."""
 MG = STANDARD_GRAVITY_M_S2 * 1e-3
-"""m/s^2 per mg."""
+"""One mg in m/s^2."""
 UG = STANDARD_GRAVITY_M_S2 * 1e-6
 
 SLOW_STEP_S = 0.1
-"""Grid of the slow path. Faster flicker lies far below the white noise of every part listed here."""
+"""Time step of the slow path. Faster flicker is far below the white noise of every part listed here."""
 _BLOCK = 512
 _KEPT_BLOCKS = 400
-"""About 5.7 hours of slow path are kept; older times raise."""
+"""Number of stored blocks, about 5.7 hours of slow path; a read of older times raises an error."""
 _TAU_RATIO = 3.0
 _TAUS_S = 0.3 * _TAU_RATIO ** np.arange(11.0)
 """Time constants of the Gauss-Markov processes whose sum is the flicker: 0.3 s to 5 hours."""
@@ -37,22 +37,22 @@ _TAUS_S = 0.3 * _TAU_RATIO ** np.arange(11.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AxisNoise:
-    """Figures of one triad in SI: rad/s for gyros, m/s^2 for accelerometers."""
+    """Noise figures of one triad in SI units: rad/s for gyros, m/s^2 for accelerometers."""
 
     white: float
-    """N, unit * sqrt(s)."""
+    """White noise N, unit * sqrt(s)."""
     flicker: float = 0.0
-    """B, unit; the Allan floor is 0.664 B."""
+    """Flicker noise B, unit; the Allan floor is 0.664 B."""
     walk: float = 0.0
-    """K, unit / sqrt(s)."""
+    """Random walk K, unit / sqrt(s)."""
     per_kelvin: float = 0.0
-    """Bias per kelvin away from the reference temperature; one sigma where a piece is drawn."""
+    """Bias per kelvin of difference to the reference temperature; when a piece is drawn, the sigma of that slope."""
     scatter: float = 0.0
-    """One sigma of the bias from power-up to power-up, at one temperature."""
+    """Sigma of the bias from power-up to power-up, at constant temperature."""
     step: float = 0.0
-    """Quantisation of the output; 0 for floats."""
+    """Quantisation step of the output; 0: floats."""
     limit: float = math.inf
-    """Saturation."""
+    """Saturation limit of the output."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +63,7 @@ class ImuSpec:
     reference_degc: float = 25.0
 
     def piece(self, random: np.random.Generator, usual: Array) -> Piece:
-        """Draw one piece with these usual biases (6,) and its own curve."""
+        """Draw one piece of this part, with these usual biases (6,) and its own temperature curve."""
         scatter = np.repeat([self.gyro.scatter, self.accel.scatter], 3)
         return Piece.drawn(random, usual, scatter, np.repeat([self.gyro.per_kelvin, self.accel.per_kelvin], 3))
 
@@ -78,7 +78,7 @@ def _triad(
     limit: float,
     walk: float | None = None,
 ) -> AxisNoise:
-    """Figures from an Allan floor; without K the walk reaches the floor at 1000 s (as the method assumes)."""
+    """Return figures for an Allan floor; without K, the walk reaches the floor at 1000 s (as the method assumes)."""
     return AxisNoise(
         white=white,
         flicker=floor / 0.664,
@@ -171,7 +171,7 @@ class _SlowPath:
         self.silent = not (flicker.any() or walk.any())
 
     def at(self, t_s: Array) -> Array:
-        """Interpolate the grid linearly (n, 6); before time 0 the values are those of time 0."""
+        """Return the path, linearly interpolated, at times (n, 6); before time 0 the values are those at time 0."""
         position = np.maximum(t_s, 0.0) / SLOW_STEP_S
         index = position.astype(np.int64)
         share = (position - index)[:, None]
@@ -213,7 +213,7 @@ class _SlowPath:
             del self._blocks[block]
 
     def _make_block(self) -> None:
-        """Make one block and the first value of the next, so that interpolation stays inside a block."""
+        """Make one block and the first value of the next, so that interpolation needs only one block."""
         out = np.empty((_BLOCK + 1, 6))
         out[0] = self._last
         kicks = self._random.standard_normal((_BLOCK, len(_TAUS_S), 6)) * self._kick
@@ -242,7 +242,7 @@ class ImuModel:
         gyro_misalignment_rad, accel_misalignment_rad: small rotation of the triad.
         gyro_shear, accel_shear: deviation from square of x and y, x and z, y and z.
         mounting_deg: roll, pitch, yaw of the sensor's axes relative to the vehicle's (a MAVLink rotation's angles).
-        thermometer_off_k: error of its own thermometer.
+        thermometer_off_k: error of the IMU's own thermometer.
         curve: the piece's curve over temperature; without one each axis moves as the specification allows.
     """
 
@@ -267,14 +267,14 @@ class ImuModel:
         self.aircraft = aircraft
         self.spec = PARTS[spec] if isinstance(spec, str) else spec
         self.mounting = mounting_matrix(*mounting_deg)
-        """Sensor to vehicle FRD."""
+        """Rotation from sensor axes to vehicle FRD."""
         self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
         self.thermometer: Callable[[float], float] = lambda degc: degc + thermometer_off_k
-        """Reading of its thermometer at a true temperature; replaceable by a bad one."""
+        """Function from true temperature to the thermometer's reading; a test can replace it by a bad thermometer."""
         gyro, accel = self.spec.gyro, self.spec.accel
         self.curve = curve or Curve((np.repeat([gyro.per_kelvin, accel.per_kelvin], 3),))
         self.white: Array = np.repeat([gyro.white, accel.white], 3)
-        """N of the six axes: three in rad/s * sqrt(s), three in m/s^2 * sqrt(s)."""
+        """White noise N of the six axes: three in rad/s * sqrt(s), three in m/s^2 * sqrt(s)."""
         self._limit = np.repeat([gyro.limit, accel.limit], 3)
         self._slow = _SlowPath(
             np.repeat([gyro.flicker, accel.flicker], 3), np.repeat([gyro.walk, accel.walk], 3), [seed, 1]
@@ -287,30 +287,30 @@ class ImuModel:
         self._accel_matrix = _response(accel_scale, accel_misalignment_rad, accel_shear) @ self.mounting.T
 
     def in_steps(self, gyro_rad_s: float, accel_m_s2: float) -> ImuModel:
-        """Return the sensor behind another converter, which replaces this one: both draw from the same noise."""
+        """Return the sensor with another converter, in place of this one: both draw from the same noise."""
         other, spec = copy.copy(self), self.spec
         gyro, accel = replace(spec.gyro, step=gyro_rad_s), replace(spec.accel, step=accel_m_s2)
         other.spec = replace(spec, gyro=gyro, accel=accel)
         return other
 
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
-        """Power up again with other biases, behind every converter."""
+        """Power up again with other biases, also for the sensors made by `in_steps`."""
         self._turn_on[:] = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2])
 
     def forget_before(self, t_s: float) -> None:
-        """Drop the bias before a time: an hour of it is 1.7 MB."""
+        """Delete the stored bias before a time: one hour takes 1.7 MB."""
         self._slow.forget_before(t_s)
 
     def temperature_degc(self, t_s: float) -> float:
         return self.thermometer(self.aircraft.temperature_degc(t_s))
 
     def true_bias(self, t_s: float) -> Bias:
-        """Additive bias now: turn-on, flicker, walk and temperature."""
+        """Return the true additive bias at a time: turn-on, flicker, walk and temperature."""
         both = self._bias_at(t_s)
         return Bias(both[:3], both[3:])
 
     def mean_bias(self, start_s: float, end_s: float) -> Bias:
-        """Mean of `true_bias` over a window, on a grid of 0.1 s."""
+        """Return the mean of `true_bias` over a window, on a grid of 0.1 s."""
         times = np.arange(start_s, end_s, SLOW_STEP_S) if end_s > start_s else np.array([start_s])
         both = self._bias(times).mean(axis=0)
         return Bias(both[:3], both[3:])
@@ -325,7 +325,7 @@ class ImuModel:
         return result
 
     def expected(self, t_s: float) -> Array:
-        """Reading without noise, rounding and limit: three rates, three specific forces."""
+        """Return the reading without noise, rounding and limit: three rates, three specific forces."""
         truth = self.aircraft.truth_at(t_s)
         if truth is not self._seen:  # a standing aircraft gives the same object again and again
             ideal = np.concatenate((self._gyro_matrix @ truth.rate_rad_s, self._accel_matrix @ truth.force_m_s2))
@@ -333,7 +333,7 @@ class ImuModel:
         return self._ideal + self._bias_at(t_s)
 
     def expected_block(self, t_s: Array) -> Array:
-        """Readings (n, 6) without noise, rounding and limit at ascending times (n)."""
+        """Return readings (n, 6) without noise, rounding and limit at ascending times (n)."""
         rate, force = self.aircraft.truth(t_s)
         out = self._bias(t_s)
         out[:, :3] += rate @ self._gyro_matrix.T
@@ -341,7 +341,7 @@ class ImuModel:
         return out
 
     def read(self, t_s: Array, interval_s: float) -> Array:
-        """Readings (n, 6) at ascending times of samples that each average over `interval_s`.
+        """Return readings (n, 6) at ascending times, of samples that each average over `interval_s`.
 
         White noise is drawn in the order of reading, so one model has one reader; the bias does not care.
         """

@@ -1,11 +1,12 @@
 """Motions of a standing aircraft: turned, handled, shaken, and swayed on a boat in waves.
 
-A motion adds to the Euler angles of the still pose, and to the acceleration. Each one gives its angles and their exact
-derivatives, so the true body rate needs no numerical differentiation. Times are seconds of the aircraft's own clock.
+A motion adds to the Euler angles of the aircraft at rest, and to the acceleration. Each one gives its angles and their
+exact derivatives, so the true body rate needs no numerical differentiation. Times are seconds of the aircraft's own
+clock.
 
 Every wave is a narrow band: components of equal size, spread around its frequency, with random phases, so that it comes
 in groups as real waves do. Roll and pitch have components of their own. The boat is pushed along its slopes too: in
-long waves a raft lies across the apparent vertical, and a fluid level on it feels little of its tilt.
+long waves a raft is normal to the apparent vertical, and a gradienter on a raft measures little of the raft's tilt.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from sim.earth import STANDARD_GRAVITY_M_S2, Array
 
 
 def smooth_step(u: Array) -> tuple[Array, Array]:
-    """A step from 0 to 1 over u in [0, 1] with continuous second derivative, and its derivative in u."""
+    """Return a step from 0 to 1 over u in [0, 1] with continuous second derivative, and its derivative in u."""
     u = np.minimum(np.maximum(u, 0.0), 1.0)
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2), 30.0 * u**2 * (1.0 - u) ** 2
 
@@ -36,26 +37,26 @@ class Motion(ABC):
 
     @property
     def end_s(self) -> float:
-        """End of the motion; the angles it leaves stay."""
+        """End of the motion; a change of the angles can remain after it."""
         return self.start_s + self.duration_s
 
     @abstractmethod
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Added roll, pitch, heading (n, 3) in rad, and their derivatives in rad/s."""
+        """Return the added roll, pitch, heading (n, 3) in rad, and their derivatives in rad/s."""
 
     def acceleration_m_s2(self, t_s: Array) -> Array | None:
-        """Added acceleration (n, 3) of the IMU, in body axes; None: never any."""
+        """Return the added acceleration (n, 3) of the IMU in body axes; None: this motion never has any."""
         del t_s
         return None
 
     def level_acceleration_m_s2(self, t_s: Array) -> Array | None:
-        """Added acceleration (n, 3) along the heading, to the right of it, and down, of the aircraft as a whole."""
+        """Return the added acceleration (n, 3) of the whole aircraft: along the heading, to its right, and down."""
         del t_s
         return None
 
     @functools.cached_property
     def leaves_rad(self) -> Array:
-        """Angles that remain afterwards (3)."""
+        """Return the change of the angles that remains after the motion (3)."""
         result: Array = self.euler_rad(np.array([self.end_s]))[0][0]
         return result
 
@@ -82,7 +83,7 @@ class SlowTurn(Motion):
     ramp_s: float = 1.0
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Added angles and rates: the rate rises smoothly over `ramp_s`, stays, and falls in the same way."""
+        """Return added angles and rates: the rate rises smoothly over `ramp_s`, is constant, and falls like this."""
         ramp = min(self.ramp_s, self.duration_s / 2.0)
         since, until = t_s - self.start_s, self.end_s - t_s
         near = np.minimum(since, until)  # to the beginning or to the end: it ends as it has begun
@@ -97,21 +98,21 @@ class SlowTurn(Motion):
 
 @dataclass(frozen=True, kw_only=True)
 class Handling(Motion):
-    """A person holds the aircraft: irregular turning and shaking that ends where it began."""
+    """A person holds the aircraft: irregular turning and shaking, which ends in the initial pose."""
 
     angle_deg: float = 4.0
     acceleration: float = 0.7
-    """Largest acceleration, about, m/s^2."""
+    """Approximate largest acceleration, in m/s^2."""
     seed: int = 0
 
     @functools.cached_property
     def _waves(self) -> tuple[Array, Array]:
-        """Angular frequencies (3 axes, 4 waves) in rad/s and phases in rad."""
+        """Return angular frequencies (3 axes, 4 waves) in rad/s, and phases in rad."""
         generator = np.random.default_rng([self.seed, 17])
         return 2.0 * math.pi * generator.uniform(0.3, 1.7, (3, 4)), generator.uniform(0.0, 2.0 * math.pi, (3, 4))
 
     def _window(self, t_s: Array) -> tuple[Array, Array]:
-        """Window that is zero, with its slope, at both ends, and its derivative in 1/s."""
+        """Return a window that is zero, with zero slope, at both ends, and its derivative in 1/s."""
         u = np.clip((t_s - self.start_s) / self.duration_s, 0.0, 1.0)
         return np.sin(math.pi * u) ** 2, math.pi / self.duration_s * np.sin(2.0 * math.pi * u)
 
@@ -134,7 +135,7 @@ class Handling(Motion):
 
 @dataclass(frozen=True, kw_only=True)
 class Vibration(Motion):
-    """A running motor or generator near by: no turning, a steady shake."""
+    """A running motor or generator near the aircraft: no turning, a steady vibration."""
 
     frequency_hz: float = 87.0
     amplitude_m_s2: float = 1.0
@@ -144,7 +145,7 @@ class Vibration(Motion):
         return ((t_s >= self.start_s) & (t_s < self.end_s)).astype(np.float64)
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
-        """Rocking about roll and pitch at the vibration's frequency."""
+        """Return rocking angles about roll and pitch at the vibration's frequency, and their rates."""
         omega = 2.0 * math.pi * self.frequency_hz
         phase = omega * (t_s - self.start_s)
         peak = math.radians(self.rocking_deg_s)
@@ -153,7 +154,7 @@ class Vibration(Motion):
         return gate * (peak / omega) * np.sin(phase)[:, None] * share, gate * peak * np.cos(phase)[:, None] * share
 
     def acceleration_m_s2(self, t_s: Array) -> Array:
-        """Shake in body axes, strongest along z."""
+        """Return the vibration in body axes, strongest along z."""
         phase = 2.0 * math.pi * self.frequency_hz * (t_s - self.start_s)
         waves = np.column_stack([np.sin(phase), np.sin(phase + 1.0), np.sin(phase + 2.0)])
         result: Array = self._gate(t_s)[:, None] * self.amplitude_m_s2 * waves * np.array([0.4, 0.4, 1.0])
@@ -165,7 +166,7 @@ class Vibration(Motion):
 
 
 COMPONENTS: Final = 16
-"""Components of one wave about one axis."""
+"""Number of components of one wave about one axis."""
 DAY_S: Final = 86400.0
 SURGE: Final = 0.3
 
@@ -177,7 +178,7 @@ class Wave:
     frequency_hz: float
     sway_deg: float
     spread: float = 0.1
-    """Standard deviation of the components' frequencies over the frequency itself."""
+    """Standard deviation of the components' frequencies, relative to the wave's frequency."""
 
 
 SWELL: Final = (Wave(0.2, 5.0), Wave(0.05, 1.0))
@@ -192,24 +193,24 @@ class Sea(Motion):
     duration_s: float = DAY_S
     waves: tuple[Wave, ...] = SWELL
     surge: float = SURGE
-    """Sideways acceleration over g times the slope; 1: a raft, on which no tilt is felt."""
+    """Ratio of sideways acceleration to g times the slope; 1: a raft, on which no tilt is felt."""
     surge_lead_rad: float = 0.5
-    """Lead of the sideways acceleration over the slope."""
+    """Phase by which the sideways acceleration leads the slope."""
     heave: float = 0.3
-    """Vertical acceleration over g times the slope, a quarter of a wave behind, as water moves in circles."""
+    """Ratio of vertical acceleration to g times the slope; it lags by a quarter wave, as water moves in circles."""
     rise_s: float = 5.0
-    """Time in which the waves build up, and die away."""
+    """Time in which the waves build up at the start and die away at the end."""
     seed: int = 0
 
     def _height(self, t_s: Array) -> tuple[Array, Array]:
-        """Height of the build-up, 0 to 1, and its derivative in 1/s."""
+        """Return the amplitude of the waves while they build up or die away, 0 to 1, and its derivative in 1/s."""
         rise_s = min(self.rise_s, self.duration_s / 2.0)
         up, up_slope = smooth_step((t_s - self.start_s) / rise_s)
         down, down_slope = smooth_step((self.end_s - t_s) / rise_s)
         return up * down, (up_slope * down - up * down_slope) / rise_s
 
     def _sums(self, t_s: Array) -> tuple[Array, Array, Array]:
-        """Roll and pitch (n, 2), the same a quarter of a wave later, and their derivatives."""
+        """Return roll and pitch (n, 2), both a quarter of a wave later, and the derivatives."""
         frequencies, amplitudes, phases = _components(self.waves, self.seed)
         angles, later, slopes = np.empty((3, len(t_s), 2))
         for axis in range(2):
@@ -229,7 +230,7 @@ class Sea(Motion):
         return turned, rates
 
     def level_acceleration_m_s2(self, t_s: Array) -> Array:
-        """Surge, sway and heave: down the slope, and round."""
+        """Return surge, sway and heave: acceleration down the slope, and on the circles of the water."""
         angles, later, _ = self._sums(t_s)
         slope = math.cos(self.surge_lead_rad) * angles + math.sin(self.surge_lead_rad) * later
         height, _ = self._height(t_s)
@@ -245,7 +246,7 @@ class Sea(Motion):
 
 @functools.lru_cache(maxsize=16)
 def _components(waves: tuple[Wave, ...], seed: int) -> tuple[Array, Array, Array]:
-    """Angular frequencies in rad/s, amplitudes in rad, phases in rad; (2, components), roll and pitch."""
+    """Return angular frequencies in rad/s, amplitudes in rad, phases in rad: (2, components) for roll and pitch."""
     random = np.random.default_rng([seed, 41])
     shape = (2, COMPONENTS)
     frequencies = [wave.frequency_hz * (1.0 + wave.spread * random.standard_normal(shape)) for wave in waves]
@@ -259,7 +260,7 @@ MOTIONS: Final = ("still", "turn", "sea", "engine")
 
 
 def motions_of(name: str, *, seed: int = 0, turn_deg_s: float = TURN_DEG_S) -> tuple[Motion, ...]:
-    """Return the motions of a name in `MOTIONS`, for a whole day."""
+    """Return the motions with a name in `MOTIONS`, for a whole day."""
     turn = SlowTurn(start_s=0.0, duration_s=DAY_S, rate_deg_s=turn_deg_s)
     engine = Vibration(start_s=0.0, duration_s=DAY_S)
     known: dict[str, tuple[Motion, ...]] = {

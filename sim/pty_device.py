@@ -28,11 +28,11 @@ DATA_BITS = 8
 
 
 class Received(NamedTuple):
-    """One frame as the receiver saw it."""
+    """One frame as the receiver has read it."""
 
     byte: int
     framing_error: bool
-    """The bit in the place of the stop bit was low."""
+    """True: the bit in the place of the stop bit was low."""
     parity_error: bool
 
 
@@ -50,7 +50,7 @@ def parity_bit(byte: int, parity: Parity) -> int:
 
 
 def transmit(data: bytes, setting: Setting, gap_bits: int = 0) -> list[int]:
-    """Return the levels of the line, one a bit, with `gap_bits` of idle line between bytes."""
+    """Return the levels of the line, one per bit, with `gap_bits` of idle line between bytes."""
     levels = [1]
     for byte in data:
         levels += [0, *(byte >> bit & 1 for bit in range(DATA_BITS))]
@@ -61,10 +61,10 @@ def transmit(data: bytes, setting: Setting, gap_bits: int = 0) -> list[int]:
 
 
 def receive(levels: list[int], sent_baud: int, setting: Setting) -> Iterator[Received]:
-    """Yield the frames that a receiver finds.
+    """Yield the frames that a receiver finds in the levels of a line.
 
     A low stop bit counts as the start bit of the next frame, as in the 16550 and its many descendants (NS16550 data
-    sheet, line status register, framing error). Where all bits were low, a break, the receiver waits for an edge.
+    sheet, line status register, framing error). After a break (all bits low), the receiver waits for an edge.
     """
     step = sent_baud / setting.baud  # bits of the line for one of the receiver's
     stop = DATA_BITS + (1 if setting.parity == "none" else 2)
@@ -95,7 +95,7 @@ def receive(levels: list[int], sent_baud: int, setting: Setting) -> Iterator[Rec
 
 
 def heard(data: bytes, sent: Setting, read: Setting, gap_bits: int = 0) -> bytes:
-    """Return what a program on Linux reads: with parity checking on, a byte that fails it or its stop bit is NUL."""
+    """Return what a program on Linux reads: with parity checking, a byte with wrong parity or stop bit becomes NUL."""
     if sent == read:
         return data
     return bytes(
@@ -110,8 +110,8 @@ _SHORTEST_SLEEP_S = 0.001
 class PtyDevice:
     """Serves a device's frames on the event loop, in its clock's time, under a symlink with a stable name.
 
-    Like a UART it waits for nobody: unread bytes are lost, and a slow reader loses bytes in the middle of frames. Only
-    the path is shared with the reader, so it works with any program.
+    Like a UART, the device does not wait for the reader: unread bytes are lost, and a slow reader loses bytes in the
+    middle of frames. Only the path is shared with the reader, so it works with any program.
 
     Use: `async with PtyDevice(HMR3300(aircraft), directory / "compass") as device: ...`
     """
@@ -123,7 +123,7 @@ class PtyDevice:
         None: bytes pass unchanged, whatever the reader's setting.
         """
         self.muted = False
-        """The device is connected and sends nothing."""
+        """True: the device is connected but sends nothing."""
         self._master: int | None = None
         self._poll = select.poll()
         self._banner = b""
@@ -152,14 +152,14 @@ class PtyDevice:
         return self._master is not None and not any(event & select.POLLHUP for _, event in self._poll.poll(0))
 
     def unplug(self) -> None:
-        """Unplug it: the path disappears, and a reader gets a hang-up."""
+        """Unplug the device: the path disappears, and a reader gets a hang-up."""
         if self._master is None:
             return
         self._close()
         self.path.unlink(missing_ok=True)
 
     def replug(self) -> None:
-        """Plug it in: a new pseudo-terminal under the same path; the device starts anew."""
+        """Plug the device in: a new pseudo-terminal under the same path; the device starts again."""
         if self._master is not None:
             return
         if self.path.exists() and not self.path.is_symlink():

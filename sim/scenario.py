@@ -30,7 +30,7 @@ IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
     "xsens": XsensImu,
     "stim300": Stim300,
 }
-"""Constructors from the model whose readings the device sends."""
+"""Constructors of IMUs by protocol name; each gets the model whose readings the device sends."""
 
 COMPASSES: dict[str, Callable[..., SerialDevice]] = {
     "hmr3300": HMR3300,
@@ -39,7 +39,7 @@ COMPASSES: dict[str, Callable[..., SerialDevice]] = {
     "nmea": NmeaCompass,
     "os5000": Os5000,
 }
-"""Constructors from the aircraft and `seed`; upright, with noise and lag only."""
+"""Constructors of compasses by protocol name, from the aircraft and `seed`; upright, with noise and lag only."""
 
 GRADIENTERS: dict[str, Callable[..., SerialDevice]] = {
     "inclinometer_xy": Gradienter,
@@ -49,24 +49,24 @@ GRADIENTERS: dict[str, Callable[..., SerialDevice]] = {
     "stim300": lambda aircraft, seed: Stim300(ImuModel(aircraft, "adis16470", seed=seed), seed=seed),
     "jewell": Jewell,
 }
-"""Constructors from the aircraft and `seed`; every compass but RION's also serves as a gradienter."""
+"""Constructors of gradienters, from the aircraft and `seed`; every compass but RION's also serves as a gradienter."""
 
 
 class Fit(NamedTuple):
     """Configuration that a device of one of the tables needs in one of its roles."""
 
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Roll, pitch, yaw of the device's axes on the aircraft."""
+    """Mounting of the device on the aircraft: roll, pitch and yaw of its axes."""
     law: Law | None = None
-    """Law of a gradienter; None: the protocol's own, or roll and pitch."""
+    """Law of a gradienter; None: the protocol's own law, or roll and pitch."""
     sigma_deg: float | None = None
-    """None: the companion's default is right."""
+    """Sigma to configure; None: the companion's default is right."""
     model_mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Mounting of the model of an IMU that sends its model's readings unchanged; an IMU that turns them needs none."""
 
 
 Z_UP = (180.0, 0.0, 0.0)
-"""Flat on the aircraft: X forward, Y left, Z up."""
+"""Mounting of a device that is flat on the aircraft: X forward, Y left, Z up."""
 
 FITS: dict[tuple[str, str], Fit] = {
     ("imu", "xsens"): Fit(mounting_deg=Z_UP),
@@ -76,7 +76,7 @@ FITS: dict[tuple[str, str], Fit] = {
     ("compass", "hmr3300"): Fit(sigma_deg=1.0),
     ("imu", "witmotion"): Fit(mounting_deg=Z_UP, model_mounting_deg=Z_UP),
 }
-"""Key: role ("imu", "gradienter", "compass") and protocol name; a device not listed needs nothing."""
+"""Fit of each device by role ("imu", "gradienter", "compass") and protocol name; a device not listed needs none."""
 
 
 def fit(role: str, name: str) -> Fit:
@@ -97,7 +97,7 @@ class Devices(NamedTuple):
 
 
 def make(model: ImuModel, imu: str, gradienter: str, compass: str, seed: int) -> Devices:
-    """Make the devices of an aircraft, by their protocols; two roles of one name are one device.
+    """Make the devices of an aircraft by their protocols; two roles with one protocol name share one device.
 
     Args:
         model: model of the IMU, mounted as `Fit.model_mounting_deg` says.
@@ -118,13 +118,13 @@ FIRST_GYRO_DEG_H = (162.234, 169.563, 98.289)
 FIRST_ACCEL_MG = (2.4125, 2.1596, 0.89809)
 GRADIENTER_OFFSET_DEG = (0.003, -0.002)
 DEMO_DEVICES = ("vectornav", "inclinometer_xy", "hmr3300")
-"""IMU, gradienter, compass."""
+"""Protocols of IMU, gradienter and compass in the demonstration."""
 DEMO_UNIX_S = 1_795_219_200.0
-"""21 November 2026, 00:00 UTC."""
+"""Date of the demonstration: 21 November 2026, 00:00 UTC."""
 
 
 def site_at(latitude_deg: float, longitude_deg: float, height_m: float, unix_s: float = DEMO_UNIX_S) -> Site:
-    """A site with the magnetic field of the World Magnetic Model at that date."""
+    """Return a site with the magnetic field of the World Magnetic Model at that date."""
     date = datetime.fromtimestamp(unix_s, UTC)
     year = date.year + (date.timetuple().tm_yday - 1) / 365.25
     model = GeoMag(coefficients_file="wmm/WMM_2025.COF")
@@ -134,7 +134,7 @@ def site_at(latitude_deg: float, longitude_deg: float, height_m: float, unix_s: 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """An aircraft, its devices and its autopilot, with one truth."""
+    """An aircraft, its devices and its autopilot, which share one truth."""
 
     aircraft: VirtualAircraft
     flight_controller_imus: tuple[ImuModel, ...]
@@ -147,7 +147,7 @@ class Scenario:
 
     @property
     def ports(self) -> dict[str, SerialDevice]:
-        """Devices by the names of their ports; one with two roles has one port."""
+        """Return the devices by the names of their ports; a device with two roles has one port."""
         found: dict[str, SerialDevice] = {}
         for name, device in (("imu", self.imu), ("gradienter", self.gradienter), ("compass", self.compass)):
             if not any(device is other for other in found.values()):
@@ -176,9 +176,9 @@ def demo(
 ) -> Scenario:
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
-    The flight controller's first IMU has biases of the size of the paper's tables (162, 170, 98 deg/h; 2.4, 2.2,
-    0.9 mg: its fourth row), its second and the serial IMU others. The compass is 0.8 degrees off; the gradienter shows
-    3 and -2 millidegrees too much.
+    The flight controller's first IMU has biases of the size of the paper's tables (162, 170, 98 deg/h; 2.4, 2.2, 0.9
+    mg: its fourth row), its second IMU and the serial IMU have other biases. The compass is 0.8 degrees off; the
+    gradienter shows 3 and -2 millidegrees too much.
 
     Args:
         pose: pose of the aircraft.
@@ -186,20 +186,20 @@ def demo(
         unix_s: date at the beginning.
         motions: motions of the aircraft.
         gyr_cal_at_boot: the autopilot's default INS_GYR_CAL = 1, which has already removed most of the gyro bias (and
-            includes the Earth's rotation). The demonstration starts without, to have something to show.
+            includes the Earth's rotation). The demonstration starts without it, to have a bias to show.
         firmware: firmware of the autopilot.
         part: part of the flight controller's IMUs.
-        gyro_deg_h: gyro biases of its first IMU.
-        accel_mg: accelerometer biases of its first IMU.
-        accel_scale: relative scale errors of the accelerometers of its first two IMUs.
+        gyro_deg_h: gyro biases of the flight controller's first IMU.
+        accel_mg: accelerometer biases of the flight controller's first IMU.
+        accel_scale: relative scale errors of the accelerometers of the flight controller's first two IMUs.
         board_deg: roll and pitch of the flight controller in the aircraft.
         gradienter_offset_deg: offset of the gradienter, x and y.
-        devices: families of IMU, gradienter and compass, by their names in `sim.scenario`; errors are those of the
-            usual ones, any other has none.
+        devices: families of IMU, gradienter and compass, by their names in `sim.scenario`; only the default
+            families have the errors above.
         warms: the air's temperature in degC, the self-heating in K, and its time constant in s; then each IMU has
             a curve of its own over temperature, by the seed.
         power_up: the same aircraft on another day: each power-up has other biases, about the usual ones.
-        aircraft: another aircraft for the sensors; `pose`, `motions` and `warms` are then its own.
+        aircraft: another aircraft for the sensors; pose, motions and temperature are then those of that aircraft.
     """
     air_degc, rise_k, time_constant_s = warms or (25.0, 0.0, 1.0)
     temperature_degc = ThermalBoard(rise_k, time_constant_s).switched_on(air_degc)

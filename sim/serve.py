@@ -37,13 +37,13 @@ from sim.station import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
 _PROFILES = {"white_only": "icm42688p", "perfect": "icm42688p"}
-"""Profile that the companion is told for parts that only simulators have."""
+"""Noise profiles to tell the companion for sensor types that only the simulator has."""
 FIRMWARE_COMMANDS = {
     "ardupilot": "a real ArduPilot SITL binary on this aircraft, and the devices",
     "px4": "a real PX4 SITL binary on this aircraft, and the devices",
     "residuals": "what each calibration leaves in a real autopilot, as a table",
 }
-"""Commands of `sim.sitl.cli`."""
+"""Commands that `sim.sitl.cli` handles."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -152,7 +152,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str, int] | None) -> str:
-    """A configuration of the companion that fits what is served; comments say what is missing."""
+    """Return a companion configuration for the devices and autopilot that are served; comments say what is missing."""
     lines = ["[mavlink]"]
     if udp is None:
         lines.append("# no autopilot is simulated here; `python -m sim autopilot` is one")

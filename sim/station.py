@@ -13,11 +13,11 @@ from typing import Protocol, TypeVar, cast
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MAX_QUEUED_BYTES = 65536
-"""With more bytes than this in the send buffer, new packets are dropped."""
+"""Maximum number of bytes in the send buffer; further packets are dropped."""
 
 
 class End(Protocol):
-    """One end of a UDP link: the double, its `ground`."""
+    """One end of a UDP link, such as a double or its port `ground`."""
 
     def attach(self, transmit: Callable[[bytes], None] | None) -> None:
         """Set the function that sends."""
@@ -49,7 +49,7 @@ class UdpEnd(asyncio.DatagramProtocol):
         self._end.receive(data, asyncio.get_running_loop().time())
 
     def error_received(self, exc: Exception) -> None:
-        """Go on sending: nobody listens yet."""
+        """Ignore the error and go on sending: nobody listens yet."""
 
     def close(self) -> None:
         if self._transport is not None:
@@ -100,7 +100,7 @@ class Station:
             self._transmit(data)
 
     def timed(self, kind: type[M], *, since_s: float = 0.0) -> list[tuple[float, M]]:
-        """Messages of a kind with their times, oldest first."""
+        """Return the messages of a kind with their times, oldest first."""
         first = bisect_left(self.heard, since_s, key=lambda entry: entry[0])
         return [(t_s, message) for t_s, message in self.heard[first:] if isinstance(message, kind)]
 
@@ -108,7 +108,7 @@ class Station:
         return [message for _, message in self.timed(kind, since_s=since_s)]
 
     def texts(self) -> list[str]:
-        """STATUSTEXT, chunk by chunk."""
+        """Return the received STATUSTEXT, chunk by chunk."""
         return [message.text for message in self.all(mavlink.MAVLink_statustext_message)]
 
     def heartbeat(self, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> None:
@@ -118,7 +118,7 @@ class Station:
         )
 
     async def command(self, number: int, *params: float, target: tuple[int, int] = (1, 1), wait_s: float = 2.0) -> int:
-        """Send COMMAND_LONG and return the first result; -1 when none comes in time."""
+        """Send COMMAND_LONG and return the first result; -1: no result came in time."""
         loop = asyncio.get_running_loop()
         begun = len(self.heard)
         seven = [*params, *[0.0] * (7 - len(params))]

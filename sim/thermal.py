@@ -1,4 +1,4 @@
-"""Self-heating of a board, and a bias that follows its temperature: for the aircraft, and for studies of days.
+"""Self-heating of a board, and a bias that follows the board's temperature: for aircraft, and for studies of days.
 
 A piece of a part keeps its curve and its usual bias all its life; every power-up adds an offset of its own. The die is
 as warm as its thermometer was a moment before, so that heating and cooling differ.
@@ -16,20 +16,20 @@ import numpy as np
 from sim.earth import Array
 
 _BEND_K: Final = 40.0
-"""Kelvin from the reference at which a curve's square, and its cube, are as large as its line: one sigma."""
+"""Kelvin from the reference at which linear, square and cubic terms of a drawn curve have equal sigmas."""
 LAG_S: Final = (5.0, 30.0)
 RISE_K: Final = (10.0, 25.0)
 TIME_CONSTANT_S: Final = (100.0, 600.0)
 
 
 def warming(start_degc: float, end_degc: float, time_constant_s: float) -> Callable[[float], float]:
-    """Temperature that approaches `end_degc` exponentially, as in a box that was just switched on."""
+    """Return a temperature that approaches `end_degc` exponentially, as in a box that was just switched on."""
     return lambda t_s: end_degc + (start_degc - end_degc) * math.exp(-max(t_s, 0.0) / time_constant_s)
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalBoard:
-    """Self-heating over the air's temperature, and its time constant."""
+    """Self-heating of a board above the air's temperature, and its time constant."""
 
     rise_k: float
     time_constant_s: float
@@ -41,13 +41,13 @@ class ThermalBoard:
         return cls(random.uniform(*RISE_K), time_constant_s)
 
     def switched_on(self, air_degc: float, cold: float = 1.0) -> Callable[[float], float]:
-        """Temperature in degC by seconds since power-on; `cold` is 0 for a board that is already warm."""
+        """Return temperature in degC as a function of seconds since power-on; `cold` is 0 for a board already warm."""
         return warming(air_degc + (1.0 - cold) * self.rise_k, air_degc + self.rise_k, self.time_constant_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """Bias over the kelvin from the part's reference temperature.
+    """Bias as a function of temperature, in kelvin from the part's reference temperature.
 
     Attributes:
         powers: coefficients (n,) of n axes: of the kelvin, their square, their cube.
@@ -58,7 +58,7 @@ class Curve:
     lag_s: float = 0.0
 
     def at(self, kelvin: float | Array) -> Array:
-        """Bias (n,) at one temperature, or (m, n) at m of them, (m, 1)."""
+        """Return the bias (n,) at one temperature, or (m, n) at m temperatures (m, 1)."""
         found: Array = self.powers[-1] * kelvin
         for each in self.powers[-2::-1]:
             found = (found + each) * kelvin
@@ -87,5 +87,5 @@ class Piece:
         return cls(curve, usual, scatter)
 
     def turned_on(self, random: np.random.Generator) -> Array:
-        """Draw the biases (n,) at the reference temperature of one more power-up."""
+        """Draw the biases (n,) at the reference temperature for one more power-up."""
         return np.asarray(random.normal(self.usual, self.scatter))

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 MAV_RESULT_CANCELLED = 6
 """Result code for a cancelled command, from MAVLink's common messages; pymavlink's ArduPilot dialect lacks its name."""
 ACK_PERIOD_S = 0.4
-"""Interval between IN_PROGRESS ACKs. QGroundControl gives up after 1.2 s without one: two in a row may get lost."""
+"""Interval between IN_PROGRESS ACKs. QGroundControl gives up after 1.2 s without an ACK: two in a row can get lost."""
 NOTHING_RAN: Final = 1  # `result_param2` of a cancel's ACK when there was nothing to cancel
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
@@ -76,7 +76,7 @@ Request = Calibrate | Undo | Cancel | Literal["version"]  # A checked request; "
 
 
 class Permission:
-    """Checks senders against the setting `mavlink.allow`; counts refusals, and logs the first one of each sender."""
+    """Checks senders against the setting `mavlink.allow`; counts refusals, and logs each sender's first refusal."""
 
     def __init__(self, senders: Senders) -> None:
         self.senders = senders
@@ -108,9 +108,9 @@ class _Final(NamedTuple):
 
 
 class CommandServer:
-    """Handles commands addressed to this component; the caller must call `step` at each time that `step` returns.
+    """Handles commands addressed to this component. `step` returns the time at which it must be called again.
 
-    Commands to other components and to component 0 (everyone) are ignored: our ACK would pass for the autopilot's.
+    Commands to other components and to component 0 (everyone) are ignored: our ACK would look like the autopilot's.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class CommandServer:
         )
 
     def step(self, now_s: float) -> float:
-        """Acknowledge the running job; return the time of the next call, or infinity if nothing is left to send."""
+        """Send the ACKs that are due; return the time of the next call, or infinity if there is nothing to send."""
         retry_s = self._send_unsent(now_s)
         running = self._running
         if running is None:
@@ -266,7 +266,7 @@ class CommandServer:
             self._woken.set()
 
     def _send_unsent(self, now_s: float) -> float:
-        """Resend final ACKs that the transport did not accept, while their requesters may still wait."""
+        """Resend final ACKs that the transport did not accept, for the 3 s in which a requester waits for them."""
         retry_s = math.inf
         for key, final in self._finals.items():
             if not final.sent and now_s - final.at_s <= REMEMBER_FINAL_S:

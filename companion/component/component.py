@@ -18,14 +18,14 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.lua import to_script
 
 VALID_S: Final = 10
-"""Time in seconds for which PX4 may arm after our answer ACCEPTED; 0 would expire at once."""
+"""Time in seconds for which our answer ACCEPTED allows PX4 to arm; an answer with 0 would expire at once."""
 TOLD_BY_US: Final = 1
-"""Value of MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot shows no reason of its own; our STATUSTEXT shows it."""
+"""Value of MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot shows no reason, because our STATUSTEXT does."""
 REPEAT_S: Final = 0.05
 """Delay before an answer to an arming request is sent a second time. Links lose packets, and PX4 drops an answer with
-the same timestamp as its request, as happens in SITL's lockstep."""
+the same timestamp as the request. In SITL's lockstep the timestamps can be equal."""
 ATTEMPT_S: Final = 1.5
-"""Time after the start of an arming attempt in which new requests still belong to it; retransmissions: 4.5 s."""
+"""Time for which new arming requests count as one attempt to arm; for retransmitted requests it is 4.5 s."""
 _RESULTS: Final = {
     "accept": mavlink.MAV_RESULT_ACCEPTED,
     "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
@@ -37,7 +37,7 @@ class ArmAuthoriser:
     """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST from our autopilot (PX4) at once; ignores other senders.
 
     PX4 differs from MAVLink's definitions (docs/reference/autopilots.md section 9.2). It expects the validity in
-    result_param2 and the reason in progress, and ignores an answer not addressed to its own system id. One attempt to
+    `result_param2` and the reason in `progress`, and ignores answers that do not name its system id. One attempt to
     arm sends two requests and retransmissions of both. Each gets an answer, but the pilot gets only one text.
     """
 
@@ -81,7 +81,7 @@ class ArmAuthoriser:
 SCRIPT_PERIOD_S: Final = 0.5
 MARK: Final = b"CMPA\x01"
 REASON_BYTES: Final = 41 - len("Companion: ")
-"""Maximum length of the reason that ArduPilot shows after this prefix (docs/reference/autopilots.md section 5.3)."""
+"""Maximum length of a reason that ArduPilot shows after "Companion: " (docs/reference/autopilots.md section 5.3)."""
 VERDICTS: Final = {"wait": 0, "accept": 1, "refuse": 2}
 NOT_GATING: Final = 3
 
@@ -99,7 +99,7 @@ class ArmingScript:
         self._next_s = -math.inf
 
     def step(self, now_s: float) -> float:
-        """Send the verdict if due; return the time of the next one, or infinity if no script can receive it now."""
+        """Send the verdict if due; return the time of the next verdict, or infinity if no script can receive one."""
         autopilot = self._link.autopilot
         if autopilot is None or not self._link.connected or not self._gate.asks_script:
             return math.inf

@@ -1,7 +1,7 @@
 """Parameters of component 191: a small server of the MAVLink parameter protocol.
 
-All parameters have the type REAL32, which both encodings (C cast, bytewise) send alike. All names begin with CMP_, as
-no autopilot's parameter does: ArduPilot executes a PARAM_SET for component 191 itself if it cannot forward it.
+All parameters have the type REAL32, which both encodings (C cast, bytewise) send alike. All names begin with
+CMP_, unlike any autopilot's: ArduPilot obeys a PARAM_SET for component 191 itself if it cannot forward the message.
 
 A PARAM_SET is answered at once, with the old value if the new one is not allowed. Reads wait in a set of names and are
 answered at a pace that a slow telemetry link can carry, so a flood of requests costs neither memory nor bandwidth.
@@ -68,7 +68,7 @@ class OwnParameters:
         return self._values[name]
 
     def set(self, name: str, value: float) -> None:
-        """Set a parameter from inside the daemon, and broadcast a change; raise ValueError beyond its limits."""
+        """Set a parameter for the daemon, and broadcast a changed value; raise ValueError for a value beyond limits."""
         parameter = self._by_name[name]
         value = float32(value)
         if not parameter.allows(value):

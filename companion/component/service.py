@@ -56,7 +56,7 @@ class CalibrationService(Protocol):
 
     @property
     def progress_percent(self) -> int:
-        """Progress of the running calibration or undo in percent; 100: no job runs."""
+        """Progress of the running calibration or undo in percent; 100 also if no job runs."""
 
     @property
     def mav_state(self) -> int:
@@ -66,17 +66,17 @@ class CalibrationService(Protocol):
 class ArmAnswer(msgspec.Struct, frozen=True):
     """Answer to the question whether the aircraft may arm now.
 
-    "accept": the aircraft may arm. "wait": it may arm soon, perhaps only after it was held still. "refuse": somebody
-    has to act first. `words`: reason and remedy, if possible within the 41 characters that ArduPilot shows.
+    "accept": the aircraft may arm. "wait": it may arm soon, perhaps after it was held motionless. "refuse":
+    somebody has to act first. `words`: reason and remedy, if possible within the 41 characters that ArduPilot shows.
     """
 
     verdict: Literal["accept", "wait", "refuse"]
     words: str
     hold_still_s: int | None = None
-    """Seconds for which the aircraft must still be held still; None: holding still is not enough."""
-    meanwhile: str = ""  # Activity of the companion while the aircraft is held still
+    """Remaining seconds for which the aircraft must be held motionless; None: something else is needed."""
+    meanwhile: str = ""  # Activity of the companion while the aircraft is held motionless
     against: str = ""
-    """Reason why the aircraft counts as uncalibrated; empty: something else prevents arming, or nothing does."""
+    """Reason why the aircraft counts as uncalibrated; empty if another reason, or none, prevents arming."""
 
     @classmethod
     def hold_still(cls, seconds: float, meanwhile: str = "", against: str = "") -> ArmAnswer:

@@ -8,7 +8,7 @@ Texts must not begin with "[cal]": QGroundControl reads such lines as the progre
 
 Tunes are for an operator without a screen in view. Both ArduPilot (`AP_Notify/ToneAlarm.cpp` and `MMLPlayer.cpp`) and
 PX4 (`mavlink_receiver.cpp` and `lib/tunes`) accept PLAY_TUNE (258) in QBasic's notation. Neither acknowledges a tune.
-Both would play it in flight too, so none is sent then. PX4 garbles a tune that arrives before the last one has ended.
+Both would play a tune in flight too, so we send none in flight. PX4 garbles a tune that arrives during another tune.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def to_ascii(text: str) -> str:
 
 
 def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
-    """Split a text into lines of one STATUSTEXT each; only the first line has a severity that is spoken.
+    """Split a text into lines of one STATUSTEXT each; lines after the first are INFO, which is not spoken.
 
     A line ends at the last punctuation that fits, otherwise between two words. The first line of a NOTICE ends before
     the first figure, to keep figures unspoken. MAVLink's `chunk_seq` cuts words, and some receivers speak every chunk.
@@ -134,13 +134,13 @@ class StatusText:
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
         self.spoken: deque[dict[str, object]] = deque(maxlen=SPOKEN)
-        """The latest texts that ground stations speak, for the web page; oldest first, numbered from 1 since start."""
+        """The latest texts that ground stations speak, for the web page: oldest first, numbered from 1 at start."""
         self._numbers = itertools.count(1)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
-        """Queue a text; return False if an equal one was queued within 3 s, or if the queue is full.
+        """Queue a text; return False if an equal one was queued within 3 s, or if more important texts fill the queue.
 
-        The result of a job is always queued. After a result, earlier texts may be repeated for the next job.
+        The result of a job is always queued. After a result, texts from before it can be queued again at once.
         """
         text = to_ascii(text)
         now_s = asyncio.get_running_loop().time()
@@ -193,7 +193,7 @@ TUNE_STALE_S: Final = 3.0  # Age at which a tune that could not be sent is dropp
 
 
 class Tune(enum.Enum):
-    """Tunes, each with its notes for PLAY_TUNE: at most 29 characters, which its first field holds.
+    """Tunes, each with its notes for the first field of PLAY_TUNE, which holds 29 characters.
 
     HOLD_STILL: a long note. NEXT (this pose is done): rising notes. WRONG (not the requested pose): alternating notes.
     """
@@ -206,7 +206,7 @@ class Tune(enum.Enum):
 
 
 class Tunes:
-    """Plays tunes on a disarmed autopilot's buzzer if `wanted` allows; `play` sets `woken`, to have `step` called."""
+    """Plays tunes on the buzzer of a disarmed autopilot, if `wanted` returns True. `step` sends the latest tune."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, wanted: Callable[[], bool], woken: asyncio.Event) -> None:
         self._link, self._vehicle, self._wanted, self._woken = link, vehicle, wanted, woken

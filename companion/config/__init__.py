@@ -29,10 +29,10 @@ CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
 _Kind = typing.TypeVar("_Kind", bound=msgspec.Struct)
 
 Saved = Callable[[Path, str], NoiseProfile | str]
-"""Function that loads a saved noise profile by storage directory and name. It may return the name itself instead.
+"""Function that loads a saved noise profile by storage directory and name, or returns just the name.
 
 Raises:
-    ConfigError, StorageError: there is no such profile, or it cannot be read; callers put "found" before the text.
+    ConfigError, StorageError: there is no such profile, or it cannot be read; callers show the text after "found".
 """
 
 
@@ -53,7 +53,7 @@ def load(path: Path, saved: Saved = _none) -> Config:
 
 
 def read(path: Path, missing: str) -> str:
-    """Read the text of a configuration file; raise ConfigError, with the remedy `missing` if there is no file."""
+    """Read the text of a file; raise ConfigError if it cannot be read. `missing`: remedy if there is no such file."""
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES + 1).decode()

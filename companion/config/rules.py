@@ -118,7 +118,7 @@ def _port(port: str, here: str) -> Iterator[str]:
 
 
 def _ports_differ(config: Config) -> Iterator[str]:
-    """Check that one device uses each port; sections of the same device must agree on protocol, baud and parity."""
+    """Check that no two devices share a port; sections of one device must agree on protocol, baud and parity."""
     used: dict[str, list[tuple[str, Imu | Gradienter | Compass]]] = {}
     for here, device in _serial_devices(config):
         for before, other in (sharing := used.setdefault(device.port or "", [])):
@@ -167,7 +167,7 @@ _BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<por
 def bind_problem(bind: str, name: str) -> str | None:
     """Return the reason why a web page cannot be bound to an address, or None if it can.
 
-    Host names are refused: the address behind a name may change with the network, and with it who can reach the page.
+    Host names are refused: on another network, a name can mean an address that other people can reach.
     """
     match = _BIND.fullmatch(bind)
     host = (match["six"] or match["host"]) if match else ""

@@ -51,7 +51,7 @@ ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "sti
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
 """Names of the built-in noise profiles of IMUs; `companion profile --save` estimates and saves further ones."""
 UNKNOWN: Final[Profile] = "unknown"
-"""Noise profile for an IMU of unknown type, with the figures of the worst common types."""
+"""Noise profile for an IMU of unknown type: as noisy as the worst of the common types."""
 GradienterProtocol = Literal[
     "inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000", "rion", "pni", "witmotion", "stim300"
 ]
@@ -87,14 +87,14 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class VehicleSection(Section, frozen=True):
-    """Section [vehicle]: place and system id, instead of those from the autopilot; and the platform it is parked on."""
+    """Section [vehicle]: platform under the parked vehicle; place and system id that replace the autopilot's values."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
     height_m: Height | None = None
     system_id: Annotated[int, Meta(ge=1, le=255)] | None = None
     platform: Platform = "ground"
-    """Platform: "ground" is fixed to the Earth; "deck" may turn and sway (a boat, a car with its engine running)."""
+    """Platform: "ground" is fixed to the Earth; "deck" can turn and sway (a boat, a car with its engine running)."""
 
 
 class Mavlink(Section, frozen=True):
@@ -136,7 +136,7 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     accel: AllanModel
     origin: str = ""  # Description of the recordings from which a saved profile was estimated
     warm_up: tuple[float, float] | None = None
-    """Two sigma of the bias change from cold to warm: gyro in rad/s, accelerometer in m/s^2; None: unknown."""
+    """Bias change from cold to warm, as a 2-sigma limit: gyro in rad/s, accelerometer in m/s^2; None: unknown."""
 
     def of(self, triad: Triad) -> AllanModel:
         return self.gyro if triad == "gyro" else self.accel
@@ -189,7 +189,7 @@ class Compass(Section, frozen=True):
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
     heading: Literal["device", "field"] = "device"
-    """Source of the heading. "device": the compass itself. "field": its field vector, levelled by the gradienter."""
+    """Source of the heading. "device": the compass itself. "field": its field vector and the gradienter's tilt."""
     counts_per_gauss: PositiveFloat | None = None
     """Scale of a compass that reports the magnetic field in counts; None: the field strength is not checked."""
 
@@ -201,13 +201,13 @@ class Calibration(Section, frozen=True):
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
     max_age_min: PositiveFloat = 30.0
-    """Time after its last confirmation at which a calibration is out of date (docs/reference/method.md section 3.2)."""
+    """Time from a calibration's last confirmation until it is out of date (docs/reference/method.md section 3.2)."""
     max_temperature_change_degc: PositiveFloat = 3.0
-    """Temperature change since confirmation that makes a calibration out of date, if no temperature curve is known."""
+    """Temperature change after which a confirmed calibration is out of date, if no temperature curve is known."""
     prior: bool = True
     """True: check a new calibration against earlier ones, and combine it with them (docs/calibration.md)."""
     any_bias: bool = False
-    """True: accept a bias larger than any sensor has, and measured gravity that contradicts the tilt."""
+    """True: accept an implausibly large bias, and measured gravity that contradicts the tilt."""
 
 
 class Push(Section, frozen=True):
@@ -248,7 +248,7 @@ class Mqtt(Section, frozen=True):
 
 
 class Fleet(Section, frozen=True):
-    """Section [fleet]: reports for the collector of a fleet, sent over MQTT; without the section none are made."""
+    """Section [fleet]: reports to the collector of a fleet over MQTT. Without this section, no reports are sent."""
 
     name: NonEmpty | None = None  # Name of the aircraft
     location: Location = "off"  # Precision of the location in the reports
@@ -274,7 +274,7 @@ class Control(Section, frozen=True):
 class Storage(Section, frozen=True):
     directory: NonEmpty | None = None
     recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
-    """Size of the ring of recordings, whose oldest part is overwritten; 0: none; None: small, if mcap is installed."""
+    """Disk space for recordings; new data overwrite the oldest. 0: no recordings. None: 64, if mcap is installed."""
 
     @property
     def path(self) -> Path:

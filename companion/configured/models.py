@@ -41,7 +41,7 @@ from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltS
 from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
-"""Message rate requested for each autopilot IMU unless a serial line limits it; the autopilot's filters pass 20 Hz."""
+"""Message rate to request for each autopilot IMU if no serial line limits it. The autopilot's filters pass 20 Hz."""
 LEAST_IMU_RATE_HZ: Final = 10.0
 LINE_SHARE: Final = 0.5
 BITS_PER_BYTE: Final = 10.0  # Bits on the wire for one byte (8N1): a start bit, eight bits of data, a stop bit
@@ -51,9 +51,9 @@ VISION_BYTES: Final = 129.0  # Length of VISION_POSITION_ESTIMATE: 117 + 12 byte
 SCALED_BYTES: Final = 36.0  # Length of SCALED_IMU2 and SCALED_IMU3: 24 + 12 bytes
 
 TILT_SIGMA_DEG: Final = 0.05
-"""Default sigma of a gradienter's tilt, from its cell and mounting; protocols of worse devices set their own."""
+"""Default sigma of a gradienter's tilt, due to sensor and mounting; protocols of worse devices set a larger sigma."""
 TILT_BY_THE_WAY_SIGMA_DEG: Final = 0.65
-"""Default sigma of the tilt reported by a compass or an IMU; the value is that of the HMR3300 compass."""
+"""Default sigma of a tilt that a compass or an IMU reports; taken from the HMR3300 compass."""
 HEADING_SIGMA_DEG: Final = 3.0
 """Default sigma of a compass heading, caused by the aircraft's own iron and currents."""
 
@@ -73,9 +73,9 @@ def baud_of(url: str) -> int | None:
 
 
 def imu_rate_hz(config: Config) -> float:
-    """Return the message rate for each autopilot IMU. All IMUs use half of a serial line (57600 baud, one IMU: 38 Hz).
+    """Return the message rate for each autopilot IMU, for example 38 Hz for one IMU on a serial line with 57600 baud.
 
-    An autopilot whose serial line is full drops messages and answers late.
+    All IMUs share half of the line, with at least 10 Hz: on a full line, an autopilot drops messages and answers late.
     """
     baud = baud_of(config.mavlink.url)
     instances = [imu.instance or 1 for imu in config.imu if imu.source == "autopilot"]
@@ -86,7 +86,7 @@ def imu_rate_hz(config: Config) -> float:
 
 
 def attitude_rate_hz(config: Config) -> float:
-    """Return the rate of attitude messages to the autopilot: at most half of a serial line (57600 baud: 22 Hz)."""
+    """Return the rate of attitude messages to the autopilot. At 57600 baud it is at most 22 Hz (half of the line)."""
     wanted, baud = config.push.attitude_rate_hz, baud_of(config.mavlink.url)
     return wanted if baud is None else min(wanted, LINE_SHARE * baud / BITS_PER_BYTE / VISION_BYTES)
 
@@ -188,13 +188,13 @@ def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
 
 
 def place_doubt(config: Config, vehicle: Vehicle) -> str | None:
-    """Return the reason why the autopilot's position is in doubt, unless the configuration has place and height."""
+    """Return a doubt about the autopilot's position; None: no doubt, or the configuration has both place and height."""
     place = config.vehicle
     return None if place.latitude_deg is not None and place.height_m is not None else vehicle.place.doubt
 
 
 def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> GradienterModel | None:
-    """Return the configured model of the gradienter, with the zero and the sigma that an alignment has measured."""
+    """Return the configured gradienter model, corrected by the zero offset and sigma that an alignment has measured."""
     if model is None or used is None:
         return model
     x_deg, y_deg = model.offset_deg
@@ -218,7 +218,7 @@ class Role:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SerialDevice:
-    """One device on a serial port. Baud rate and parity are the configured ones, otherwise those of the factory."""
+    """One device on a serial port. Baud rate and parity: as configured, otherwise the factory settings."""
 
     port: str
     info: ProtocolInfo
@@ -237,7 +237,7 @@ class SerialDevice:
 
     @property
     def name(self) -> str:
-        """Name of the device: that of its first role. Recordings store the device's bytes under this name."""
+        """Name of the device, equal to the name of its first role. Recordings store its bytes under this name."""
         return self.roles[0].name
 
     @property
@@ -283,7 +283,7 @@ def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Samp
 
 
 def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
-    """Pass a sample to the collector; return the tilt, or the heading if the collector uses it, otherwise None."""
+    """Pass a sample to the collector; return a tilt sample, or a heading that the collector uses, otherwise None."""
     match part:
         case ImuSample():
             into.add_imu(role.name, part)
@@ -300,7 +300,7 @@ def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | Co
 def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
     """Predict the sigma in deg/h of a gyro bias averaged over the longest window, for each built-in noise profile.
 
-    The figure contains noise and the drift in the next 180 s, but not warm-up and coarse telemetry.
+    The sigma covers noise and the drift in the 180 s after the window, but not warm-up or the rounding of telemetry.
     """
     mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
     known = {name: one.gyro for name, one in PROFILES.items() if one.is_named}
@@ -308,7 +308,7 @@ def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
 
 
 class Profiles:
-    """Noise profile of each IMU: the configured one, otherwise that of the sensor that the autopilot reports."""
+    """Noise profiles of the IMUs: each as configured, otherwise by the type of sensor that the autopilot reports."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -316,7 +316,7 @@ class Profiles:
         self._parts: dict[str, Profile | None] = {}
 
     def found(self, name: str, part: Profile | None) -> bool:
-        """Store the type of sensor that the autopilot reports for an IMU; return whether its noise profile changes."""
+        """Store the type of sensor that the autopilot reports for an IMU; return True if its noise profile changes."""
         before = self.of(name)
         self._parts[name] = part
         return self.of(name) != before

@@ -50,7 +50,7 @@ class Text(NamedTuple):
 
 
 class AutopilotSeen(NamedTuple):
-    """Firmware and armed state of an autopilot, from its last heartbeat."""
+    """Firmware and armed state of an autopilot, from its last heartbeat; after 3 s the armed state is unknown."""
 
     system_id: int
     firmware: str | None
@@ -86,7 +86,7 @@ class GroundListener:
         return AutopilotSeen(system_id, beat.firmware, armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
-        """Return whether the companion was busy in its last heartbeat; None: no heartbeat came after `since_s`."""
+        """Return True if the companion's last heartbeat reports a job; None: no heartbeat came after `since_s`."""
         beat = self.heartbeats.get(Address(system_id, self.component_id))
         if beat is None or beat.at_s <= since_s:
             return None
@@ -146,7 +146,7 @@ def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
 
 
 def nobody_heard(heard: GroundListener, url: str, system_id: int | None, within_s: float) -> str:
-    """Describe in one line that no companion was found, which senders were received instead, and the remedy."""
+    """Return one line that no companion was found, with the senders that were received, and the remedy."""
     others, component = heard.summary(), heard.component_id
     if not others:
         return (

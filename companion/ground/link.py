@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[Signing]:
-    """Connect MAVSDK to a url through a link that signs and verifies; `own`: system and component id of this end."""
+    """Connect MAVSDK to a url through a link that signs and verifies; `own`: our own system and component id."""
     await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
     loop, parser = asyncio.get_running_loop(), mavlink.MAVLink(None)
     parser.robust_parsing = True
@@ -190,7 +190,7 @@ class _Log:
 
 @asynccontextmanager
 async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -> AsyncIterator[GroundLink]:
-    """Open a telemetry link as a ground station. `heard` receives all messages, with a key only those signed with it.
+    """Open a telemetry link as a ground station. `heard` receives all messages, or only messages signed with `key`.
 
     Raises:
         ConfigError: MAVSDK is not installed, or the url is invalid.
@@ -220,11 +220,11 @@ async def open_link(url: str, heard: GroundListener, key: bytes | None = None) -
 
 
 ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
-"""Timeouts in seconds of the attempts to get a first answer: 0.3 s for the companion, the rest for the radio. At the
-last attempt, the companion must still remember its answer to the first: otherwise a second calibration could start."""
+"""Timeouts in seconds of the attempts to send a request: 0.3 s for the companion, the rest for the radio. The last
+attempt must come while the companion remembers its answer to the first: later it would start a second calibration."""
 REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
-"""Seconds without an answer after which a running request is repeated; two IN_PROGRESS ACKs in a row may be lost
-before. The last repeat must arrive while the companion still remembers its final answer (3 s)."""
+"""Seconds without an answer after which a running request is repeated. The first value allows two lost IN_PROGRESS
+ACKs. The last repeat must arrive while the companion remembers its final answer (3 s)."""
 assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
 ENDED_AFTER_S: Final = 5.0  # time without answers, but with idle heartbeats: the final answer counts as lost
 LOST_AFTER_S: Final = 20.0
@@ -274,7 +274,7 @@ class Exchange:
         return False
 
     async def _follow(self) -> bool:
-        """Wait for the next answer and repeat the request meanwhile; return False if no answer can come any more."""
+        """Wait for the next answer, and repeat the request; return False if the job has ended or the link is lost."""
         loop = asyncio.get_running_loop()
         repeats = list(REPEAT_AFTER_S)
         while not await self._hears(_TICK_S):

@@ -49,7 +49,7 @@ _SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}  # sev
 
 @dataclasses.dataclass(frozen=True)
 class RequestOutcome:
-    """Outcome of a request: `answer` for programs, as JSON with `state` and `reason` first; `lines` for people."""
+    """Outcome of a request: `answer` is JSON for programs (`state`, `reason`, more); `lines` are texts for people."""
 
     state: State
     reason: str
@@ -94,12 +94,12 @@ class Station:
         return self._heard.vehicle(self._target.system_id, asyncio.get_running_loop().time())
 
     def interrupt(self) -> None:
-        """Handle Ctrl-C: cancel the request; at a second Ctrl-C, do not wait for its end."""
+        """Handle Ctrl-C: the first cancels the running request, the second ends the wait for its end."""
         self._why_cancelled = self._why_cancelled or "Ctrl-C"
         self._interrupted.set()
 
     async def find(self, system_id: int | None, within_s: float) -> None:
-        """Find the companion by its heartbeat. Wait up to 1.3 s more for other vehicles and for its autopilot.
+        """Find the companion by its heartbeat. Wait up to 1.3 s for heartbeats of its autopilot and of other vehicles.
 
         Raises:
             NobodyHeardError: no heartbeat in time; the text names the received senders and the remedy.
@@ -155,7 +155,7 @@ class Station:
         return await self._judge(exchange, begun_s)
 
     async def cancel(self) -> RequestOutcome:
-        """Cancel the running job, whoever started it, and wait for its end; NobodyHeardError if no answer comes."""
+        """Cancel the running job of any requester, and wait for its end; raise NobodyHeardError without an answer."""
         loop = asyncio.get_running_loop()
         begun_s, exchange = loop.time(), Exchange(self._link, self._target, CANCEL)
         await exchange.run()
@@ -217,7 +217,7 @@ class Station:
             await asyncio.gather(running, return_exceptions=True)
 
     async def _ends(self, running: asyncio.Task[None], within_s: float | None) -> bool:
-        """Wait until a request ends, or for the timeout or the next Ctrl-C; return True if the request has ended."""
+        """Wait for the end of a request, the timeout or Ctrl-C; return True if the request has ended."""
         interrupted = asyncio.create_task(self._interrupted.wait())
         try:
             await asyncio.wait({running, interrupted}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)

@@ -47,7 +47,7 @@ def folder() -> Path:
 
 
 def content(shipped: str, *, executable: str = EXECUTABLE) -> bytes:
-    """Return a service file with the path of `executable`; raise CompanionError if a unit cannot hold that path."""
+    """Return a service file that starts `executable`; raise CompanionError for a path that a unit cannot contain."""
     text = (folder() / shipped).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
@@ -72,7 +72,7 @@ HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S10
 """Folders that the systemd unit hides from the service, by ProtectHome and PrivateTmp."""
 
 PACKAGED: Final = "packaged-by"
-"""File that marks a Python environment from a Debian package; that package then installs the service."""
+"""File that marks a Python environment from our Debian package, which installs the service itself."""
 _START_PACKAGED: Final = "sudo systemctl enable --now companion"
 UDEV_RUNS: Final = Path("/run/udev/control")
 
@@ -114,7 +114,7 @@ def own_executable() -> str:
 
 
 def install(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
-    """Install the service step by step; raise CompanionError without root, or if a Debian package installed it."""
+    """Install the service step by step; raise CompanionError without root, or if a Debian package provides it."""
     if target.is_this_machine:
         _check_not_packaged(_START_PACKAGED)
         _check_user("install-service")
@@ -127,7 +127,7 @@ def install(target: Installation, run: Run | None = None) -> Iterator[InstallSte
 
 
 def start_service(run: Run | None = None) -> Iterator[InstallStep]:
-    """Start the service now and at every boot, and install it first if need be; raise CompanionError without root."""
+    """Start the service now and at every boot, after installing it if need be; raise CompanionError without root."""
     if _is_packaged():
         for command in ("enable", "restart"):
             yield _command(run or _run, "systemctl", command, "companion.service")
@@ -140,7 +140,7 @@ def how_to_start() -> str:
 
 
 def uninstall(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:
-    """Remove the service, not configuration and records; CompanionError without root, or if a package installed it."""
+    """Remove the service, not configuration and records; CompanionError without root, or if a Debian package has it."""
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
         _check_user("uninstall-service")

@@ -1,9 +1,9 @@
 """Access rules of the web page, for reading and for actions.
 
 All clients that reach the page may read. An action needs a token in an HTTP header that other web sites cannot set. If
-only the board itself can reach the page, the server sends it a token of its own process; elsewhere a person types the
-token from the storage folder once. Another site could resolve its name to our address (DNS rebinding): therefore the
-Host header may contain only addresses, "localhost" and the board's own names.
+only the board itself can reach the page, the server makes a token at start and sends it to the page; otherwise a
+person types the token from the storage folder once. Another site could resolve its name to our address (DNS
+rebinding): therefore the Host header may contain only addresses, "localhost" and the board's own names.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def new_token() -> str:
 
 
 def kept_token(directory: Path) -> str:
-    """Read the web page's token from the storage folder; if there is none, create one that only the owner can read.
+    """Read the web page's token from the storage folder; if there is none, create a file that only its owner can read.
 
     Raises:
         StorageError: the token cannot be read or created, or is too short.
@@ -82,7 +82,7 @@ def _bare(token: str) -> str:
 
 
 class Access:
-    """Access rules of a web page: actions need `token`; `handed_out`: the server sends the token to the page itself."""
+    """Access rules of a web page: actions need `token`. `handed_out`: the server sends its token to the page."""
 
     def __init__(self, token: str, *, handed_out: bool) -> None:
         self.token, self.handed_out = token, handed_out
@@ -100,7 +100,7 @@ class Access:
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
     def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
-        """Return the reason to refuse a request that the page of another web site has sent; None: accept."""
+        """Return the reason to refuse a request that another web site's page has sent; None: accept."""
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "asked by another site"
         origin, host = headers.get("origin"), headers.get("host", "")

@@ -36,7 +36,7 @@ UNHEARD_MS: Final = 10_000
 
 
 class Connection(H11Protocol):
-    """HTTP connection of one client; the handler of its request finds it as `request.state.connection`."""
+    """HTTP connection of one client; request handlers find the connection as `request.state.connection`."""
 
     def __init__(self, config: Config, state: ServerState, unanswered: dict[Connection, None]) -> None:
         super().__init__(config, state, {"connection": self})
@@ -81,7 +81,7 @@ class Connection(H11Protocol):
 
 @contextlib.asynccontextmanager
 async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) -> AsyncIterator[int]:
-    """Serve a web application until the context ends, with `more` headers on every answer; yield the port.
+    """Serve a web application while the context is open, with `more` headers on every answer; yield the port.
 
     Raises:
         OSError: the address cannot be used.

@@ -43,9 +43,9 @@ ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 MAX_VIEWERS: Final = 16
 MAX_STRANGERS: Final = 4
-"""Maximum number of viewers from one address without the token; unlimited if only the board itself can connect."""
+"""Maximum number of viewers without the token per address; no limit if only the board itself can connect."""
 MAX_BEHIND: Final = 20
-"""Maximum number of events that wait for a slow viewer (10 s); with more it is disconnected, and then reconnects."""
+"""Maximum number of events that wait for a slow viewer (10 s). A slower viewer is disconnected, and reconnects."""
 AGAIN_S: Final = 0.5  # Pause before the status is requested again after a failure
 ACTIONS: Final = asked_by(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
@@ -56,7 +56,7 @@ _SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
 class Page:
     """Server of the web page at an address HOST:PORT; the caller runs `run` as a task.
 
-    If other computers can reach the address, the token from the storage folder is used.
+    If other computers can reach the address, actions need the token from the storage folder.
     """
 
     def __init__(self, bind: str, directory: Path, ask: Ask) -> None:
@@ -217,7 +217,7 @@ class Page:
     # --- viewers
 
     def _no_room_for(self, viewer: Viewer) -> str | None:
-        """Return the reason to refuse a viewer, None: accept. A viewer with the token replaces another if need be."""
+        """Return the reason to refuse a viewer; None: accept. If 16 are there, one with the token replaces another."""
         if not viewer.has_token:
             if len(self._viewers) >= MAX_VIEWERS:
                 return f"{MAX_VIEWERS} are looking already; the token makes room: companion web-token, on the board"

@@ -1,4 +1,4 @@
-"""Aircraft without any prior calibration: turned on spots, propped up twelve times."""
+"""Accuracy for an aircraft that was never calibrated: turned about on sloping spots, propped up twelve times."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ BY_HAND: Final = ("icm42688p", "bmi088", "adis16470")
 STAND_S: Final = 12
 PLACEMENT_DEG: Final = 0.02
 PROPPED_DEG: Final = 5.0
-"""One sigma by which hands miss a face, about each axis."""
+"""Sigma, about each axis, of the error with which a person props the aircraft up on a face."""
 ARDUPILOT_READINGS: Final = 50
 """Number of readings that a level calibration of ArduPilot averages."""
 SLOPE_DEG: Final = 3.0
-"""Slope of the ground on which it is propped."""
+"""Slope of the ground on which the aircraft is propped up."""
 SLOPES_DEG: Final = (0.5, 1.0, 3.0, 5.0)
-"""Slopes of the spots on which it is turned."""
+"""Slopes of the spots on which the aircraft is turned."""
 TURNS: Final = tuple((headings, slope) for headings in (2, 4) for slope in SLOPES_DEG)
-"""Headings and slope."""
+"""Simulated turns on a spot: number of headings, and slope of the spot in degrees."""
 GYRO_SCALE, GYRO_SHEAR, STAMPS_S = 0.01, 0.005, 0.5e-3
-"""One sigma of scale and shear of the gyros that count the turns; half the rounding of their time stamps."""
+"""Sigmas of scale and shear of the gyros that measure the turns; half the rounding of the gyros' time stamps."""
 _FACES: Final = ((90, 0), (-90, 0), (0, -90), (0, 90), (0, 180), (0, 0))
-"""Pitch and roll; up is +x, -x, +y, -y, +z, -z."""
+"""Pitch and roll in degrees of the six faces, with this axis up: +x, -x, +y, -y, +z, -z."""
 _EDGES: Final = ((45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90))
 
 
@@ -51,25 +51,25 @@ class HandRun:
     """Errors of one aircraft, and sigmas, in SI units; biases relative to their mean over the next three minutes."""
 
     faces: Array
-    """(9,) bias, scale, shear."""
+    """Errors of the accelerometers' bias, scale and shear after the twelve stands (9,)."""
     faces_sigma: Array
     faces_checked: bool
-    """No stand was rejected or in doubt."""
+    """True: no stand was rejected or in doubt."""
     turn: Array
-    """(TURNS, 2) level bias ahead and to the right."""
+    """Errors of the bias of the horizontal accelerometers, forward and right, after each turn (TURNS, 2)."""
     turn_sigma: Array
     slope: Array
-    """Slope of the spot (TURNS), rad."""
+    """Error of the estimated slope of each spot, in rad (TURNS,)."""
     level: Array
-    """(2,) roll and pitch of the board, on the steepest spot."""
+    """Errors of the board's roll and pitch, measured on the steepest spot (2,)."""
     level_sigma: Array
     level_firmware: Array
-    """(2,) the same from a firmware's level calibration there, with biases and scales known exactly."""
+    """Errors (2,) of a firmware's level calibration on that spot, with biases and scales known exactly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stood:
-    """Measurement of one stand."""
+    """Measurement of one stand, in which the aircraft is motionless."""
 
     start_s: float
     end_s: float
@@ -87,14 +87,14 @@ class _Stood:
 
 
 class _Spot:
-    """One spot: five stands, each a quarter turn farther, and the gyros' readings throughout."""
+    """Measurements on one spot: five stands, each a quarter turn after the last, and all gyro readings."""
 
     def __init__(self) -> None:
         self.stood: list[_Stood] = []
         self.counter = TurnCounter()
 
     def chosen(self, headings: int) -> list[StandMeans]:
-        """Stands that `align turn` asks for: first heading, half a turn, first heading; or quarters all round."""
+        """Return the stands that `align turn` asks for: first heading, half a turn, first heading; or all quarters."""
         found: list[StandMeans] = []
         counter = copy.deepcopy(self.counter)  # which lets go of what was before a stand
         chosen = self.stood[::2] if headings == 2 else self.stood
@@ -109,7 +109,7 @@ class _Spot:
 
 
 class _Aircraft:
-    """An autopilot's board, mounted by eye and never calibrated; a person who moves it; and its collector."""
+    """An aircraft whose autopilot was mounted by eye and never calibrated, a person who moves it, and a collector."""
 
     def __init__(self, part: str, seed: int, number: int) -> None:
         self.random = np.random.default_rng([seed, 6, BY_HAND.index(part), number])
@@ -150,7 +150,7 @@ class _Aircraft:
         return times, rows
 
     def stand(self, move: Callable[[float], float], counter: TurnCounter | None = None) -> _Stood:
-        """Move the aircraft and measure."""
+        """Move the aircraft, then measure its stand."""
         begin_s = math.ceil(move(self.t_s) + 1.0)
         if counter is not None:
             self._read(begin_s + 0.5 - self._read_s, counter)
@@ -172,13 +172,13 @@ class _Aircraft:
         return _Stood(window.start_s, window.end_s, window.imus[0], rows[:, 3:])
 
     def propped(self, pitch_deg: float, roll_deg: float) -> _Stood:
-        """Prop it up by hand, on a slope in a random direction."""
+        """Prop the aircraft up by hand, on a slope in a random direction; measure its stand."""
         azimuth = self.random.uniform(0.0, 2.0 * math.pi)
         off = self.random.normal(size=2) * PROPPED_DEG + SLOPE_DEG * np.array([math.cos(azimuth), math.sin(azimuth)])
         return self.stand(lambda t_s: self.hands.hold(t_s, pitch_deg + float(off[0]), roll_deg + float(off[1])))
 
     def on_spot(self, slope_deg: float) -> _Spot:
-        """Measure four quarter turns and the way on to the first heading, on a slope in a random direction."""
+        """Measure stands after four quarter turns, back to the first heading, on a slope in a random direction."""
         azimuth = self.random.uniform(0.0, 2.0 * math.pi)
         pitch, roll = slope_deg * math.cos(azimuth), slope_deg * math.sin(azimuth)
         spot = _Spot()
@@ -188,7 +188,7 @@ class _Aircraft:
         return spot
 
     def level_reading(self, bias: Array) -> Array:
-        """Accelerometer reading of a level aircraft with these biases."""
+        """Return the accelerometers' reading in a horizontal aircraft, with the given biases."""
         level = VirtualAircraft(Pose(), self.aircraft.site)
         return self.imu.in_accel_axes(level.truth_at(0.0).force_m_s2) + bias
 
@@ -230,7 +230,7 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
 
 
 def _wander(stands: list[_Stood]) -> Array:
-    """Change of the bias from a stand to the next minutes, (3,)."""
+    """Return the sigma (3,) of the change of the bias from a stand to the next minutes."""
     use, stat = (
         np.array([getattr(one.window, name) for one in stands])
         for name in ("accel_sigma_use_m_s2", "accel_sigma_stat_m_s2")
@@ -239,7 +239,7 @@ def _wander(stands: list[_Stood]) -> Array:
 
 
 def _tilt(force: Array) -> Array:
-    """Roll and pitch from corrected accelerometers."""
+    """Return roll and pitch from corrected accelerometer readings."""
     x, y, z = force
     return np.array([math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))])
 

@@ -23,7 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; 0 when every claim holds, 1 when one does not."""
+    """Run the command; return 0 if every claim holds, otherwise 1."""
     from sim.accuracy.tables import report
 
     parser = argparse.ArgumentParser(prog="python -m sim accuracy", description=f"Monte Carlo: {HELP}.")

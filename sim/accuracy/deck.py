@@ -1,7 +1,7 @@
-"""Calibrations on a deck in waves: the errors and the sigmas.
+"""Calibrations on a deck in waves: their errors and stated sigmas.
 
-The simulator makes the readings sample by sample; the seconds go into `Deck` as in the daemon, its windows
-into `solve`.
+The simulator makes the readings sample by sample; the seconds go into `Deck` as in the daemon, the
+windows of `Deck` into `solve`.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class Voyage:
     latitude_deg: float = 45.0
     compass_sigma_deg: float = COMPASS_SIGMA_DEG
     gyro_axes_sigma: float = 0.0029
-    """Scale and cross-axis errors of the gyros, one sigma: uniform up to 0.5 %."""
+    """Sigma of the gyros' scale and cross-axis errors, as for a uniform distribution up to 0.5 %."""
     gyro_bias_rad_s: float = GYRO_BIAS_RAD_S
-    """One sigma."""
+    """Sigma of the gyro biases."""
 
     def motions(self, seed: int) -> list[Motion]:
-        """Motions from before the beginning until after the end."""
+        """Return the motions of the deck, which begin before the calibration and end after it."""
         found: list[Motion] = []
         if self.waves:
             found.append(Sea(start_s=-_BEFORE_S, waves=self.waves, seed=seed))
@@ -71,7 +71,7 @@ class Voyage:
 def sail(
     voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[GradienterModel, CompassModel], Deck] = Deck
 ) -> Errors:
-    """Calibrate one aircraft with one IMU after each span (ascending), by the deck that `made` returns.
+    """Calibrate one aircraft with one IMU after each span (ascending), with the deck that `made` creates.
 
     Errors (spans, 6) are against the mean bias of the next minutes: rad/s, m/s^2, vehicle FRD.
     """
@@ -113,7 +113,7 @@ def sail(
 
 
 def feed(deck: Deck, imu: ImuModel, seconds: int, random: np.random.Generator, compass_sigma_deg: float) -> None:
-    """Feed so many seconds of an IMU, a gradienter and a compass."""
+    """Give a deck so many seconds of readings of an IMU, a gradienter and a compass."""
     headings, tilts = _headings(imu.aircraft, seconds, random, compass_sigma_deg), _tilts(imu.aircraft, seconds, random)
     for first in range(0, seconds, _CHUNK_S):
         count = min(_CHUNK_S, seconds - first)
@@ -186,7 +186,7 @@ MOST: Final = {("gyros, deg/h", 120): 40.0, ("gyros, deg/h", 600): 10.0,
 
 
 def section(voyages: int, stands: int, seed: int, jobs: int) -> Section:
-    """Make the table and the claims."""
+    """Make the table of calibrations on a deck, and its claims."""
     sea = many(sail, [(Voyage(), SPANS_S, 10_000 * seed + number) for number in range(voyages)], jobs)
     still = many(sail, [(STILL, STILL_S, 10_000 * seed + 5_000 + number) for number in range(stands)], jobs)
     lines = [
@@ -225,7 +225,7 @@ def _rows(title: str, runs: list[Errors], index: int) -> list[str]:
 
 
 def _over_the_ground(runs: list[Errors], index: int, span_s: int) -> Figure:
-    """Sigma of the gyros over that of a mean of the same length, V(T, H)."""
+    """Ratio of the gyros' sigma on deck to the sigma of a mean of the same length on the ground, V(T, H)."""
     model = PROFILES[STILL.part].gyro
     at_rest = math.sqrt(model.white**2 / span_s + float(floor_variance(model.flicker, model.walk, span_s, NEXT_S)))
     return rms(stack(runs, "sigma")[:, index, :3] / at_rest)

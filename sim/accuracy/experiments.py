@@ -1,6 +1,6 @@
 """The experiments: many stands each, in several processes; each returns errors and sigmas against the known truth.
 
-Each is one function of a seed, so that a run does not depend on the number of processes.
+Each experiment is a function of a seed, so its result does not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ TILTS: Final = (
     ("0.05 deg", 0.05),
     ("0.1 deg", 0.1),
 )
-"""References of the tilt and their sigma in degrees; the error of the first is uniform up to its limit."""
+"""Tilt references, each with a sigma in degrees; the first reference's error is uniform up to its limit."""
 TILT_DRAWS: Final = 8
-"""Draws of a reference's error, per stand."""
+"""Number of errors drawn for each tilt reference, per stand."""
 FIELD_TILT_DEG: Final = 0.01
 FIELD_HEADING_DEG: Final = 1.0
 STEP_RAD_S: Final = 1e-3
@@ -55,7 +55,7 @@ _Found = TypeVar("_Found")
 
 
 def many(one: Callable[..., _Found], arguments: Sequence[tuple[object, ...]], jobs: int) -> list[_Found]:
-    """Return `one(*arguments)` of all arguments, in order."""
+    """Return the results of `one(*arguments)` for all `arguments`, in their order, from several processes."""
     if jobs == 1:
         return [one(*each) for each in arguments]
     with ProcessPoolExecutor(jobs) as pool:
@@ -63,13 +63,13 @@ def many(one: Callable[..., _Found], arguments: Sequence[tuple[object, ...]], jo
 
 
 def plain_mean(rows: Array) -> tuple[Array, Array]:
-    """Bias (6) and its sigma (6) from readings (n, 6): their mean less that of a level aircraft on an Earth at rest."""
+    """Return bias (6) and sigma (6): mean of readings (n, 6) less that of a level aircraft on an Earth at rest."""
     level = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -STANDARD_GRAVITY_M_S2])
     return rows.mean(axis=0) - level, np.asarray(rows.std(axis=0, ddof=1) / math.sqrt(len(rows)))
 
 
 def whole_seconds(times: Array, rows: Array, window: Window) -> Array:
-    """Return the readings that belong to this window."""
+    """Return the readings that belong to a window."""
     return np.asarray(rows[(times >= window.start_s) & (times < window.end_s)])
 
 
@@ -78,7 +78,7 @@ def whole_seconds(times: Array, rows: Array, window: Window) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteRun:
-    """One stand with white noise only and perfect references; arrays (spans, 6), over the bound."""
+    """One stand with white noise only and perfect references; arrays (spans, 6), as multiples of the bound."""
 
     error: Array
     sigma: Array
@@ -87,7 +87,7 @@ class WhiteRun:
 
 
 def white(seed: int, number: int) -> WhiteRun:
-    """Errors and sigma_stat in units of the Cramer-Rao bound N / sqrt(T)."""
+    """Return errors and sigma_stat of one stand, in units of the Cramer-Rao bound N / sqrt(T)."""
     posture = POSTURES[number % len(POSTURES)]
     site = sites()[number // len(POSTURES) % len(sites())]
     standing = stand("white_only", posture, site, (seed, 1, number))
@@ -109,15 +109,15 @@ def white(seed: int, number: int) -> WhiteRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FloorRun:
-    """One stand with a part's flicker and walk, judged by its bias over the next three minutes; (spans, 6), SI."""
+    """Errors of one stand with a part's flicker and walk, against the bias in the next three minutes (spans, 6), SI."""
 
     posture: str
     ideal: Array
-    """Error with perfect references: the part of the IMU alone."""
+    """Error with perfect references, caused by the IMU alone."""
     error: Array
     """Error with a gradienter of 0.01 deg and a compass of 1 deg."""
     sigma: Array
-    """Stated sigma_use of `error`."""
+    """Stated sigma_use for `error`."""
     plain: Array
     plain_sigma: Array
     tilted: Array
@@ -125,7 +125,7 @@ class FloorRun:
 
 
 def floors(part: str, seed: int, number: int) -> FloorRun | None:
-    """Measure one stand; None where chance looked like motion, so that the pilot would have to wait longer."""
+    """Simulate one stand; None: noise looked like motion, so that a pilot would have to wait longer."""
     posture = POSTURES[number % len(POSTURES)]
     site = sites()[number // len(POSTURES) % len(sites())]
     standing = stand(
@@ -179,18 +179,18 @@ def _tilted(standing: Stand, window: Window, truth: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntegerRun:
-    """One stand whose readings are truncated to whole mrad/s and mg; arrays (6), in steps."""
+    """Errors of one stand whose readings are truncated to whole mrad/s and mg; arrays (6), in these steps."""
 
     error: Array
-    """NaN: refused."""
+    """Errors of the estimated biases; NaN: the calibration was refused."""
     sigma: Array
-    """sigma_stat; at least 0.5 where the readings do not determine the mean."""
+    """Stated sigma_stat; at least 0.5 if the readings do not determine the mean."""
     plain: Array
-    """Error of the plain mean less Earth and pose."""
+    """Error of the plain mean, less the effect of Earth and pose."""
 
 
 def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
-    """One stand with noise of so many steps a reading, biases uniform over two and a half steps to either side."""
+    """Simulate one stand with noise of `noise_lsb` steps per reading; biases are uniform within 2.5 steps of zero."""
     steps = np.repeat([STEP_RAD_S, MG], 3)
     density = noise_lsb / np.sqrt(float(RATE_HZ))
     spec = ImuSpec(name="cut", gyro=AxisNoise(white=density * STEP_RAD_S), accel=AxisNoise(white=density * MG))
@@ -225,7 +225,7 @@ def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
 
 
 def predicted(noise: AxisNoise, mean_s: float, horizon_s: float) -> float:
-    """sqrt(V(T, H)) of method 2.2, from the simulator's own figures."""
+    """Return sqrt(V(T, H)) of method 2.2, from the simulator's own noise figures."""
     r = horizon_s / mean_s
     phi = ((1.0 + r) ** 2 * np.log(1.0 + r) - r**2 * np.log(r)) / r - np.log(r)
     variance = noise.white**2 / mean_s + noise.flicker**2 / np.pi * phi + noise.walk**2 * (mean_s + horizon_s) / 3.0

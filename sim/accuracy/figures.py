@@ -1,4 +1,4 @@
-"""Figures with their own uncertainty from many stands; claims about them, and their tables."""
+"""Figures from many simulated stands, with standard errors; claims about the figures, and tables."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from sim.earth import Array
 
 
 class Figure(NamedTuple):
-    """A figure and its standard error."""
+    """A figure from simulation, and its standard error."""
 
     value: float
     error: float
 
     def times(self, factor: float) -> Figure:
-        """Return the figure in another unit."""
+        """Return the figure multiplied by a factor, such as for another unit."""
         return Figure(self.value * factor, self.error * abs(factor))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """Errors and the sigmas stated for them, of one run."""
+    """Errors of one run, and the sigmas stated for these errors."""
 
     error: Array
     sigma: Array
 
 
 def stack(runs: Sequence[object], name: str) -> Any:
-    """One attribute of all runs as an array (runs, ...)."""
+    """Return one attribute of all runs as an array (runs, ...)."""
     return np.array([getattr(run, name) for run in runs])
 
 
 def rms(errors: Array) -> Figure:
-    """Root mean square of errors (stands, …), the standard error from the scatter between stands; NaN is left out."""
+    """Return the rms of errors (stands, …); its standard error is from the scatter of the stands; NaN is left out."""
     each = np.square(errors).reshape(len(errors), -1)
     counted = np.isfinite(each).sum(axis=1)
     if not counted.any():
@@ -50,7 +50,7 @@ def rms(errors: Array) -> Figure:
 
 
 def covered(errors: Array, sigmas: Array, times: float) -> Figure:
-    """Share of errors (stands, …) within so many sigmas, the standard error from the scatter; NaN is left out."""
+    """Return the share of errors (stands, …) within `times` sigmas, with a standard error; NaN is left out."""
     inside = (np.abs(errors) <= times * sigmas).astype(np.float64).reshape(len(errors), -1)
     known = np.isfinite(errors).reshape(len(errors), -1)
     count = float(known.sum())
@@ -63,10 +63,10 @@ def covered(errors: Array, sigmas: Array, times: float) -> Figure:
 
 
 def beside(errors: Array, efficient: Array) -> Figure:
-    """Rms of errors over that of an efficient estimator on the same readings, in units of the bound (stands, …).
+    """Return the ratio of an estimator's rms error to an efficient estimator's, on the same readings (stands, …).
 
-    The excess over an efficient estimator is uncorrelated with it (Rao), so this is sqrt(1 + rms(difference)^2): the
-    luck of the readings, common to both, cancels, and few stands resolve one per cent.
+    Errors are in units of the bound. The difference of the errors is uncorrelated with the efficient error (Rao), so
+    the ratio is sqrt(1 + rms(difference)^2). Common noise cancels: few stands resolve one per cent.
     """
     added = rms(errors - efficient)
     value = math.sqrt(1.0 + added.value**2)

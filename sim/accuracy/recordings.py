@@ -1,14 +1,14 @@
 """`python -m sim recordings DIR`: is sigma honest on real sensors, and is the estimate better than a plain mean?
 
-DIR has one folder for each part, with recordings of it at rest: everything that `companion replay` reads. Files in its
-folder `moving` were recorded in motion from beginning to end. Its file `part.toml` has what the recordings lack, all
+DIR has one folder per part, with recordings at rest in any format that `companion replay` reads. Files in the part's
+folder `moving` were recorded in motion from beginning to end. The file `part.toml` adds data to the recordings, all
 optional: `profile` (of the catalogue), `columns`, `rate_hz`, `powered_s` (since switch-on, at the beginning of a file).
 
-Every window is calibrated by itself, as after a start. Its truth is the plain mean of the raw samples of the following
-180 s (60 s at least where the recording ends before). The pose is the same in both, and cancels. Profiles:
+Every window is calibrated alone, as after a start. The window's truth is the plain mean of the raw samples of the
+following 180 s (60 s at least where the recording ends before). The pose is the same in both, and cancels. Profiles:
 
 - `default`: an unknown part;
-- `catalogue`: the one that part.toml names;
+- `catalogue`: the profile that part.toml names;
 - `learned`: fitted to the other recordings of the part, if these have 10 minutes at rest.
 """
 
@@ -47,7 +47,7 @@ _HEAD: Final = ("part", "profile", "T", "windows", "refused", "2 sigma", "rms/si
 
 
 class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of `part.toml`."""
+    """Content of a folder's `part.toml`."""
 
     profile: str | None = None
     columns: str | None = None
@@ -72,7 +72,7 @@ class Score:
         self._rows += other._rows
 
     def cells(self, triad: Triad) -> tuple[str, ...]:
-        """Format coverage, rms over sigma, rms error, that over the plain mean's, and coverage of the naive sigma."""
+        """Format a row: coverage, rms/sigma, rms error, its ratio to the plain mean's, the naive sigma's coverage."""
         if not self._rows:
             return ("-",) * 5
         error, sigma, naive, of_mean = np.array(self._rows)[:, :, rows_of(triad)].transpose(1, 0, 2)
@@ -88,7 +88,7 @@ class Score:
 
 
 def scored(logs: Iterable[StillLog], profile: NoiseProfile, powered_s: float, length_s: float) -> Score:
-    """Calibrate every window of a length, and compare it with the raw samples after it."""
+    """Calibrate every window of a length, and compare the biases with the raw samples after the window."""
     score = Score()
     for log in logs:
         for window in calibrated(log, Given(powered=powered_s, profile=profile), length_s):
@@ -108,7 +108,7 @@ def scored(logs: Iterable[StillLog], profile: NoiseProfile, powered_s: float, le
 
 
 def _truth(log: StillLog, start: int) -> tuple[Floats, Floats] | None:
-    """Return the mean of the raw samples after a window, (6,), and its sigma by white noise; None if they are few."""
+    """Return the mean (6,) of the raw samples after a window, and its sigma by white noise; None: too few samples."""
     if start >= len(log.t_s):
         return None
     end = int(np.searchsorted(log.t_s, log.t_s[start] + HORIZON_S))
@@ -121,7 +121,7 @@ def _truth(log: StillLog, start: int) -> tuple[Floats, Floats] | None:
 
 
 def learned(at_rest: Sequence[Sequence[Rest]], but: int) -> NoiseProfile | None:
-    """Fit a profile to the recordings of a part, all but one; None if they are too short."""
+    """Fit a profile to all recordings of a part except one; None: the recordings are too short."""
     found = [rest for number, one in enumerate(at_rest) if number != but for rest in one]
     if seconds_at_rest(found) < LEAST_LEARNED_S:
         return None
@@ -132,7 +132,7 @@ def learned(at_rest: Sequence[Sequence[Rest]], but: int) -> NoiseProfile | None:
 
 
 def judged_still(logs: Iterable[StillLog]) -> tuple[int, int]:
-    """Count the seconds of moving recordings, and those that the gate judges still, without a profile."""
+    """Count the seconds in recordings of motion, and how many of them the gate judges motionless, without a profile."""
     still = seconds = 0
     for log in logs:
         gate = ImuGate(log.imu, noise_profile(None))

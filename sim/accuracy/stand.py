@@ -1,8 +1,8 @@
-"""One aircraft standing still: a simulated IMU read sample by sample into the flying collector, and its solution.
+"""One motionless aircraft: a simulated IMU read sample by sample into the flying collector, and its solution.
 
-Nothing of the estimator is copied or shortened: samples go into `RollingCollector` (seconds, stillness, stretch, robust
-means, ramps, sigmas), its windows into `solve` (pose, Earth, biases, covariance). The truth, its noise, its Earth and
-its gradienter are the simulator's own.
+Nothing of the estimator is copied or shortened: samples go into `RollingCollector` (seconds, stillness, robust means,
+ramps, sigmas), the collector's windows into `solve` (pose, Earth, biases, covariance). Truth, noise, Earth and
+gradienter are the simulator's own.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from sim.scenario import site_at
 from sim.thermal import Curve
 
 BEGIN_S: Final = 0.5
-"""Start of the stream within a second, which is not counted; the windows begin at 1 s."""
+"""Start of the readings in the first second, which is not counted; the windows begin at 1 s."""
 NEXT_S: Final = 180.0
 RATE_HZ: Final = 100
 GYRO_BIAS_RAD_S: Final = 100.0 * DEG_H
-"""One sigma of the bias of a power-up, the scatter of the paper's tables (method 1.3)."""
+"""Sigma of the gyro bias at power-up, from the scatter in the paper's tables (method 1.3)."""
 ACCEL_BIAS_M_S2: Final = 2.0 * MG
 GRAVITY_ANOMALY_M_S2: Final = 3.0e-4
-"""30 mGal, one sigma: error of the formula of normal gravity (method 2.1)."""
+"""Sigma of the error of the formula for normal gravity, 30 mGal (method 2.1)."""
 STEADY_DEGC: Final = 25.0
 THERMOMETER_K: Final = 0.02
 """Noise of one reading of the IMU's own thermometer."""
@@ -54,7 +54,7 @@ _HEADING_NOISE_DEG: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Posture:
-    """Pose in degrees, law of the gradienter, mounting of the IMU."""
+    """Pose of the aircraft in degrees, law of the gradienter, mounting of the IMU."""
 
     name: str
     pitch_deg: float
@@ -62,7 +62,7 @@ class Posture:
     law: Law = "axis"
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     by_eye_deg: float = 0.0
-    """One sigma added to pitch and roll by a person who levels it by eye."""
+    """Sigma of pitch and roll if a person levels the aircraft by eye; added to the pose."""
 
 
 POSTURES: Final = (
@@ -72,12 +72,12 @@ POSTURES: Final = (
     Posture("20/15", 20.0, 15.0, "slope", (180.0, 0.0, 90.0)),
     Posture("inverted", 10.0, 170.0, "euler"),
 )
-"""The last hangs on its back, for gradienters of law "euler"; the one before carries its IMU upside down."""
+"""Postures to simulate. "20/15" has its IMU upside down; "inverted" lies on its back, for law "euler" only."""
 
 
 @functools.cache
 def sites() -> tuple[Site, ...]:
-    """The equator, 45 N, 60 N and the south, each with its magnetic field."""
+    """Return sites at the equator, 45 N, 60 N and in the south, each with its magnetic field."""
     places = ((0.0, -78.0, 2800.0), (45.0, 10.0, 100.0), (60.0, 25.0, 20.0), (-35.0, 149.0, 580.0))
     return tuple(site_at(*place) for place in places)
 
@@ -98,7 +98,7 @@ class AnomalousSite(Site):
 
     @property
     def gravity_m_s2(self) -> float:
-        """True gravity there."""
+        """True gravity at this place, with the anomaly."""
         return super(AnomalousSite, self).gravity_m_s2 + self.anomaly_m_s2
 
 
@@ -106,22 +106,22 @@ class AnomalousSite(Site):
 class Stand:
     posture: Posture
     site: Site
-    """Place by the formula; the aircraft's own may have an anomaly."""
+    """Place with gravity by the formula; at the aircraft's own site, gravity can have an anomaly."""
     imu: ImuModel
     random: np.random.Generator
 
     @property
     def heading_deg(self) -> float:
-        """True heading."""
+        """True heading of the aircraft."""
         return self.imu.aircraft.pose.heading_deg
 
     def in_vehicle(self, rows: Array) -> Array:
-        """Turn readings (…, 6) from sensor axes to the vehicle's."""
+        """Rotate readings (…, 6) from sensor axes to the vehicle's axes."""
         turn = self.imu.mounting.T
         return np.concatenate([rows[..., :3] @ turn, rows[..., 3:] @ turn], axis=-1)
 
     def bias(self, start_s: float, end_s: float) -> Array:
-        """True mean bias (6) over a time, vehicle FRD."""
+        """Return the true mean bias (6) from `start_s` to `end_s`, in vehicle FRD."""
         return self.in_vehicle(np.concatenate(self.imu.mean_bias(start_s, end_s)))
 
 
@@ -157,7 +157,7 @@ def stand(
 
 
 def samples(standing: Stand, seconds: float, rate_hz: int = RATE_HZ) -> tuple[Array, Array]:
-    """Read the IMU from `BEGIN_S` until `seconds` good ones are over: times (n) and readings (n, 6), its axes."""
+    """Read the IMU from `BEGIN_S` on, for `seconds` whole seconds: times (n) and readings (n, 6) in sensor axes."""
     times = BEGIN_S + (np.arange(round((1.0 - BEGIN_S + seconds) * rate_hz)) + 0.5) / rate_hz
     return times, standing.imu.read(times, 1.0 / rate_hz)
 
@@ -200,7 +200,7 @@ def collected(
 
 
 def _temperatures(standing: Stand, times: Array) -> list[float | None]:
-    """Readings of its thermometer at these times, one per 0.1 s."""
+    """Return thermometer readings at the given times; the temperature is interpolated on a grid of 0.1 s."""
     noise = np.random.default_rng(round(1e6 * standing.heading_deg))
     coarse = np.linspace(times[0], times[-1], max(2, round(float(times[-1] - times[0]) * 10.0)))
     smooth = np.interp(times, coarse, [standing.imu.temperature_degc(float(t_s)) for t_s in coarse])
@@ -213,7 +213,7 @@ def _window(collector: RollingCollector, now_s: float) -> Window:
 
 
 def _tilts(standing: Stand, until_s: float) -> list[TiltSample]:
-    """Latest first."""
+    """Return the gradienter's readings until a time, the latest first."""
     times = np.arange(BEGIN_S, until_s, 1.0 / _TILT_HZ)
     device = Gradienter(standing.imu.aircraft, law=standing.posture.law, range_deg=360.0)
     readings = device.tilt_deg(times) + standing.random.normal(size=(len(times), 2)) * _TILT_NOISE_DEG
@@ -221,7 +221,7 @@ def _tilts(standing: Stand, until_s: float) -> list[TiltSample]:
 
 
 def _headings(standing: Stand, until_s: float) -> list[CompassSample]:
-    """Latest first."""
+    """Return the compass headings until a time, the latest first."""
     times = np.arange(BEGIN_S, until_s, 1.0 / _HEADING_HZ)
     noise = standing.random.normal(size=len(times)) * _HEADING_NOISE_DEG
     readings = np.mod(standing.heading_deg - standing.site.declination_deg + noise, 360.0)
@@ -270,7 +270,7 @@ def _models(standing: Stand, references: References) -> tuple[GradienterModel, C
 
 
 def biases(found: ImuSolution) -> Array:
-    """Estimated biases (6,), vehicle FRD; NaN where a triad is refused."""
+    """Return the estimated biases (6,) in vehicle FRD; NaN: the triad was refused."""
     refused = np.full(3, math.nan)
     return np.concatenate(
         [

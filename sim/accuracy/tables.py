@@ -33,14 +33,14 @@ from sim.earth import STANDARD_GRAVITY_M_S2
 from sim.imu_model import DEG_H, PARTS, UG
 
 UPRIGHT: Final = ("level", "by eye", "5/-3")
-"""Postures in which the horizontal accelerometers are the body's x and y."""
+"""Postures in which the horizontal accelerometers are the x and y of the body."""
 PAPER_LEFT_UG: Final = (56.80, 36.24)
-"""Mean absolute E and N of the paper's table 1, recomputed (method 1.3)."""
+"""Mean absolute errors E and N from the paper's table 1, in micro-g, recomputed (method 1.3)."""
 _TRIADS: Final = (("gyro", "deg/h", DEG_H, slice(0, 3)), ("accel", "ug", UG, slice(3, 6)))
 _LSB_DEG_H: Final = STEP_RAD_S / DEG_H
 _REFERENCES: Final = f"gradienter {FIELD_TILT_DEG:g} deg, compass {FIELD_HEADING_DEG:g} deg"
 _HALF_A_STEP: Final = 0.45
-"""A sigma_stat of so many steps is no measurement."""
+"""Value of sigma_stat, in steps of the output, from which on a mean counts as undetermined."""
 
 
 def report(
@@ -49,9 +49,9 @@ def report(
     """Return all sections asked for, by name.
 
     Args:
-        runs: stands with white noise. A fifth of it for every part, a hundredth for every case of a warm-up. A
-            twentieth for every step of noise under integers, a thirty-second for every rate of a ground that turns. A
-            tenth of it aircraft turned by hand, a twentieth switched on day after day.
+        runs: number of stands with white noise. Other experiments use a share of this number. A fifth for every part,
+            a hundredth for every warm-up case, a twentieth for each noise of integer readings. A thirty-second for each
+            turn rate of the ground, a tenth for aircraft turned by hand, a twentieth for aircraft over many days.
         seed: seed of everything.
         only: some of `cli.SECTIONS`.
         jobs: number of processes.

@@ -1,7 +1,7 @@
-"""AgingAircraft over many days: gyro biases at the next power-up, and calibrations in mid-warm-up.
+"""Gyro biases of aircraft over many days: at the next power-up, and calibrated in the middle of a warm-up.
 
-Pieces and boards are those of `sim.thermal`; each day one warms up and stands still now and then. The days are means of
-still seconds, drawn directly.
+Pieces and boards are those of `sim.thermal`. Each day a board warms up, and is motionless now and then. The simulation
+draws one-second means directly.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sim.thermal import Curve, Piece, ThermalBoard
 
 DAYS: Final = 20
 TRIED: Final = ("icm42688p", "bmi088", "adis16405")
-"""Parts whose scatter includes the wander within each power-up."""
+"""Parts whose scatter between power-ups includes the wander within each power-up."""
 AMBIENT_DEGC: Final = (5.0, 40.0)
 SESSION_S: Final = (300.0, 900.0)
 AT_MOST: Final = 1.3
@@ -40,7 +40,7 @@ _UP: Final = (0.0, 0.0, -1.0)
 
 @dataclass(frozen=True, slots=True)
 class Day:
-    """One row per second."""
+    """Readings of one day, one row per second."""
 
     degc: Array
     k_s: Array
@@ -62,7 +62,7 @@ class AgingAircraft:
         self.board = ThermalBoard.drawn(random)
 
     def day(self) -> Day:
-        """Return the next day."""
+        """Simulate the next day."""
         random, count = self._random, int(self._random.uniform(*SESSION_S))
         turned_on = self.piece.turned_on(random)
         # Three times in ten it is switched on again while it is warm.
@@ -81,7 +81,7 @@ class AgingAircraft:
         return Day(degc + random.normal(0.0, _THERMOMETER_K, count), np.gradient(degc), bias, still)
 
     def _flicker(self, count: int) -> Array:
-        """Flicker as a sum of Gauss-Markov processes of many time constants."""
+        """Return flicker noise for so many seconds, a sum of Gauss-Markov processes with different time constants."""
         decay = np.exp(-1.0 / _TAUS_S)[:, None]
         sigma = self._flicker_sigma
         state = self._random.normal(0.0, sigma, (len(_TAUS_S), 3))
@@ -93,7 +93,7 @@ class AgingAircraft:
         return found
 
     def seen(self, day: Day, number: int) -> list[Point]:
-        """Points by kelvin that a daemon would remember of the still seconds."""
+        """Return the points, one per kelvin, that a daemon would store for the motionless seconds of a day."""
         points = []
         kelvin = np.floor(day.degc)
         for step in dict.fromkeys(kelvin[day.still].tolist()):
@@ -122,7 +122,7 @@ class AgingAircraft:
 
 
 def power_up(part: str, seed: int, number: int) -> Errors:
-    """One aircraft of a part: twenty days, then the error at the next power-up, over the part's scatter."""
+    """Simulate an aircraft for twenty days; return the error at the next power-up, relative to the part's scatter."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
     aircraft = AgingAircraft(PARTS[part].gyro, random)
@@ -183,7 +183,7 @@ def power_up_section(runs: list[Errors], each: int) -> Section:
 RATES_K_MIN: Final = (0.5, 2.0, 5.0)
 SPANS_S: Final = (15, 60)
 _FLAT: Final = 5.0
-"""Time constants until it counts as warm."""
+"""Number of time constants after which a board counts as warm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,13 +195,13 @@ class MidRun:
     warm_error: Array
     warm_sigma: Array
     plain_error: Array
-    """Error without the curve."""
+    """Error without the temperature curve."""
     plain_sigma: Array
     plain_warm_error: Array
 
 
 def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
-    """One aircraft, its earlier days, and a stand in whose middle the temperature rises at this rate."""
+    """Simulate an aircraft's earlier days, then a stand during which the temperature rises at `rate_k_min`."""
     random = np.random.default_rng([seed, 77, number, round(10.0 * rate_k_min)])
     rate_k_s = rate_k_min / 60.0
     on_s = -1.0

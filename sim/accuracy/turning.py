@@ -1,7 +1,7 @@
 """Calibrations on a platform that turns slowly, from the start or after a rest: share of wrong results.
 
 An aircraft stands on a platform that turns about the vertical. Its readings go second by second into the flying
-collector; at every moment at which a calibration is possible, one is computed. A wrong result is one whose error
+collector; whenever a calibration is possible, it is computed. A wrong result is one whose error
 exceeds three times its stated sigma.
 """
 
@@ -39,7 +39,7 @@ from sim.scenario import site_at
 RATES_DEG_S: Final = (0.0, 0.01, 0.02, 0.05, 0.15, 0.4, 1.0, 2.0)
 REST_S: Final = 40.0
 TURNS_S: Final = 80.0
-"""Observed time from the start of the turn on."""
+"""Time for which the stand is observed from the start of the turn on."""
 SIGMAS: Final = 3.0
 FALSE_PERCENT: Final = 0.5
 NEXT_S: Final = 180.0
@@ -56,19 +56,19 @@ VN100: Final = ImuSpec(
     gyro=AxisNoise(white=8.9 * DEG_H, flicker=7.0 / 0.664 * DEG_H, walk=7.0 * math.sqrt(3e-3) * DEG_H),
     accel=AxisNoise(white=99 * _UG, flicker=40 / 0.664 * _UG, walk=40 * math.sqrt(3e-3) * _UG),
 )
-"""0.0035 deg/s/sqrt(Hz), 5 to 7 deg/h; 140 ug/sqrt(Hz), 40 ug (VectorNav's data sheet)."""
+"""Noise of VectorNav's data sheet: 0.0035 deg/s/sqrt(Hz), 5 to 7 deg/h; 140 ug/sqrt(Hz), 40 ug."""
 SPECS: Final = {"vn100": VN100, **{name: PARTS[name] for name in ("icm42688p", "bmi088", "adis16405")}}
 
 
 COMPASSES: Final = {"0.5 deg": (0.5, 0.0), "steps of 0.1": (0.05, 0.1), "steps of 1": (0.2, 1.0), "none": None}
-"""Noise and resolution in degrees."""
+"""Noise and resolution of each compass, in degrees; None: no compass."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TurningCase:
     part: str
     learned: bool
-    """Profile of the part itself; else that of an unknown part."""
+    """True: the IMU has its own part's noise profile. False: the profile of an unknown part."""
     compass: str
     rate_deg_s: float
     begins: Begins
@@ -80,15 +80,15 @@ class Found:
     """Result of one stand."""
 
     looks: int
-    """Number of seconds at which a calibration was possible in time."""
+    """Number of times at which a calibration was possible early enough."""
     refused: int
-    """Number of them at which a calibration was refused."""
+    """Number of these times at which the calibration was refused."""
     named: int
-    """Number of refusals that named a turn."""
+    """Number of refusals whose text named a turn."""
     worst: float
-    """Largest gyro error over its stated sigma, against the bias of the window."""
+    """Largest ratio of gyro error to stated sigma; the error is against the true bias in the window."""
     largest_deg_h: float
-    """Largest error against the bias of the window."""
+    """Largest gyro error against the true bias in the window."""
 
 
 def _profile(case: TurningCase) -> NoiseProfile:
@@ -135,7 +135,7 @@ class Platform:
         self.collector = RollingCollector(wanted, [taken], self.level, self.model if self.compass is not None else None)
 
     def errors(self, now_s: float) -> tuple[Array, Array]:
-        """Gyro errors of a calibration now, against the window's bias, and its sigma_use."""
+        """Calibrate now; return the gyro errors against the true bias in the window, and the stated sigma_use."""
         window = self.collector.window(now_s)
         solution = solve(window, self.local, self.level, self.model if self.compass else None, What.BOTH)
         (found,) = solution.imus
@@ -144,7 +144,7 @@ class Platform:
         return found.gyro_rad_s - then, found.gyro_sigma_use_rad_s
 
     def samples(self) -> list[tuple[float, Callable[[], object]]]:
-        """All samples in the order of time, each with the call that delivers it."""
+        """Return all samples, sorted by time, each with the call that delivers it to the collector."""
         collector, random, end_s = self.collector, self.random, self.end_s
         found: list[tuple[float, Callable[[], object]]] = []
         times = (np.arange(round(end_s * IMU_HZ)) + 0.5) / IMU_HZ
@@ -194,7 +194,7 @@ def run(case: TurningCase) -> Found:
 
 
 def cases(rate_deg_s: float, seeds: int, first: int = 0) -> list[TurningCase]:
-    """Cases of one rate, over all parts, profiles, compasses and beginnings in turn."""
+    """Return cases with one turn rate, alternating parts, profiles, compasses and beginnings."""
     begins: tuple[Begins, ...] = ("at the start", "after rest")
     kinds = [
         kind
@@ -214,7 +214,7 @@ deg/s  compass       stands  looks   way, %       %   sigmas  sigmas  deg/h"""
 
 
 def section(stands: int, seed: int, jobs: int) -> Section:
-    """Make the table by rate, with and without a compass."""
+    """Make the table by turn rate, with and without a compass."""
     work = [(case,) for rate in RATES_DEG_S for case in cases(rate, stands, 1_000_000 * (seed - 1))]
     rows: dict[tuple[float, bool], list[Found]] = {}
     for (case,), one in zip(work, many(run, work, jobs), strict=True):

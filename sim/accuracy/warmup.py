@@ -36,21 +36,21 @@ from sim.thermal import warming
 NEXT_MINUTE_S: Final = 60.0
 WARMING: Final = ("adis16405", "icm42688p", "bmi088", "vn100")
 RAMPS: Final = (0.3, 1.0, 3.0, 10.0)
-"""Rates of the gyro biases, (deg/h)/s; the accelerometers' follow from the same change of temperature."""
+"""Rates of the gyro biases in (deg/h)/s; those of the accelerometers follow from the same temperature change."""
 CURVES_S: Final = (60.0, 300.0, 1200.0)
-"""Time constants."""
+"""Time constants of the warm-up curves."""
 CURVE_K: Final = 20.0
 LATE_S: Final = (5.0, 120.0)
-"""Start of the stream after the switch-on."""
+"""Times from switch-on to the first reading."""
 ON_S: Final = (0.0, 600.0, 3600.0)
-"""Time since the switch-on of a part at a steady temperature."""
+"""Times since switch-on for a part at constant temperature."""
 VN100: Final = (allan_model(8.9 * DEG_H, 5.0 * DEG_H), allan_model(99.0 * UG, 40.0 * UG))
-"""Profile by the data sheet; the catalogue has none."""
+"""Noise profile from VectorNav's data sheet; the catalogue has none for this IMU."""
 
 
 @dataclass(frozen=True, slots=True)
 class WarmupCase:
-    """A temperature history, and the knowledge of it."""
+    """A temperature history; `thermometer`: the IMU has a thermometer."""
 
     thermometer: bool
     ramp_deg_h_s: float = 0.0
@@ -60,11 +60,11 @@ class WarmupCase:
 
     @property
     def is_steady(self) -> bool:
-        """Neither warms nor cools."""
+        """True: the temperature is constant."""
         return not self.ramp_deg_h_s and not self.curve_s
 
     def temperature(self, per_kelvin_rad_s: float) -> Callable[[float], float]:
-        """Temperature by aircraft time."""
+        """Return a function of aircraft time that gives the temperature."""
         if self.curve_s:
             curve = warming(STEADY_DEGC - CURVE_K, STEADY_DEGC, self.curve_s)
             return lambda t_s: curve(t_s + self.late_s)
@@ -83,7 +83,7 @@ def cases() -> tuple[WarmupCase, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WarmRun:
-    """Errors against the mean bias of the next minute, sigma_use, and the warm-up's part of it; (spans, 6)."""
+    """Errors against the mean bias of the next minute, sigma_use, and its share from the warm-up; (spans, 6)."""
 
     error: Array
     sigma: Array
@@ -121,7 +121,7 @@ def warm(part: str, case: WarmupCase, seed: int, number: int) -> WarmRun:
 
 
 def _windows(standing: Stand, taken: ImuInput, times: Array, rows: Array, *, thermometer: bool) -> list[Window | None]:
-    """Windows of each span; None from the first refusal on: a stretch that drifts too fast is not still."""
+    """Return the windows after each span; None from the first refusal on: too fast a drift looks like motion."""
     for count in range(len(SPANS_S), 0, -1):
         spans = SPANS_S[:count]
         until = times < 1.0 + spans[-1]
@@ -192,7 +192,7 @@ def section(runs: list[WarmRun], each: int) -> Section:
 
 
 def _rows() -> list[tuple[str, list[WarmupCase]]]:
-    """Words and cases of every line, with and without a thermometer."""
+    """Return title and cases of each table row, with and without a thermometer."""
     every = cases()
     rows = [
         (f"steady, {words}", [case for case in every if case.is_steady and case.on_s == on_s])

@@ -1,1 +1,1 @@
-"""The parts of the ArduPilot double: channels, parameters, inertial path, messages, calibrations, faults."""
+"""Parts of the ArduPilot double: channels, parameters, inertial path, messages, calibrations, faults."""

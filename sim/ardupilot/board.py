@@ -1,4 +1,4 @@
-"""The base of ArduPilot's parts: sensors, estimator, parameters, and texts."""
+"""Base class of the ArduPilot double: sensors, estimator, parameters and texts."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ LOOP_RATE_HZ = {"copter": 400.0, "plane": 50.0}
 
 
 class YawSource(Protocol):
-    """An external attitude estimate, as the messages show it."""
+    """An external attitude estimate, as the messages need it."""
 
     @property
     def selected(self) -> bool:
-        """Heading comes from it."""
+        """True: the estimator takes its heading from this source."""
 
     @property
     def aligned(self) -> bool:
-        """The filter has accepted a heading from it."""
+        """True: the filter has accepted a heading from this source."""
 
     def choose(self, source_set: int) -> None:
-        """Select another set of sources, 1 to 3."""
+        """Select a set of sources, 1 to 3."""
 
 
 class ArduPilotBoard(AutopilotDouble):
-    """An autopilot without its servers.
+    """An ArduPilot without its servers for parameters and commands.
 
     Args:
         aircraft: the truth.
@@ -45,9 +45,9 @@ class ArduPilotBoard(AutopilotDouble):
         version: "4.3" to "4.8"; `sim.ardupilot.parameters` has the differences.
         vehicle: "copter" (loop 400 Hz) or "plane" (50 Hz: nothing above 40 Hz).
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
-        up_s: time since its boot at the beginning of the simulation.
+        up_s: time since the autopilot's boot at the beginning of the simulation.
         auxiliary: the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
-        script: companion_arming.lua runs on it; modelled are only its IMU readings in floats.
+        script: companion_arming.lua runs on the autopilot; only the script's IMU readings in floats are modelled.
     """
 
     external_nav: YawSource
@@ -82,7 +82,7 @@ class ArduPilotBoard(AutopilotDouble):
         self.parameters = self._new_store(parameters or {}, auxiliary=auxiliary)
         self.estimator = CoarseEstimator()
         self.airspeed_m_s = 0.0
-        """Airspeed in VFR_HUD."""
+        """Airspeed in the message VFR_HUD."""
         self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]
         self.calibrations = Calibrations(self._paths, self.parameters, self.random)
         self._frozen: dict[int, Array] = {}
@@ -102,16 +102,16 @@ class ArduPilotBoard(AutopilotDouble):
 
     @property
     def has_highres_imu(self) -> bool:
-        """4.6 and later, on boards with more than 1 MB of flash."""
+        """True if the firmware has HIGHRES_IMU: version 4.6 or later, on boards with more than 1 MB of flash."""
         return since(self.version, "4.6") and not self.faults.int_only
 
     @property
     def fastest_interval_ms(self) -> int:
-        """Whole milliseconds of 1.25 loop periods."""
+        """Shortest interval of a stream: 1.25 loop periods, in whole milliseconds."""
         return int(1.25 * 1000.0 / LOOP_RATE_HZ[self.vehicle])
 
     def imu_output(self, index: int, loop_s: float) -> Array:
-        """Filtered rates and specific forces (6) of IMU index 0..2 in vehicle FRD."""
+        """Return filtered rates and specific forces (6) of IMU index 0..2 in vehicle FRD."""
         if self.faults.frozen_imu and index in self._frozen:
             return self._frozen[index]
         output = self._paths[index].output(self.aircraft.time_at(loop_s), armed=self.armed)
@@ -119,17 +119,17 @@ class ArduPilotBoard(AutopilotDouble):
         return output
 
     def update_estimator(self, loop_s: float) -> None:
-        """Bring the estimator to this time; call it before anything changes the output."""
+        """Advance the estimator to this time; call it before anything changes the output."""
         error = self.residual(1, loop_s)
         self.estimator.update(self.aircraft.time_at(loop_s), error.gyro_rad_s, error.accel_m_s2)
 
     def answer_delay_s(self) -> float:
-        """Time to a PARAM_VALUE: 2 to 6 ms, on Plane 17 to 23 ms."""
+        """Return the delay of a PARAM_VALUE: 2 to 6 ms, on Plane 17 to 23 ms."""
         low, high = (0.002, 0.006) if self.vehicle == "copter" else (0.017, 0.023)
         return float(self.random.uniform(low, high))
 
     def read_delay_s(self) -> float:
-        """Time to the answer to a read, which waits for the next turn of a slow thread: 5 to 95 ms."""
+        """Return the delay of the answer to a parameter read, which waits for a slow thread: 5 to 95 ms."""
         return float(self.random.uniform(0.005, 0.095))
 
     @abc.abstractmethod
@@ -157,14 +157,14 @@ class ArduPilotBoard(AutopilotDouble):
 
 
 MAX_INTERVALS = 10
-"""Different intervals per port, beside the heartbeat's; a further one gets the nearest of these."""
+"""Number of different stream intervals per port, besides the heartbeat's; a further stream gets the nearest of them."""
 
 
 class ArduPilotChannel(Channel):
-    """A port: ten intervals, and a quarter of the rate while parameters are listed."""
+    """A port: ten intervals, and a quarter of the stream rates during a parameter list."""
 
     def set_stream(self, message_id: int, interval_s: float | None, now_s: float) -> None:
-        """Start, change or (None) stop a stream; an interval beyond the ten kept becomes the nearest of them."""
+        """Start, change or (None) stop a stream; after ten different intervals, a stream gets the nearest of these."""
         if interval_s is None:
             self.streams.pop(message_id, None)
             return
@@ -176,7 +176,7 @@ class ArduPilotChannel(Channel):
         self.streams[message_id] = Stream(interval_s, now_s + interval_s)
 
     def due(self, now_s: float) -> list[int]:
-        """Message ids that are due; a stream that fell behind skips, it never bursts."""
+        """Return the ids of messages that are due; a stream that is late skips messages and never sends a burst."""
         due = []
         for message_id, stream in self.streams.items():
             if stream.next_s <= now_s + 1e-9:

@@ -1,4 +1,4 @@
-"""The commands the double understands, with ArduPilot's results; all others are UNSUPPORTED."""
+"""Commands that the double handles, with ArduPilot's results; it answers all others with UNSUPPORTED."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
 )
 ACK_DELAY_S = 0.003
 REBOOT_DELAY_S = 0.7
-"""Time from the acknowledgement to the restart; until then it runs normally."""
+"""Delay from the acknowledgement of a reboot command to the restart; until then the autopilot runs normally."""
 _FORCE_ARM: dict[float, Version] = {2989.0: "4.3", 21196.0: "4.6"}
-"""Magic numbers that force arming, and their first version."""
+"""Magic numbers that force arming, each with the first firmware version that accepts it."""
 
 
 class CommandServer:
-    """Carries out commands; a handler returns the result, or None when the acknowledgement comes later."""
+    """Carries out commands; a handler returns the result, or None if the acknowledgement comes later."""
 
     def __init__(self, double: ArduPilotBoard) -> None:
         self._double = double
@@ -43,7 +43,7 @@ class CommandServer:
         }
 
     def handle(self, command: Command) -> None:
-        """Carry out a command, and acknowledge."""
+        """Carry out a command and acknowledge it."""
         handler = self._handlers.get(command.number)
         result = UNSUPPORTED if handler is None else handler(command)
         if result is not None:

@@ -29,14 +29,14 @@ FLOATS_ASKED_S = 3.0
 
 
 class ArduPilotDouble(ArduPilotBoard):
-    """An autopilot with up to three IMUs on a virtual aircraft.
+    """An ArduPilot with up to three IMUs on a virtual aircraft.
 
-    It is an `End` (attach, receive) for the companion; `ground` is a second one for a ground station. `run` sends due
+    It is an `End` (attach, receive) for the companion; `ground` is a second `End` for a ground station. `run` sends due
     messages; answers need only the running loop. Time is the loop's clock.
 
     Not modelled: flight, notches, missions, learning of temperature calibrations (INS_TCALn_ENABLE = 2), calibration of
     accelerometers and of the level, the 10 s that consistency checks must pass before arming. Nor the messages
-    LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, ODOMETRY, SETUP_SIGNING (`require_signatures` stands for it).
+    LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, ODOMETRY, SETUP_SIGNING (`require_signatures` replaces it).
 
     Arguments are those of `ArduPilotBoard`.
     """
@@ -56,7 +56,7 @@ class ArduPilotDouble(ArduPilotBoard):
         return self.parameters.values[name]
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a value silently, as if it had always been so."""
+        """Set a parameter value without an announcement, as if it had always been so."""
         self.parameters.set(name, value)
 
     def write_as_another_station(self, name: str, value: float) -> None:
@@ -101,7 +101,7 @@ class ArduPilotDouble(ArduPilotBoard):
     # What its parts use.
 
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
-        """Roll, pitch, yaw of ATTITUDE: truth, the estimator's tilt error, less AHRS_TRIM; yaw in (-pi, pi]."""
+        """Return roll, pitch, yaw of ATTITUDE: truth, estimator's tilt error, less AHRS_TRIM; yaw in (-pi, pi]."""
         self.update_estimator(loop_s)
         roll, pitch, yaw = self.aircraft.angles_rad(self.aircraft.time_at(loop_s))
         roll_error, pitch_error = map(float, self.estimator.tilt_error_rad)
@@ -116,7 +116,7 @@ class ArduPilotDouble(ArduPilotBoard):
     # The inside.
 
     def build(self, message_id: int, loop_s: float) -> Message | None:
-        """Build a message of `BUILDERS`, or the script's floats; None while the script may not send."""
+        """Build a message of `BUILDERS`, or the script's floats; None: the script is not allowed to send."""
         if message_id != FLOATS:
             return BUILDERS[message_id](self, loop_s)
         return script_floats(self, loop_s) if loop_s < self._floats_until_s and not self.armed else None
@@ -139,7 +139,7 @@ class ArduPilotDouble(ArduPilotBoard):
         self._start_heartbeats(loop_s)
 
     def _choose_yaw_source(self, loop_s: float) -> None:
-        """Handle a boot: without a compass the estimated heading begins at north."""
+        """Handle a boot; without a compass, the estimated heading starts at north."""
         self.external_nav.restart()
         self.estimator.compass = not self.external_nav.selected
         if self.external_nav.selected:
@@ -147,7 +147,7 @@ class ArduPilotDouble(ArduPilotBoard):
             self.estimator.yaw_error_rad = -yaw
 
     def _boot_gyros(self, t_s: float) -> None:
-        """INS_GYR_CAL = 1: every boot measures the gyro offsets anew and drops the stored ones."""
+        """Measure the gyro offsets at a boot if INS_GYR_CAL = 1, in place of the stored offsets."""
         self.calibrations.gyros_ok = True
         if self.parameters.values["INS_GYR_CAL"] == 1:
             self.calibrations.gyros(t_s)
@@ -187,8 +187,8 @@ class ArduPilotDouble(ArduPilotBoard):
 class Router:
     """Learns routes from every message, and keeps them until a reboot.
 
-    The autopilot itself executes a message to a component of its system that was heard on the sender's own port only,
-    or never (autopilots 5.4, rule 1e).
+    Some messages address a component of the autopilot's system that was heard on the sender's port only, or never.
+    The autopilot executes these itself (autopilots 5.4, rule 1e).
     """
 
     def __init__(self, system_id: int, channels: Sequence[Channel]) -> None:
@@ -200,7 +200,7 @@ class Router:
         self._routes.clear()
 
     def route(self, came_by: Channel, message: Message) -> bool:
-        """Learn, forward, and return whether the autopilot handles the message itself."""
+        """Learn the sender's route and forward the message; return True if the autopilot itself handles the message."""
         here = self._channels.index(came_by)
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self._system_id, 1):

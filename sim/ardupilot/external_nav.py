@@ -1,4 +1,4 @@
-"""External attitude in the double: VisOdom accepts it, EKF3 uses its yaw if a source set selects it.
+"""External attitude in the double: VisOdom accepts the attitude, EKF3 uses its yaw if a source set selects that.
 
 Facts: ArduPilot `GCS_Common.cpp`, `AP_VisualOdom_MAV.cpp`, `AP_NavEKF3_Measurements.cpp` (writeExtNavData),
 `AP_NavEKF3_MagFusion.cpp` (2026-03). VISO_TYPE and EK3_SRCn_YAW count as they were at the boot. Not modelled: position
@@ -19,24 +19,24 @@ EXTNAV = 6
 LEAST_SPACING_MS = 20
 HEALTHY_S = 0.3
 YAW_NOISE_RAD = 0.2
-"""VISO_YAW_M_NSE's default: the smallest accepted sigma; above 1.5 rad it is cut."""
+"""Smallest sigma accepted for the yaw (default of VISO_YAW_M_NSE); a sigma above 1.5 rad is limited to that."""
 GATE_SIGMAS = 3.0
-"""EK3_YAW_I_GATE."""
+"""Gate of the yaw innovation in sigmas (EK3_YAW_I_GATE)."""
 FUSED_S = 2.0
-"""Time constant of the heading: about that of the real one at 30 Hz and this noise."""
+"""Time constant with which the heading follows the external yaw; about as in EKF3 at 30 Hz and this noise."""
 
 
 class ExternalNav:
-    """The chain from message to heading; `restart` at each boot."""
+    """Processes external attitude, from the message to the heading; call `restart` at each boot."""
 
     def __init__(self, double: ArduPilotBoard) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
-        """Rejected messages by reason."""
+        """Number of rejected messages by reason."""
         self.consumed = 0
-        """Messages that reached the EKF."""
+        """Number of messages that reached the EKF."""
         self.sigma_rad = math.nan
-        """Sigma of the yaw last used by the EKF."""
+        """Sigma of the last yaw that the EKF has used."""
         self.restart()
 
     def restart(self) -> None:
@@ -50,7 +50,7 @@ class ExternalNav:
         self._heard_s = self._fused_s = -math.inf
 
     def choose(self, source_set: int) -> None:
-        """Select the sources of a set: the heading is reset to the new source's next value."""
+        """Select a set of sources; the heading is reset to the next value of the new source."""
         double = self._double
         self.source_set = source_set
         self.selected = self._sources[source_set] == EXTNAV
@@ -61,7 +61,7 @@ class ExternalNav:
             self.aligned = True
 
     def healthy(self, loop_s: float) -> bool:
-        """Return the result of the check before arming."""
+        """Return True if the check before arming accepts the external attitude."""
         return loop_s - self._heard_s < HEALTHY_S
 
     def take(self, message: mavlink.MAVLink_vision_position_estimate_message, loop_s: float) -> None:

@@ -3,10 +3,10 @@
     gyro_body  = R_b (raw - warm - GYROFFS)
     accel_body = R_b diag(ACCSCAL) (raw - warm - ACCOFFS)
 
-where `warm` is what the temperature calibration takes off (autopilots 10.1),
-then a second-order low-pass. Telemetry shows samples of the filtered value, not means; their noise is therefore that of
-the filter's output (N^2 times 44 Hz at 20 Hz cut-off), whatever the message rate, and correlated over some 20 ms. The
-filter is carried forward exactly between messages, so the mean over a long time has the variance N^2/T.
+where `warm` is the correction by the temperature calibration (autopilots 10.1), then a second-order low-pass. Telemetry
+shows samples of the filtered value, not means; their noise is therefore the noise of the filter's output (N^2 times 44
+Hz at 20 Hz cut-off), whatever the message rate, and correlated over some 20 ms. The filter is carried forward exactly
+between messages, so the mean over a long time has the variance N^2/T.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sim.firmware.numbers import rotation_matrix
 from sim.imu_model import ImuModel
 
 RAW_RATE_HZ = 1000.0
-"""Rate of the sensor's own samples; their rounding adds white noise."""
+"""Rate of the sensor's own samples, whose rounding adds white noise."""
 ORIENTATION_PERIOD_S = 1.0
 _MOVING_STEP_S = 0.0025
 _TCAL_REFERENCE_DEGC = 35.0
@@ -38,7 +38,7 @@ _DAMPING = math.sqrt(0.5)
 
 
 def orientation_matrix(store: ArduPilotParameters) -> Array:
-    """Board to vehicle for AHRS_ORIENTATION, 101 and 102 custom; unknown numbers mean no rotation."""
+    """Return the rotation from board to vehicle for AHRS_ORIENTATION (101, 102: custom); unknown numbers: none."""
     number = int(store.effective["AHRS_ORIENTATION"])
     if number in (101, 102):
         if not store.effective["CUST_ROT_ENABLE"]:
@@ -49,7 +49,7 @@ def orientation_matrix(store: ArduPilotParameters) -> Array:
 
 
 class InertialPath:
-    """Output of one IMU of the autopilot. Times are aircraft time and must not go back between `reset`s."""
+    """Output of one autopilot IMU. Times are aircraft time, and must not decrease between calls of `reset`."""
 
     def __init__(self, model: ImuModel, instance: int, store: ArduPilotParameters, *, seed: int) -> None:
         self.model, self.instance = model, instance
@@ -70,16 +70,16 @@ class InertialPath:
         self._board_checked_s = -math.inf
 
     def reset(self) -> None:
-        """Handle a boot: the filter starts anew."""
+        """Handle a boot: the filter starts again."""
         self._time_s = None
         self._board_checked_s = -math.inf
 
     def corrected(self, t_s: float, *, armed: bool = False) -> Array:
-        """Output without noise and filter (6): rates and specific forces in vehicle FRD."""
+        """Return the output without noise and filter (6): rates and specific forces in vehicle FRD."""
         return self._correct(self.model.expected(t_s), t_s, armed=armed)
 
     def output(self, t_s: float, *, armed: bool = False) -> Array:
-        """Filtered reading at this time (6), in vehicle FRD by the orientation that is set."""
+        """Return the filtered reading at this time (6), in vehicle FRD by the configured orientation."""
         if self._time_s is None:
             self._start(t_s)
         assert self._time_s is not None
@@ -112,7 +112,7 @@ class InertialPath:
         return max(self._store.effective["INS_GYRO_FILTER"], 1.0)
 
     def _correct(self, raw: Array, t_s: float, *, armed: bool) -> Array:
-        """Apply the parameters and the temperature of this time to readings (6) or (n, 6)."""
+        """Apply the parameters and the temperature at this time to readings (6) or (n, 6)."""
         store = self._store
         if self._revision != store.revision:
             self._revision = store.revision
@@ -128,7 +128,7 @@ class InertialPath:
         return result
 
     def _warm(self, t_s: float) -> Array:
-        """Correction by INS_TCALn_*, (6): zero at CALTEMP, and level beyond TMIN and TMAX."""
+        """Return the INS_TCALn_* correction (6): zero at CALTEMP, constant beyond TMIN and TMAX."""
         if self._tcal is None:
             return np.zeros(6)
         low, high, coefficients, caltemps = self._tcal
@@ -137,7 +137,7 @@ class InertialPath:
         return np.asarray(sum(each * (now**order - then**order) for order, each in enumerate(coefficients, start=1)))
 
     def _read_tcal(self) -> tuple[float, float, list[Array], Array] | None:
-        """TMIN, TMAX, by order the coefficients of the six axes, and their CALTEMPs; None: not enabled."""
+        """Return TMIN, TMAX, the coefficients of the six axes by order, and the CALTEMPs; None: not enabled."""
         values, number = self._store.effective, self.instance
         if values[tcal_name(number, "ENABLE")] != 1:
             return None
@@ -147,7 +147,7 @@ class InertialPath:
         return values[tcal_name(number, "TMIN")], values[tcal_name(number, "TMAX")], coefficients, caltemps
 
     def _advance(self, targets: Array, step_s: float) -> None:
-        """Let the filter follow targets (n, 6), each for a step."""
+        """Let the filter follow targets (n, 6), each of them for `step_s`."""
         key = (round(step_s, 6), self._cutoff_hz())
         transition, root = self._kernel(key)
         if key != self._noise_key:
@@ -162,7 +162,7 @@ class InertialPath:
         return list((root @ self._random.standard_normal((count, 2, 6))) * self._density)
 
     def _kernel(self, key: tuple[float, float]) -> tuple[Array, Array]:
-        """Transition matrix, and square root of the covariance that unit white noise adds, over a span."""
+        """Return transition matrix, and square root of the covariance that unit white noise adds, over a time span."""
         found = self._kernels.get(key)
         if found is None:
             omega = 2.0 * math.pi * key[1]
@@ -187,28 +187,28 @@ AVERAGED_S = 0.5
 
 @dataclass(slots=True)
 class Calibrations:
-    """Works on the parameters of all IMUs at once. Offsets are in board axes, before scale and orientation."""
+    """Calibrates all IMUs at once. Offsets are in board axes, before scale and orientation."""
 
     paths: list[InertialPath]
     store: ArduPilotParameters
     random: np.random.Generator
     gyros_ok: bool = True
-    """The last gyro calibration converged; if not, it does not arm."""
+    """True: the last gyro calibration converged; False prevents arming."""
 
     def _mean(self, path: InertialPath, t_s: float) -> Array:
-        """Mean of the sensor over the averaging time that ends now, with its white noise."""
+        """Return the sensor's mean, with white noise, over the averaging time that ends now."""
         times = np.linspace(t_s - AVERAGED_S, t_s, 21)[1:]
         mean: Array = path.model.expected_block(times).mean(axis=0)
         return mean + self.random.standard_normal(6) * (path.model.white / math.sqrt(AVERAGED_S))
 
     def clear_gyros(self) -> None:
-        """Start a gyro calibration: readings are zero meanwhile."""
+        """Start a gyro calibration, during which the readings are zero."""
         for path in self.paths:
             for name in offset_names(path.instance, "gyro"):
                 self.store.set(name, 0.0)
 
     def gyros(self, t_s: float, *, converged: bool = True) -> tuple[str, ...]:
-        """Make the mean rate the offset, Earth's rotation included; return the saved names.
+        """Store the mean rate, Earth's rotation included, as gyro offset; return the names of the saved parameters.
 
         Offsets are saved without success too; only the temperature is then not noted. Instances without a gyro are
         zeroed.

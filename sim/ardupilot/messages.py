@@ -26,7 +26,7 @@ Builder = Callable[["ArduPilotBoard", float], Message]
 
 
 def heartbeat(double: ArduPilotBoard, loop_s: float) -> Message:
-    """HEARTBEAT; a calibration does not show in it, neither on Copter nor on Plane."""
+    """Build HEARTBEAT, which shows no calibration, neither on Copter nor on Plane."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     if double.armed:
         base |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
@@ -36,7 +36,7 @@ def heartbeat(double: ArduPilotBoard, loop_s: float) -> Message:
 
 
 def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
-    """HIGHRES_IMU: floats of the first IMU; the temperature is the barometer's, the magnetic unit is wrong by 10^6."""
+    """Build HIGHRES_IMU: floats of the first IMU, the barometer's temperature; the magnetic unit is wrong by 10^6."""
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
     mx, my, mz = (magnetic_body(double, t_s) * 1000.0).tolist()
@@ -48,7 +48,7 @@ def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
 
 
 def _integers(double: ArduPilotBoard, index: int, loop_s: float) -> tuple[int, ...]:
-    """xacc..zgyro of RAW and SCALED messages (mG, mrad/s), magnetic field in milligauss, temperature in 0.01 degC."""
+    """Return xacc to zgyro of RAW and SCALED messages (mG, mrad/s), field in milligauss, temperature in 0.01 degC."""
     t_s = double.aircraft.time_at(loop_s)
     mx, my, mz = (truncated_16(float(value)) for value in magnetic_body(double, t_s))
     if index >= len(double.imus):
@@ -58,7 +58,7 @@ def _integers(double: ArduPilotBoard, index: int, loop_s: float) -> tuple[int, .
 
 
 def raw_imu(double: ArduPilotBoard, loop_s: float) -> Message:
-    """RAW_IMU: not raw at all, equal to SCALED_IMU."""
+    """Build RAW_IMU, which is not raw but equals SCALED_IMU."""
     ax, ay, az, gx, gy, gz, mx, my, mz, temperature = _integers(double, 0, loop_s)
     return mavlink.MAVLink_raw_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz, id=0, temperature=temperature
@@ -66,28 +66,28 @@ def raw_imu(double: ArduPilotBoard, loop_s: float) -> Message:
 
 
 def scaled_imu(double: ArduPilotBoard, loop_s: float, index: int) -> Message:
-    """SCALED_IMU, 2, 3; a missing third IMU reads zero."""
+    """Build SCALED_IMU, SCALED_IMU2 or 3; a missing third IMU reads zero."""
     return SCALED_IMU[index](double.boot_ms(loop_s), *_integers(double, index, loop_s))
 
 
 def attitude(double: ArduPilotBoard, loop_s: float) -> Message:
-    """ATTITUDE: the estimator's, in the vehicle frame, that is less AHRS_TRIM."""
+    """Build ATTITUDE from the estimator, less AHRS_TRIM: in the vehicle frame."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s)[:3] + double.estimator.omega_i
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
 
 
 def ahrs(double: ArduPilotBoard, loop_s: float) -> Message:
-    """AHRS: omegaI is minus the estimator's gyro bias."""
+    """Build AHRS; its omegaI is minus the estimator's gyro bias."""
     double.update_estimator(loop_s)
     x, y, z = map(float, double.estimator.omega_i)
     return mavlink.MAVLink_ahrs_message(x, y, z, 0.0, 0.0, 0.001, 0.002)
 
 
 def ekf_status_report(double: ArduPilotBoard, loop_s: float) -> Message:
-    """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS.
+    """Build EKF_STATUS_REPORT; without a heading, EKF3 does not use GNSS.
 
-    The ratio is of any yaw: a compass', ours, or the one it holds while it stands (seen in the real firmware).
+    Its compass ratio is for any yaw: a compass', ours, or the yaw held at rest (seen in the real firmware).
     """
     flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
     external = double.external_nav
@@ -100,14 +100,14 @@ def ekf_status_report(double: ArduPilotBoard, loop_s: float) -> Message:
 
 
 def vfr_hud(double: ArduPilotBoard, loop_s: float) -> Message:
-    """VFR_HUD: on a copter without an airspeed sensor the field has the speed over ground."""
+    """Build VFR_HUD; on a copter without an airspeed sensor, its airspeed is the ground speed."""
     _, _, yaw = double.estimated_angles_rad(loop_s)
     heading = round(np.degrees(yaw)) % 360
     return mavlink.MAVLink_vfr_hud_message(double.airspeed_m_s, 0.0, heading, 0, double.aircraft.site.height_m, 0.0)
 
 
 def autopilot_version(double: ArduPilotBoard, loop_s: float) -> Message:
-    """AUTOPILOT_VERSION: PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
+    """Build AUTOPILOT_VERSION with the capability PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -123,7 +123,7 @@ def autopilot_version(double: ArduPilotBoard, loop_s: float) -> Message:
 
 
 def script_floats(double: ArduPilotBoard, loop_s: float) -> Message:
-    """DEBUG_FLOAT_ARRAY of companion_arming.lua; one reading where the script averages four."""
+    """Build DEBUG_FLOAT_ARRAY of companion_arming.lua, from one reading; the real script averages four."""
     values = [0.0] * 58
     for index, imu in enumerate(double.imus):
         degc = imu.temperature_degc(double.aircraft.time_at(loop_s))

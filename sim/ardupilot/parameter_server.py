@@ -13,7 +13,7 @@ from sim.firmware.faults import names_match
 
 NO_INDEX = 65535
 LIST_PERIOD_S = 0.00176
-"""Time per parameter of a list: 1362 took 2.4 s on the real firmware."""
+"""Time per parameter of a list: the real firmware sent 1362 parameters in 2.4 s."""
 _CHUNK = 5
 DOES_NOT_EXIST, OUT_OF_RANGE, PERMISSION_DENIED = 1, 2, 3
 
@@ -25,7 +25,7 @@ class ArduPilotParameterServer:
         self._double = double
 
     def set(self, channel: Channel, message: mavlink.MAVLink_param_set_message, loop_s: float) -> None:
-        """Handle PARAM_SET: stored at once, armed or not; the answer goes to every port some milliseconds later."""
+        """Handle PARAM_SET: store at once, armed or not; the answer goes to every port some milliseconds later."""
         double, faults = self._double, self._double.faults
         name, value = message.param_id, message.param_value
         source = (message.get_srcSystem(), message.get_srcComponent())
@@ -69,7 +69,7 @@ class ArduPilotParameterServer:
             double.soon(double.read_delay_s(), lambda: self._send(channel, name, index))
 
     def list_all(self, channel: Channel) -> None:
-        """Handle PARAM_REQUEST_LIST: paced, with true indices; the other streams slow down meanwhile."""
+        """Handle PARAM_REQUEST_LIST: send a paced list with true indices, while the other streams slow down."""
         if channel.listing:
             return
         channel.listing = True
@@ -85,12 +85,12 @@ class ArduPilotParameterServer:
             channel.listing = False
 
     def _whose_turn(self, asker: Channel) -> Channel:
-        """Link for the error to a read: the one served when it is ready."""
+        """Return the port that receives the error to a read: at random the requester's or another one."""
         others = [channel for channel in self._double.channels if channel is not asker]
         return others[0] if others and self._double.random.integers(2) else asker
 
     def announce(self, name: str, *, wrong: bool = False) -> None:
-        """Send PARAM_VALUE on every port, index 65535, as after a write."""
+        """Send PARAM_VALUE with index 65535 on every port, as after a write."""
         self._double.soon(self._double.answer_delay_s(), lambda: self._send_everywhere(name, wrong=wrong))
 
     def _send_everywhere(self, name: str, *, wrong: bool) -> None:

@@ -1,4 +1,4 @@
-"""ArduPilot's parameters: names by release, float32 values, and the effective values.
+"""ArduPilot's parameters: names by release, float32 values, and the values in use.
 
 Releases differ for a companion (autopilots 1.1, 1.3, 2, 5.3): 4.4 brought the parameters of IMU 4 and 5; 4.6
 HIGHRES_IMU, the DENIED for a rate above the loop's and the second number that forces arming; 4.7 PARAM_ERROR, MAV_SYSID
@@ -17,11 +17,11 @@ Version = Literal["4.3", "4.4", "4.5", "4.6", "4.7", "4.8"]
 
 VERSIONS: Final[tuple[Version, ...]] = get_args(Version)
 NEWEST: Final[Version] = "4.8"
-"""Development version, as the real firmware that was run."""
+"""Development version, equal to the real firmware that was run for comparison."""
 
 
 def since(version: Version, first: Version) -> bool:
-    """Compare releases: does `version` have what `first` introduced?"""
+    """Return True if `version` is `first` or later."""
     return VERSIONS.index(version) >= VERSIONS.index(first)
 
 
@@ -34,11 +34,11 @@ _LIMITS = {INT8: (-128, 127), INT16: (-32768, 32767), INT32: (-(2**31), 2**31 - 
 AXES = ("X", "Y", "Z")
 
 EKF_SOURCES = {"POSXY": 3, "VELXY": 3, "POSZ": 1, "VELZ": 3, "YAW": 1}
-"""EK3_SRC1_*: GNSS, barometer for the height, compass; the other sets are empty."""
+"""Heading, position and velocity sources (EK3_SRC1_*): GNSS, barometric height, compass; other sets are empty."""
 
 
 def offset_names(instance: int, kind: Literal["gyro", "accel", "scale"]) -> tuple[str, str, str]:
-    """Parameter names of instance 1 to 5; the first one is irregular (there is no INS_ACC1OFFS_X), so are 4 and 5."""
+    """Return the offset names of IMU 1 to 5; those of IMU 1 (no INS_ACC1OFFS_X), 4 and 5 are irregular."""
     first = {"gyro": "INS_GYROFFS", "accel": "INS_ACCOFFS", "scale": "INS_ACCSCAL"}
     later = {"gyro": "INS_GYR{}OFFS", "accel": "INS_ACC{}OFFS", "scale": "INS_ACC{}SCAL"}
     base = first[kind] if instance == 1 else later[kind].format(instance)
@@ -54,7 +54,7 @@ def gyro_id_name(instance: int) -> str:
 
 
 def caltemp_name(instance: int, kind: Literal["GYR", "ACC"]) -> str:
-    """Name of the calibration temperature; here the first instance has its number."""
+    """Return the name of the calibration temperature; unlike other names, that of the first IMU has a number."""
     return f"INS{instance}_{kind}_CALTEMP" if instance > 3 else f"INS_{kind}{instance}_CALTEMP"
 
 
@@ -63,20 +63,20 @@ def tcal_name(instance: int, what: str) -> str:
 
 
 def tcal_names(instance: int, kind: Literal["GYR", "ACC"]) -> list[tuple[str, str, str]]:
-    """Names of the temperature coefficients, first to third order."""
+    """Return the names of the temperature coefficients, from first to third order."""
     x, y, z = AXES
     return [(base + x, base + y, base + z) for base in (f"{tcal_name(instance, kind)}{order}_" for order in (1, 2, 3))]
 
 
 class ArduPilotParameters:
-    """Values by name. `values` are the stored ones; `effective` those in use."""
+    """Parameter values by name: `values` are stored, `effective` are in use."""
 
     def __init__(self, defaults: dict[str, tuple[float, int]]) -> None:
         self._types = {name: kind for name, (_, kind) in defaults.items()}
         self.values = {name: float32(value) for name, (value, _) in defaults.items()}
         self.effective = dict(self.values)
         self.revision = 0
-        """Grows with every change of `effective`."""
+        """Counter that grows with every change of `effective`."""
         self.names = tuple(self.values)
         """Names in the order of their indices."""
 
@@ -87,7 +87,7 @@ class ArduPilotParameters:
         return self._types[name]
 
     def set(self, name: str, value: float, *, takes_effect: bool = True) -> float:
-        """Store as the firmware would (float32; integers rounded and limited); return the stored value."""
+        """Store a value as the firmware would (float32; integers rounded and limited); return the stored value."""
         kind = self._types[name]
         if kind == REAL32:
             value = float32(value)
@@ -101,7 +101,7 @@ class ArduPilotParameters:
         return value
 
     def reload(self) -> None:
-        """Handle a boot: the stored values come into use."""
+        """Handle a boot: put the stored values into use."""
         self.effective = dict(self.values)
         self.revision += 1
 
@@ -110,7 +110,7 @@ class ArduPilotParameters:
         return x, y, z
 
     def family(self, name: str) -> tuple[str, ...]:
-        """Names whose values are sent after a write: X of a vector brings Y and Z."""
+        """Return the names whose values are sent after a write: after X of a vector, Y and Z too."""
         if name.endswith("_X"):
             family = tuple(name[:-1] + axis for axis in AXES)
             if all(member in self.values for member in family):
@@ -119,10 +119,10 @@ class ArduPilotParameters:
 
 
 def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) -> dict[str, tuple[float, int]]:
-    """Parameters that a companion meets, in a fixed order, with values of a calibrated board with `imus` IMUs.
+    """Return the parameters that a companion needs, in a fixed order, for a calibrated board with `imus` IMUs.
 
-    With `auxiliary` there are names of IMU 4 and 5 too, and a gyro behind 4; not before 4.4. Offsets of 0.001 m/s^2
-    stand for "has been accelerometer-calibrated", as in ArduPilot's own simulator.
+    With `auxiliary`, from 4.4 on, there are names of IMU 4 and 5 too, and a gyro as IMU 4. Offsets of
+    0.001 m/s^2 mean "has been accelerometer-calibrated", as in ArduPilot's own simulator.
     """
     table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == NEWEST else 16, INT16)}
     old = not since(version, "4.7")
@@ -191,5 +191,5 @@ def _tcal_parameters(instance: int) -> dict[str, tuple[float, int]]:
 
 
 def device_id(instance: int) -> int:
-    """A 24-bit id such as ArduPilot makes: SPI bus, chip select, device type."""
+    """Return a 24-bit device id as ArduPilot makes it: SPI bus, chip select, device type."""
     return 0x3A0002 + (instance << 8)

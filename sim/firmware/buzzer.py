@@ -1,7 +1,7 @@
 """The buzzer of a double: PLAY_TUNE note by note, written from MAVLink's text and the firmwares.
 
-Both firmwares take QBasic's PLAY (ArduPilot MMLPlayer.cpp, PX4 lib/tunes/tunes.cpp); only the part of it is here that a
-signal needs.
+Both firmwares take QBasic's PLAY (ArduPilot MMLPlayer.cpp, PX4 lib/tunes/tunes.cpp); this module has only
+the part that signals need.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ class Played(NamedTuple):
 
 
 class Buzzer:
-    """Plays tunes. `goes_on`: behave as PX4, which continues in the new tune at the position of the interrupted one."""
+    """Plays tunes. `goes_on`: an interrupting tune starts at the position that the last tune had reached, as in PX4."""
 
     def __init__(self, *, goes_on: bool) -> None:
         self.played: list[Played] = []
         self.broken_off = 0
-        """Tunes that a later one cut short, or that began in the middle."""
+        """Number of tunes that a later tune cut short, or that began in the middle."""
         self._goes_on = goes_on
 
     def take(self, message: mavlink.MAVLink_play_tune_message, now_s: float) -> None:
@@ -63,7 +63,7 @@ class Buzzer:
 
     @property
     def heard(self) -> list[str]:
-        """Describe all tunes."""
+        """Describe all tunes that were played."""
         return [str(tune) for tune in self.played]
 
 

@@ -18,7 +18,7 @@ Message = mavlink.MAVLink_message
 
 @dataclass(slots=True)
 class Stream:
-    """One message that is sent periodically."""
+    """One message type that is sent periodically."""
 
     interval_s: float
     next_s: float
@@ -28,15 +28,15 @@ class Channel(abc.ABC):
     """An `End` for tests/support/wire.py: `attach` sets the way to send, `receive` handles bytes."""
 
     UNSIGNED: tuple[int, ...] = (mavlink.MAVLINK_MSG_ID_RADIO, mavlink.MAVLINK_MSG_ID_RADIO_STATUS)
-    """Messages that need no signature where one is required."""
+    """Messages that need no signature on a port that requires signatures."""
 
     def __init__(self, system_id: int, handle: Callable[[Channel, Message, float], None]) -> None:
         self.received: Counter[str] = Counter()
-        """Messages by name, and "bad" for invalid bytes."""
+        """Number of received messages by name; "bad" counts invalid bytes."""
         self.sent: Counter[str] = Counter()
         self.streams: dict[int, Stream] = {}
         self.listing = False
-        """A parameter list is under way."""
+        """True: a parameter list is being sent."""
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], None] | None = None
@@ -75,7 +75,7 @@ class Channel(abc.ABC):
             self._handle(self, message, t_s)
 
     def send(self, message: Message) -> None:
-        """Pack with this port's sequence number and send; does nothing while unplugged."""
+        """Pack a message with this port's sequence number and send it; do nothing while unplugged."""
         if self._transmit is None:
             return
         data = message.pack(self._codec)
@@ -90,7 +90,7 @@ class Channel(abc.ABC):
 
         Args:
             key: 32 bytes.
-            ticks: its clock, in 10 us since 2015; an autopilot without GNSS may be far behind.
+            ticks: clock of the signatures, in 10 us since 2015; without GNSS, an autopilot's clock can be far behind.
             link_id: number of this port.
         """
         signing = self._codec.signing
@@ -109,15 +109,15 @@ class Channel(abc.ABC):
 
     @abc.abstractmethod
     def due(self, now_s: float) -> list[int]:
-        """Message ids that are due."""
+        """Return the ids of messages that are due."""
 
     def next_due_s(self) -> float | None:
-        """Time of the next stream."""
+        """Return the time of the next stream message, or None."""
         return min((stream.next_s for stream in self.streams.values()), default=None)
 
 
 class Command(NamedTuple):
-    """COMMAND_LONG or COMMAND_INT, and the port for the answer."""
+    """A received COMMAND_LONG or COMMAND_INT, and the port for the answer."""
 
     channel: Channel
     number: int
@@ -140,10 +140,10 @@ def command_of(
 
 
 class Write(NamedTuple):
-    """One received PARAM_SET: the independent witness of the companion's writes and their times."""
+    """One received PARAM_SET; tests compare the companion's writes and their times with these records."""
 
     t_s: float
-    """Time by the loop's clock."""
+    """Time of receipt by the loop's clock."""
     name: str
     value: float
     armed: bool

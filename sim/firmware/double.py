@@ -1,4 +1,4 @@
-"""The outside of a double and its loop, common to every firmware."""
+"""Base class of the autopilot doubles: its ports and its loop, common to every firmware."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sim.imu_model import Bias, ImuModel
 
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 FIELD_MILLIGAUSS = (280.0, 450.0)
-"""Horizontal and vertical part of the magnetic field."""
+"""Horizontal and vertical component of the Earth's magnetic field."""
 
 
 class AutopilotDouble(abc.ABC):
@@ -31,7 +31,7 @@ class AutopilotDouble(abc.ABC):
         aircraft: the truth.
         imus: the models; the first is IMU 1.
         channels: the companion's port and the ground station's.
-        up_s: time since its boot at the beginning of the simulation.
+        up_s: time since the autopilot's boot at the beginning of the simulation.
         tunes_go_on: `goes_on` of `Buzzer`.
     """
 
@@ -54,16 +54,16 @@ class AutopilotDouble(abc.ABC):
         self.calibrating = False
         self.boots = 0
         self.writes: list[Write] = []
-        """Every received PARAM_SET, obeyed or not, in order; integers as numbers."""
+        """All received PARAM_SET in order, obeyed or not; integers are stored as numbers."""
         declination = math.radians(aircraft.site.declination_deg)
         north, down = FIELD_MILLIGAUSS
         self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
         self.channels = channels
         self._port, self.ground = channels
         self.random = np.random.default_rng([seed, 4])
-        """Random numbers for everything but sensor noise."""
+        """Random numbers for everything except sensor noise."""
         self.has_compass = False
-        """The own magnetometer works, and holds the yaw."""
+        """True: the autopilot's own magnetometer works, and determines the yaw."""
         self._up_s = up_s
         self._booted_s: float | None = None
         self._down = False
@@ -75,7 +75,7 @@ class AutopilotDouble(abc.ABC):
     # The outside: two ends, and the loop.
 
     def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Plug the companion's wire in (None: out)."""
+        """Connect the companion's wire (None: disconnect)."""
         self._port.attach(transmit)
 
     def receive(self, data: bytes, t_s: float) -> None:
@@ -83,7 +83,7 @@ class AutopilotDouble(abc.ABC):
         self._port.receive(data, t_s)
 
     def require_signatures(self, key: bytes, ticks: int = 0) -> None:
-        """Sign on both ports and accept only signed messages, as after SETUP_SIGNING."""
+        """Sign on both ports, and accept only signed messages, as after SETUP_SIGNING."""
         for number, channel in enumerate(self.channels, start=1):
             channel.require_signatures(key, ticks, number)
 
@@ -104,11 +104,11 @@ class AutopilotDouble(abc.ABC):
 
     @abc.abstractmethod
     def parameter(self, name: str) -> float:
-        """Return the stored value; KeyError for an unknown name."""
+        """Return the stored value of a parameter; KeyError for an unknown name."""
 
     @abc.abstractmethod
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a value silently, as if it had always been so."""
+        """Set a parameter value without an announcement, as if it had always been so."""
 
     @abc.abstractmethod
     def write_as_another_station(self, name: str, value: float) -> None:
@@ -116,39 +116,39 @@ class AutopilotDouble(abc.ABC):
 
     @abc.abstractmethod
     def arm(self) -> None:
-        """The pilot arms."""
+        """Arm, as a pilot would."""
 
     @abc.abstractmethod
     def disarm(self) -> None:
-        """The pilot disarms."""
+        """Disarm, as a pilot would."""
 
     @abc.abstractmethod
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
-        """Roll, pitch, yaw as in ATTITUDE."""
+        """Return roll, pitch, yaw as in ATTITUDE."""
 
     @abc.abstractmethod
     def residual(self, instance: int, loop_s: float) -> Bias:
-        """Error left in the output of IMU `instance` (1..) after its offsets and scales: output minus truth, FRD."""
+        """Return the error in the output of IMU `instance` (1..) after offsets and scales: output minus truth, FRD."""
 
     @abc.abstractmethod
     def prearm_failures(self, loop_s: float) -> list[str]:
-        """Reasons against arming, in the firmware's words without the prefix."""
+        """Return the reasons against arming, in the firmware's words without the prefix."""
 
     @abc.abstractmethod
     def build(self, message_id: int, loop_s: float) -> Message | None:
-        """Build the message of a stream; None when there is nothing to send."""
+        """Build the message of a stream; None: there is nothing to send."""
 
     @abc.abstractmethod
     def _started(self, loop_s: float) -> None:
-        """Handle the first instant on a loop: the autopilot has been up for a while."""
+        """Handle the first instant on a loop; the autopilot was already running for `up_s`."""
 
     @abc.abstractmethod
     def _restarted(self, loop_s: float) -> None:
-        """Handle a boot: forget what is not stored, set up the streams."""
+        """Handle a boot: forget everything that is not stored, and set up the streams."""
 
     @abc.abstractmethod
     def _receive_message(self, channel: Channel, message: Message, loop_s: float) -> None:
-        """Handle a message received while up."""
+        """Handle a message that was received while the autopilot was running."""
 
     # What happens to it.
 
@@ -171,7 +171,7 @@ class AutopilotDouble(abc.ABC):
         return self.boot_us(loop_s) // 1000
 
     def unix_s(self, loop_s: float) -> float:
-        """Date known to the autopilot."""
+        """Return the date that the autopilot knows."""
         return self.aircraft.unix_s + self.aircraft.time_at(loop_s)
 
     def now_s(self) -> float:
@@ -184,7 +184,7 @@ class AutopilotDouble(abc.ABC):
         loop.call_later(delay_s, lambda: action() if generation == self._generation else None)
 
     def soon(self, delay_s: float, action: Callable[[], None], *, lane: str = "") -> None:
-        """Run an action after a delay, in order with the others of its lane, such as answers on a port."""
+        """Run an action after a delay, in order with other actions of the same lane, such as answers on a port."""
         now_s = self.now_s()
         at_s = max(now_s + delay_s, self._lanes.get(lane, 0.0) + 1e-6)
         self._lanes[lane] = at_s
@@ -201,7 +201,7 @@ class AutopilotDouble(abc.ABC):
             asyncio.get_running_loop().call_soon(self._tick)
 
     def after_write(self) -> bool:
-        """Count down the faults that wait for a write; True if this one rebooted the autopilot."""
+        """Count down the faults that wait for a write; return True if this write has rebooted the autopilot."""
         faults = self.faults
         if faults.foreign_write_after is not None:
             count, name, value = faults.foreign_write_after
@@ -258,7 +258,7 @@ class AutopilotDouble(abc.ABC):
             self._timer = loop.call_at(min(due), self._tick)
 
     def _holds_back(self, message_id: int) -> bool:
-        """Return True where a fault suppresses this stream."""
+        """Return True if a fault suppresses this stream."""
         return self.faults.heartbeat_off if message_id == HEARTBEAT else self.faults.telemetry_off
 
     def _send_due(self, loop_s: float) -> None:

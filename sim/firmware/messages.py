@@ -19,28 +19,28 @@ SCALED_IMU = (
     mavlink.MAVLink_scaled_imu2_message,
     mavlink.MAVLink_scaled_imu3_message,
 )
-"""Message classes by number of the IMU."""
+"""Message classes, by number of the IMU."""
 
 
 def in_integers(output: Array) -> list[int]:
-    """The fields xacc to zgyro of rates and specific forces (6): mG and mrad/s, cut toward zero."""
+    """Return the fields xacc to zgyro for rates and specific forces (6): mG and mrad/s, cut toward zero."""
     milli_g = output[3:] * (1000.0 / STANDARD_GRAVITY_M_S2)
     return [truncated_16(float(value)) for value in (*milli_g, *output[:3] * 1000.0)]
 
 
 def pressure_hpa(height_m: float) -> float:
-    """Static pressure of the standard atmosphere."""
+    """Return the static pressure of the standard atmosphere."""
     return float(1013.25 * (1.0 - height_m / 44330.8) ** 5.25588)
 
 
 def magnetic_body(double: AutopilotDouble, t_s: float) -> Array:
-    """Magnetic field in body axes, milligauss."""
+    """Return the magnetic field in body axes, in milligauss."""
     result: Array = double.aircraft.body_from_ned(t_s) @ double.field_ned
     return result
 
 
 def system_time(double: AutopilotDouble, loop_s: float) -> Message:
-    """SYSTEM_TIME; GNSS supplies the date."""
+    """Build SYSTEM_TIME; GNSS supplies the date."""
     return mavlink.MAVLink_system_time_message(int(double.unix_s(loop_s) * 1e6), double.boot_ms(loop_s))
 
 
@@ -55,7 +55,7 @@ def global_position_int(double: AutopilotDouble, loop_s: float) -> Message:
 
 
 def gps_raw_int(double: AutopilotDouble, loop_s: float) -> Message:
-    """GPS_RAW_INT: a 3D fix."""
+    """Build GPS_RAW_INT with a 3D fix."""
     site = double.aircraft.site
     return mavlink.MAVLink_gps_raw_int_message(
         double.boot_us(loop_s), 3, round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
@@ -64,7 +64,7 @@ def gps_raw_int(double: AutopilotDouble, loop_s: float) -> Message:
 
 
 def sys_status(double: AutopilotDouble, loop_s: float) -> Message:
-    """SYS_STATUS, with the health bit of the checks before arming."""
+    """Build SYS_STATUS, with the health bit of the checks before arming."""
     sensors = (
         mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
         | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL

@@ -26,7 +26,7 @@ _NOT_IN_MAVLINK = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0
 
 
 def rotation_matrix(number: int) -> Array:
-    """Board to vehicle for a MAV_SENSOR_ORIENTATION below 100; unknown numbers mean no rotation."""
+    """Return the rotation from board to vehicle for a MAV_SENSOR_ORIENTATION below 100; unknown number: none."""
     if number in _NOT_IN_MAVLINK:
         return mounting_matrix(*_NOT_IN_MAVLINK[number])
     entry = mavlink.enums["MAV_SENSOR_ORIENTATION"].get(number)

@@ -1,6 +1,6 @@
-"""Simulated aircraft of a fleet: each is a client of the broker that keeps its items until they are confirmed.
+"""Simulated aircraft of a fleet: each is a client of the broker, and keeps its items until they are confirmed.
 
-There is no daemon and no calibration in them: records are made from known biases, drawn from a seed.
+They contain no daemon and no calibration: records are made from known biases, drawn from a seed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 
 WINDOW: Final = 8
-"""Most unconfirmed items at a time."""
+"""Maximum number of unconfirmed items at a time."""
 AGAIN_S: Final = 30.0
 FIRST_WAIT_S: Final = 0.2
 _NAMES: Final = ("Heron", "Crane", "Kite", "Swift", "Tern", "Stork", "Plover", "Wren", "Gannet", "Osprey")
@@ -34,7 +34,7 @@ _LEAVES: Final = (aiomqtt.MqttError, OSError, TimeoutError)
 class Aircraft:
     """One aircraft with two IMUs.
 
-    `told` has the payloads of its items by sequence, `biases` the true ones of its calibrations by sequence and IMU.
+    `told` has the payloads of its items by sequence number; `biases` the true biases by sequence number and IMU.
     """
 
     def __init__(self, number: int, seed: int = 1) -> None:
@@ -60,7 +60,7 @@ class Aircraft:
     # --- what happens to it
 
     def tell(self, kind: str, at: datetime.datetime, body: Any) -> int:
-        """Keep an item; return its sequence."""
+        """Store an item until it is confirmed; return its sequence number."""
         sequence = len(self.told) + 1
         item = {"format_version": FORMAT_VERSION, "aircraft": self.id, "epoch": self.epoch, "sequence": sequence}
         self.told[sequence] = msgspec.json.encode(
@@ -70,7 +70,7 @@ class Aircraft:
         return sequence
 
     def calibrate(self, at: datetime.datetime, reason: str = "", *, held_back: bool = False) -> int:
-        """Calibrate at a new power-up; `reason` makes it a failure."""
+        """Calibrate at a new power-up; with a `reason`, the calibration fails."""
         degc = self._dice.uniform(15.0, 45.0)
         true = {} if reason else {f"fc{k + 1}": self._power_up(k, degc) for k in range(2)}
         imus = tuple(self._imu(name, k, degc, *each) for k, (name, each) in enumerate(sorted(true.items())))
@@ -192,7 +192,7 @@ class Aircraft:
 
     @property
     def hello(self) -> bytes:
-        """Return the hello message: what it keeps."""
+        """Return the hello message, which describes the stored items."""
         return msgspec.json.encode(
             {
                 "format_version": FORMAT_VERSION,

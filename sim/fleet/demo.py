@@ -23,14 +23,14 @@ from sim.fleet.aircraft import Aircraft
 AIRCRAFT: Final = 30
 FLIGHTS: Final = 24
 FAULT_DEG_H: Final = 80.0
-"""Step of one gyro's bias in two of the aircraft."""
+"""Bias step of one gyro, in two of the aircraft."""
 SEED: Final = 19
 PAUSE_S: Final = 4.0
 """Time between two flights of the fleet."""
 PAGE: Final = "127.0.0.1:8291"
 _PATH: Final = "/usr/sbin:/usr/local/sbin:/usr/bin:/usr/local/bin:/opt/homebrew/sbin"
 _ENDS_WITH_US: Final = 'exec 3<&0; (read -r _ <&3; kill $$) & exec "$@" 3<&-'
-"""Shell script that runs a command and ends it when the standard input is closed, also by our own kill."""
+"""Shell script that runs a command and ends it when its standard input is closed, even if our process is killed."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -54,7 +54,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def fleet_of(number: int, now: datetime.datetime) -> list[Aircraft]:
-    """Make aircraft with a history: some silent, some never calibrated, some with a moved bias or a held-back one."""
+    """Make aircraft with a history: some silent, some never calibrated, some with a step or a quarantine of a bias."""
     found = [Aircraft(k, SEED) for k in range(number)]
     for k, each in enumerate(found):
         last = now - datetime.timedelta(days=40 * (k % 15 == 11))
@@ -112,7 +112,7 @@ async def _fly(fleet: list[Aircraft]) -> None:
 
 @contextlib.asynccontextmanager
 async def _child(log: Path, *command: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a command that ends with this block, and with this process if that is killed."""
+    """Run a command until this block ends, or until this process is killed."""
     with log.open("wb") as output:
         process = await asyncio.create_subprocess_exec(
             *("sh", "-c", _ENDS_WITH_US, "sh", *command),
@@ -130,7 +130,7 @@ async def _child(log: Path, *command: str) -> AsyncIterator[asyncio.subprocess.P
 
 
 async def _watch(process: asyncio.subprocess.Process, log: Path) -> None:
-    """Raise once a child has ended."""
+    """Raise an error when a child process has ended."""
     await process.wait()
     said = await asyncio.to_thread(log.read_text, errors="replace")
     raise RuntimeError(f"{log.stem} has ended: {said[-500:].strip()}")

@@ -1,1 +1,1 @@
-"""Flights of real firmware by its own physics; the sensors follow its truth: effects of faults on the heading."""
+"""Flights of real firmware with its own physics, whose truth our sensors follow: effects of faults on the heading."""

@@ -20,11 +20,11 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.process import LOOPBACK, BinaryError, FirmwareProcess, port_free
 
 RIDER_PORT = 9012
-"""Port on which a SITL with one slave waits for it (SIM_JSON_Master.cpp); it is fixed."""
+"""Fixed port on which a SITL with one slave waits for that slave (SIM_JSON_Master.cpp)."""
 SERVO_MAGIC = 18458
 _SILENT_S = 0.1
 AHEAD = 40
-"""Steps acknowledged in advance, so that SITL need not wait while we are busy."""
+"""Number of steps acknowledged in advance, so that SITL need not wait while we are busy."""
 COPTER_MODES = {"guided": 4, "hold": 5}
 PLANE_MODES = {"takeoff": 13, "hold": 15}
 STICKS_S = 0.2
@@ -78,7 +78,7 @@ class Rider:
         self._socket.close()
 
     async def _knock(self) -> None:
-        """Send acknowledgements: SITL waits for one before its first step, and after a loss."""
+        """Send acknowledgements: SITL waits for one before its first step, and after a lost packet."""
         loop = asyncio.get_running_loop()
         while True:
             if loop.time() - self._heard_s > _SILENT_S:
@@ -121,8 +121,8 @@ PLANE = {
     "PTCH_RATE_D": 0.007265, "PTCH_RATE_FF": 0.595723, "PTCH_RATE_I": 0.11, "PTCH_RATE_P": 0.15,
     "TKOFF_ALT": 60.0, "THR_FAILSAFE": 0.0, "SIM_WIND_T": 0.0, "SIM_WIND_T_ALT": 40.0,
 }  # fmt: skip
-"""The tuning of SITL's plane (Tools/autotest/models/plane.parm), in a wind that grows with the height from none at the
-ground: on its wheels, which have no friction, it would turn in any."""
+"""Tuning of SITL's plane (Tools/autotest/models/plane.parm). The wind grows with the height from zero at the ground:
+any wind there would turn the plane on its wheels, which have no friction."""
 COPTER = {
     "SIM_WIND_T": 1.0,
     "FRAME_CLASS": 1.0, "FRAME_TYPE": 0.0, "FS_THR_ENABLE": 0.0, "FS_GCS_ENABLE": 0.0, "MOT_THST_HOVER": 0.39,
@@ -131,7 +131,7 @@ COPTER = {
 
 
 def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str, float]:
-    """Defaults of a calibrated vehicle whose IMUs have the biases of the scenario's."""
+    """Return default parameters of a calibrated vehicle whose IMUs have the scenario's biases."""
     table = {
         "SIM_RATE_HZ": 800.0,  # twice its loop
         "SIM_WIND_SPD": wind[0],
@@ -196,11 +196,11 @@ class FlyingArduPilot(ArduPilot, FlyingVehicle):
         await asyncio.sleep(2.0 * STICKS_S)
 
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """Turn all its compasses by 45 deg from now on."""
+        """Turn all the vehicle's own compasses by 45 deg from now on."""
         await ground.put_all({f"SIM_MAG{number}_ORIENT": 1.0 for number in (1, 2, 3)})  # ROTATION_YAW_45
 
     async def hold(self, ground: GroundStation) -> None:
-        """Loiter, sticks centred; a plane circles clockwise from here (Guided)."""
+        """Hold the place in Loiter with centred sticks; a plane circles clockwise from here (Guided)."""
         if not self.is_plane:
             await self.mode(ground, "hold")
             return
@@ -219,7 +219,7 @@ class FlyingArduPilot(ArduPilot, FlyingVehicle):
         await self.until_mode(ground, "hold")
 
     async def steer(self, ground: GroundStation) -> None:
-        """Send the sticks until cancelled."""
+        """Send stick positions until cancelled."""
         while True:
             ground.send(mavlink.MAVLink_rc_channels_override_message(self.system_id, 1, *self.sticks_us, *[0] * 4))
             await asyncio.sleep(STICKS_S)

@@ -38,20 +38,20 @@ CALIBRATED_WITHIN_S = 120.0
 PUSHED_WITHIN_S = 60.0
 STARTED_S = 2.0
 STORED_S = 3.0
-"""Time in which PX4 stores written values."""
+"""Time in which PX4 saves written values."""
 RESTARTED_S = 6.0
 HEIGHT_M = 10.0
 PLANE_HEIGHT_M = 60.0
 SETTLED_S = 6.0
 PLANE_SETTLED_S = 75.0
-"""Time for a whole circle of the plane."""
+"""Time that the plane needs for a whole circle."""
 WATCHED_S = 35.0
 SLOWEST = 0.9
-"""Share of real time at which firmware and daemon still see the same world."""
+"""Smallest share of real time at which firmware and daemon still see the same world."""
 HANGS_S = 0.3
 """A stall of the firmware of this length makes a flight invalid: the daemon cannot tell it from a fault."""
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
-"""The pilot turns it about, with the fault active."""
+"""Time after the fault, and angle, at which the pilot turns the aircraft."""
 DRIFT_DEG_S = 3.0
 LIE_DEG = 40.0
 STEP_S = 0.05
@@ -86,7 +86,7 @@ class Flight:
         self._since_s = 0.0
         self._background: list[asyncio.Task[None]] = []
         self._hung_s = 0.0
-        """Longest time without news of the firmware since the watch began."""
+        """Longest time without a state from the firmware since the watch began."""
         self._stack = contextlib.AsyncExitStack()
         self.daemon: CompanionProcess
 
@@ -150,7 +150,7 @@ class Flight:
         await self.pushed()
 
     async def pushed(self) -> None:
-        """Wait until the heading is pushed, and in use again where another one was."""
+        """Wait until the heading is pushed, and until the estimator uses it again if it used another source."""
         attitude: dict[str, Any] = {}
         try:
             async with asyncio.timeout(PUSHED_WITHIN_S):
@@ -199,7 +199,7 @@ class Flight:
                 moved_s, own_s = loop.time(), truth.own_s
 
     def _take_down(self) -> None:
-        """Record what truth and ground station saw."""
+        """Record what the truth and the ground station report."""
         ground, record = self.ground, self.record
         record.truth = np.array(self.vehicle.truth.recorded)
         attitudes = [
@@ -291,7 +291,7 @@ FAULTS: dict[str, tuple[str, Strike]] = {
 
 
 def is_ours(texts: Sequence[str]) -> bool:
-    """Return False where the latest text about the source of the heading names another one."""
+    """Return False if the latest text about the heading's source names a source other than ours."""
     told = [text for text in texts if text.startswith("Heading: ")]
     return not told or told[-1].startswith("Heading: companion")
 
@@ -301,7 +301,7 @@ def _at(t_s: float, arrived: Array, own: Array) -> float:
 
 
 def events_of(ground: GroundStation, since_s: float, own: Callable[[float], float]) -> list[Event]:
-    """Changes of mode, of arming and of the source set, and texts; times by `own` from loop times."""
+    """Return the changes of mode, arming and source set, and the texts; `own` converts loop times to event times."""
     found, mode, armed = list[Event](), None, None
     for t_s, message in ground.heard:
         if t_s < since_s:

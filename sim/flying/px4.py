@@ -27,17 +27,17 @@ from sim.station import Station, open_udp
 
 MAGNETOMETER = {"cs_mag_hdg", "cs_mag_3d"}
 AUTO, LOITER = 4, 3
-"""Main mode and sub mode."""
+"""Main mode and sub mode of a PX4 that holds its place."""
 _UDP_TRUTH = 19410
 TRUTH_HZ = 250.0
 ASKED_EVERY_S = 1.0
 GUST_EVERY_S = 5.0
 """Interval of gusts. A parameter that changes while PX4 stores another one stops its simulated time."""
 GUST_SHARE = 0.1
-"""Gusts over the mean wind: this aircraft has a drag of 1 N for 1 m/s at 1 kg, ten times that of others."""
+"""Ratio of gusts to the mean wind; this aircraft has a drag of 1 N for 1 m/s at 1 kg, ten times that of others."""
 TURNED_S = 4.0
 FORCE_OVER = 25
-"""Steps between compared velocities, which are sent in whole cm/s."""
+"""Number of steps between compared velocities, which are sent in whole cm/s."""
 
 
 class GroundTruth(Station):
@@ -71,7 +71,7 @@ class GroundTruth(Station):
             )
 
     def state(self, told: mavlink.MAVLink_hil_state_quaternion_message) -> State | None:
-        """Return the next state; None for the first after a start, and for one out of order."""
+        """Return the next state; None for the first message after a start, and for a message out of order."""
         w, x, y, z = told.attitude_quaternion
         own_s, turn = told.time_usec * 1e-6, Rotation.from_quat((x, y, z, w))
         before = self._before
@@ -98,7 +98,7 @@ class GroundTruth(Station):
 
 
 def source_changes(flags: str) -> list[Event]:
-    """Parse `listener estimator_status_flags`: changes between "1", a heading that is sent, and "2"."""
+    """Parse `listener estimator_status_flags`: changes between "1", our pushed heading, and "2", the magnetometer."""
     found, source = list[Event](), ""
     for printed in flags.split("TOPIC:")[1:]:
         own_s = re.search(r"timestamp: (\d+)", printed)
@@ -164,11 +164,11 @@ class FlyingPx4(Px4, FlyingVehicle):
         await ground.wait_for(lambda: self.height_m > 0.9 * height_m, 60.0, "take-off")
 
     def mode_parameters(self, number: int) -> tuple[float, ...]:
-        """Main and sub mode."""
+        """Return main and sub mode."""
         return number >> 16 & 0xFF, number >> 24
 
     async def ask_streams(self, ground: GroundStation) -> None:
-        """Ask for the streams, and for the estimator's flags on the console: each change with its time."""
+        """Request the streams, and on the console the estimator's flags: each change with its time."""
         await super().ask_streams(ground)
         with self._flags.open("wb") as flags:
             listener = await asyncio.create_subprocess_exec(
@@ -185,15 +185,15 @@ class FlyingPx4(Px4, FlyingVehicle):
         self._stack.push_async_callback(end)
 
     def source_changes(self) -> list[Event]:
-        """Changes by the estimator's flags: "1" is the heading that is sent, "2" its magnetometer."""
+        """Return the changes by the estimator's flags: "1" is our pushed heading, "2" its magnetometer."""
         return source_changes(self._flags.read_text(errors="replace"))
 
     async def hold(self, ground: GroundStation) -> None:
-        """Do nothing: it holds by itself once it is up."""
+        """Do nothing: after take-off, this aircraft holds its place by itself."""
         await self.until_mode(ground, "hold")
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
-        """Command a clockwise turn on its spot."""
+        """Command a clockwise turn on the spot."""
         yaw_rad = math.remainder(self.truth.recorded[-1][3] + math.radians(degrees), math.tau)
         await ground.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 0.0, 0.0, yaw_rad, *[math.nan] * 3)
         await self.sleep(TURNED_S)
@@ -206,5 +206,5 @@ class FlyingPx4(Px4, FlyingVehicle):
             await asyncio.sleep(GUST_EVERY_S)
 
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """Raise: SIH's compass cannot be turned."""
+        """Raise an error: SIH's compass cannot be turned."""
         raise BinaryError("the compass of PX4's simulation cannot be turned")

@@ -28,11 +28,11 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.vehicle import FirmwareVehicle
 
 BEHIND_S = 0.015
-"""Delay of measurements: states for an instant have arrived by then."""
+"""Delay with which measurements are read: by then, the states for an instant have arrived."""
 MEAN_S = 0.005
-"""Averaging time of rates and forces: the interval of an IMU of 200 Hz."""
+"""Averaging time of rates and forces, equal to the interval of an IMU at 200 Hz."""
 _FOLLOWS = 0.02
-"""Share of a state's lateness by which the smoothed clock follows."""
+"""Share of a state's lateness by which the smoothed clock is corrected."""
 _JUMP_S = 0.5
 LATE_S = 0.1
 _SLOPE_ROWS = 4
@@ -48,7 +48,7 @@ class State(NamedTuple):
     own_s: float
     """Time by the firmware's clock."""
     quaternion: tuple[float, float, float, float]
-    """w, x, y, z; from body to NED."""
+    """Quaternion from body to NED: w, x, y, z."""
     rate_rad_s: tuple[float, float, float]
     force_m_s2: tuple[float, float, float]
     position_m: tuple[float, float, float]
@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 def angles_of_quaternion(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in rad."""
+    """Return roll, pitch, yaw in rad of a quaternion."""
     w, x, y, z = quaternion
     return (
         math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
@@ -66,18 +66,18 @@ def angles_of_quaternion(quaternion: tuple[float, float, float, float]) -> tuple
 
 
 class FlyingAircraft(VirtualAircraft):
-    """Follows the states given to `take`; until the first it stands level on its spot."""
+    """Follows the states given to `take`; before the first state, it stands level on its spot."""
 
     def __init__(self, site: Site, *, heading_deg: float = 0.0, unix_s: float) -> None:
         super().__init__(Pose(heading_deg=heading_deg), site, unix_s=unix_s)
         self._rows = np.zeros((11, _ROWS))  # a column for each state
         self._count = 0
         self.recorded: list[tuple[float, ...]] = []
-        """Every 20 ms of the firmware's clock: own_s, roll, pitch, yaw (rad, not wrapped), position (m), velocity."""
+        """States every 20 ms (firmware's clock): own_s, roll, pitch, yaw (rad, unwrapped), position (m), velocity."""
 
     @property
     def own_s(self) -> float:
-        """Firmware's clock at the latest state."""
+        """Return the firmware's clock at the latest state."""
         return float(self._rows[_OWN, self._count - 1]) if self._count else 0.0
 
     @property
@@ -85,7 +85,7 @@ class FlyingAircraft(VirtualAircraft):
         return self._count > 0
 
     def restart(self) -> None:
-        """Handle a restart of the firmware: its clock begins again."""
+        """Handle a restart of the firmware, whose clock begins again."""
         self._count = 0
         self.recorded.clear()
 
@@ -116,16 +116,16 @@ class FlyingAircraft(VirtualAircraft):
             self.recorded.append((state.own_s, roll, pitch, yaw, *state.position_m, *state.velocity_m_s))
 
     def still_at(self, t_s: float) -> bool:
-        """Return False: it may move at any time."""
+        """Return False: the aircraft can move at any time."""
         return False
 
     def _still_at(self, t_s: float) -> None:
         return None
 
     def _columns(self, t_s: Array, columns: slice) -> Array:
-        """Interpolate at aircraft times, `BEHIND_S` before them; (n, columns).
+        """Interpolate states at aircraft times, `BEHIND_S` earlier; return (n, columns).
 
-        A late state is extrapolated: without that a turn would lose it.
+        If a state is late, the last ones are extrapolated: otherwise a turn would miss it.
         """
         rows = self._rows[:, max(0, self._count - _KEPT) : self._count]
         asked, last = t_s - BEHIND_S, rows[:, -1]
@@ -179,15 +179,15 @@ async def _until_accepted(
 
 
 class FlyingVehicle(FirmwareVehicle):
-    """A firmware with physics of its own, which the scenario's aircraft follows."""
+    """A firmware with its own physics, which the scenario's aircraft follows."""
 
     sticks_us: list[int]
-    """Roll, pitch, throttle, yaw."""
+    """Stick positions in us: roll, pitch, throttle, yaw."""
     is_plane = False
     circle: tuple[float, float, float] | None = None
-    """Circle of a plane that holds, in m: north and east of the start, and the radius."""
+    """Circle of a plane that holds, in m: position north and east of the start, and radius."""
     modes: Mapping[str, int]
-    """Custom modes by purpose."""
+    """Custom mode numbers by purpose."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         super().__init__(scenario, folder)
@@ -203,31 +203,31 @@ class FlyingVehicle(FirmwareVehicle):
         return -self.truth.recorded[-1][6] if self.truth.recorded else 0.0
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """Bias set at its start."""
+        """Return the bias that the IMU had at the start."""
         return self.scenario.flight_controller_imus[instance - 1].true_bias(0.0)
 
     async def ask_streams(self, ground: GroundStation) -> None:
-        """Ask for ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
+        """Request ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
         for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
             await ground.stream(number, 25.0)
 
     async def arm(self, ground: GroundStation) -> None:
-        """Ask until it arms, with all checks."""
+        """Request arming, with all checks, until the vehicle arms."""
         await _until_accepted(ground, lambda: ground.arm(wait_s=2.0), ARM_WITHIN_S, "it does not arm")
 
     @abstractmethod
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
-        """Arm, with all its checks, and climb."""
+        """Arm with all checks, and climb."""
 
     async def mode(self, ground: GroundStation, name: str) -> None:
-        """Ask until the mode changes."""
+        """Request a flight mode until it changes."""
         words = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *self.mode_parameters(self.modes[name])
         ask = functools.partial(ground.command, mavlink.MAV_CMD_DO_SET_MODE, *words)
         await _until_accepted(ground, ask, MODE_WITHIN_S, f"no mode {name}")
         await self.until_mode(ground, name)
 
     async def until_mode(self, ground: GroundStation, name: str) -> None:
-        """Wait until it reports a mode."""
+        """Wait until the vehicle reports a mode."""
         since_s = asyncio.get_running_loop().time()
         await ground.wait_for(
             lambda: any(beat.custom_mode == self.modes[name] for beat in ground.vehicle_heartbeats(since_s)),
@@ -235,23 +235,23 @@ class FlyingVehicle(FirmwareVehicle):
         )  # fmt: skip
 
     def mode_parameters(self, number: int) -> tuple[float, ...]:
-        """Parameters of MAV_CMD_DO_SET_MODE for a custom mode."""
+        """Return the parameters of MAV_CMD_DO_SET_MODE for a custom mode."""
         return (number,)
 
     def source_changes(self) -> list[Event]:
-        """Heading sources of its estimator and their times, where it does not send them as text."""
+        """Return changes of the estimator's heading source with times, if the firmware does not send them as text."""
         return []
 
     @abstractmethod
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """Turn its own compasses by 45 deg from now on."""
+        """Turn the vehicle's own compasses by 45 deg from now on."""
 
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:
         """Hold the spot, or circle about it, until another command."""
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
-        """Turn clockwise by the yaw stick, measured by the truth; a plane turns anyway."""
+        """Turn clockwise by the yaw stick, measured by the truth; do nothing for a plane, which turns anyway."""
         if self.is_plane:
             return
         middle, begun_rad = self.sticks_us[3], self.truth.recorded[-1][3]

@@ -1,4 +1,4 @@
-"""Verdict on a flight: figures from the record of truth, estimate and events, and their limits.
+"""Verdict on a flight: figures from the record of truth, estimate and events, and the limits of these figures.
 
 Pure; times are on the firmware's clock, in seconds.
 """
@@ -18,15 +18,15 @@ from sim.earth import Array
 YAW_LIMIT_DEG = 10.0
 POSITION_LIMIT_M = 3.0
 TILT_LIMIT_DEG = 70.0
-"""A hovering aircraft beyond this tilt is falling."""
+"""Tilt limit: a hovering aircraft beyond this tilt is falling."""
 LOW_M = 1.0
-"""The flight is over below this height."""
+"""Height below which the flight counts as over."""
 BEFORE_S = 10.0
-"""Length of the reference before the fault."""
+"""Length of the interval before the fault with which the time after it is compared."""
 CIRCLE_S = 50.0
-"""Time of a plane's circle in any wind; its error varies along the circle."""
+"""Time that a plane needs for a circle in any wind; the error varies along the circle."""
 SETTLED_S = 1.0
-"""Averaging time of the estimator's place error before the fault."""
+"""Averaging time of the estimator's position error before the fault."""
 HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'other set':>13}{'off truth':>11}{'off spot':>10}  verdict"
 
 
@@ -43,18 +43,18 @@ class Record:
     fault: str
     set_up: str
     wind: tuple[float, float]
-    """Speed in m/s, and direction of origin in degrees."""
+    """Wind speed in m/s, and direction of origin in degrees."""
     truth: Array = field(default_factory=lambda: np.empty((0, 10)))
     """Rows of `FlyingAircraft.recorded`."""
     estimate: Array = field(default_factory=lambda: np.empty((0, 3)))
-    """own_s, yaw of the firmware's estimator in rad, 0."""
+    """Estimates of the firmware: own_s, yaw in rad, 0."""
     place: Array = field(default_factory=lambda: np.empty((0, 4)))
-    """own_s, and the place by the firmware's estimator: north, east, down in m."""
+    """Positions estimated by the firmware: own_s, north, east, down in m."""
     events: list[Event] = field(default_factory=list)
     struck_s: float = math.inf
     """Time of the fault."""
     circle: tuple[float, float, float] | None = None
-    """Target circle, if it does not hold its spot: north and east of the middle, and the radius, in m."""
+    """Target circle, if the aircraft does not hold its spot: centre north and east, and radius, in m."""
 
     def after(self, kind: str) -> list[Event]:
         """Return the events of a kind after the fault."""
@@ -63,7 +63,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of a flight from the fault on."""
+    """Figures of a flight, from the fault on."""
 
     yaw_deg: float
     """Largest error of the estimator's yaw."""
@@ -72,15 +72,15 @@ class Figures:
     fallback_s: float
     """Time until the other source set was in use; inf: never."""
     estimate_m: float
-    """Largest horizontal error of the estimated place, less its error before."""
+    """Largest horizontal error of the estimated position, less the error before the fault."""
     spot_m: float
     """Largest true horizontal distance from the place at the fault; on a circle: from the circle, less
     the largest distance before.
     """
     sets: int
-    """Changes of the source set."""
+    """Number of changes of the source set."""
     modes: int
-    """Changes of the flight mode that nobody asked for."""
+    """Number of changes of the flight mode that nobody requested."""
     crashed: str
     """Description of a crash; empty without one."""
 
@@ -102,7 +102,7 @@ class Figures:
 
 
 def _yaw_errors_deg(record: Record) -> tuple[Array, Array]:
-    """Times and errors of the estimator's yaw."""
+    """Return times and errors of the estimator's yaw."""
     own_s = record.estimate[:, 0]
     true = np.interp(own_s, record.truth[:, 0], record.truth[:, 3])
     return own_s, np.degrees((record.estimate[:, 1] - true + math.pi) % (2.0 * math.pi) - math.pi)

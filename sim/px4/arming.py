@@ -21,10 +21,10 @@ from sim.px4.port import PX4Port
 WATCH_S = 0.5
 REPORT_EVERY_S = 2.0
 NOT_AUTHORIZED = ""
-"""The failure that has no words of its own."""
+"""Name of the failure for which the autopilot has no text of its own."""
 _SENSORS: tuple[tuple[Kind, str], ...] = (("ACC", "Accel"), ("GYRO", "Gyro"))
 _BIAS_ALARM = 0.75
-"""Alarm threshold over the estimator's limits."""
+"""Alarm threshold of a bias, as a share of the estimator's limit."""
 
 
 class Checks:
@@ -41,7 +41,7 @@ class Checks:
         self._double.later(WATCH_S, self._watch)
 
     def failures(self, loop_s: float) -> list[str]:
-        """Failures in the firmware's words without the prefix, without the authorisation."""
+        """Return the failures in the firmware's words without the prefix; the authorisation is not included."""
         double, store = self._double, self._double.parameters
         t_s = double.aircraft.time_at(loop_s)
         found = [
@@ -67,9 +67,9 @@ class Checks:
         return found
 
     def report(self, failures: list[str], now_s: float) -> bool:
-        """Report failures that differ from the last report, if that is 2 s old; return whether it did.
+        """Report failures that differ from the last report, if that report is 2 s old; return True if reported.
 
-        The real one runs all its checks a second time for that, and in an arm request asks for authorisation again.
+        For a report, the real firmware runs all checks again; during an arm request, it requests authorisation again.
         """
         if failures == self._reported or now_s < self._reported_s + REPORT_EVERY_S:
             return False
@@ -104,12 +104,12 @@ class Request:
 
     target_system: int
     rounds: int = 0
-    """Half seconds since it was sent."""
+    """Number of half seconds since the request was sent."""
     answered: bool = False
 
 
 class ArmAuthorization:
-    """State of the authorisation for the checks before arming."""
+    """State of the arming authorisation, for the checks before arming."""
 
     def __init__(self, double: PX4Board) -> None:
         self._double = double
@@ -126,11 +126,11 @@ class ArmAuthorization:
 
     @property
     def required(self) -> bool:
-        """COM_ARM_AUTH_REQ."""
+        """True if the autopilot requires authorisation (COM_ARM_AUTH_REQ)."""
         return bool(self._double.parameters["COM_ARM_AUTH_REQ"])
 
     def check(self, verdict: Verdict) -> None:
-        """Check the authorisation: at once in the two-step method, else with the answer or time-out."""
+        """Check the authorisation: at once in the two-step method, otherwise at the answer or the timeout."""
         double, now_s = self._double, self._double.now_s()
         if self._state == "approved" and now_s > self._until_s:
             self._state = "idle"
@@ -151,7 +151,7 @@ class ArmAuthorization:
             verdict(False)  # noqa: FBT003 - the verdict's only argument
 
     def acknowledged(self, message: mavlink.MAVLink_command_ack_message) -> None:
-        """Handle a COMMAND_ACK addressed to this component or to all; every sender counts."""
+        """Handle a COMMAND_ACK addressed to this component or to all; an answer of any sender counts."""
         if message.command != REQUEST:
             return
         for request in self._open:
@@ -207,7 +207,7 @@ class ArmAuthorization:
             )
 
     def _retry(self, request: Request) -> None:
-        """Repeat every half second: the first port begins a round of repetitions, the other follows 0.5 s later."""
+        """Repeat a request every half second: the first port begins each repetition, the other follows 0.5 s later."""
         if request.answered or request.rounds > RETRIES:
             self._open.remove(request)
             return

@@ -1,4 +1,4 @@
-"""The base of PX4's parts: ports, sensors with their estimators, parameters, and texts."""
+"""Base class of the PX4 double: ports, sensors with their estimators, parameters, and texts."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Version = Literal["1.18", "1.16"]
 
 
 class Orders(Protocol):
-    """The commander, as the other parts see it."""
+    """Interface of the commander for the other parts of the double."""
 
     blocked: bool
-    """It waits for an authorisation and does nothing else."""
+    """True: the commander waits for an authorisation and does nothing else."""
 
     def receives_own_request(self, number: int) -> None:
-        """Handle a command that it sent itself."""
+        """Handle a command that the autopilot sent to itself."""
 
 
 class PX4Board(AutopilotDouble):
-    """An autopilot without its servers.
+    """A PX4 without its servers for parameters and commands.
 
     Args:
         aircraft: the truth.
@@ -42,7 +42,7 @@ class PX4Board(AutopilotDouble):
         external: numbers (0..) of IMUs that are external: they turn with CAL_x_ROT.
         imu_rate_hz: rate of the integrated samples; streams are quantised by it.
         default_streams: False: only heartbeats and TIMESYNC run by themselves (quick tests).
-        up_s: time since its boot at the beginning of the simulation.
+        up_s: time since the autopilot's boot at the beginning of the simulation.
         console: `listener` is built, which some small boards leave out.
     """
 
@@ -99,7 +99,7 @@ class PX4Board(AutopilotDouble):
             for n, model in enumerate(imus)
         ]
         self.primary_imu = 0
-        """Number of the flying IMU, which HIGHRES_IMU shows."""
+        """Number of the IMU that flies the aircraft, which HIGHRES_IMU shows."""
         self._frozen: dict[int, VehicleImuSample] = {}
 
     def residual(self, instance: int, loop_s: float) -> Bias:
@@ -109,7 +109,7 @@ class PX4Board(AutopilotDouble):
         return Bias(output[:3] - truth.rate_rad_s, output[3:] - truth.force_m_s2)
 
     def imu_output(self, index: int, loop_s: float) -> VehicleImuSample:
-        """Newest corrected sample of IMU index 0.. in vehicle FRD."""
+        """Return the newest corrected sample of IMU index 0.. in vehicle FRD."""
         if self.faults.frozen_imu and index in self._frozen:
             return self._frozen[index]
         sample = self.vehicle_imus[index].sample(self.aircraft.time_at(loop_s))
@@ -117,7 +117,7 @@ class PX4Board(AutopilotDouble):
         return sample
 
     def update_estimators(self, loop_s: float) -> None:
-        """Bring the estimators to this time; call it before anything changes the output."""
+        """Advance the estimators to this time; call it before anything changes the output."""
         t_s = self.aircraft.time_at(loop_s)
         for imu in self.vehicle_imus:
             if imu.estimator.time_s == t_s:
@@ -127,11 +127,11 @@ class PX4Board(AutopilotDouble):
 
     @abc.abstractmethod
     def parameters_changed(self, *, consumers: bool = True) -> None:
-        """Notify the users of parameters, every port, and the storage."""
+        """Notify the users of the parameters, every port, and the storage."""
 
     @abc.abstractmethod
     def say(self, severity: int, text: str) -> None:
-        """Send STATUSTEXT on every port with a ground station; elsewhere it waits for one, for 5 s."""
+        """Send STATUSTEXT on every port with a ground station; on other ports a text waits up to 5 s for one."""
 
     def _new_store(
         self,

@@ -19,11 +19,11 @@ from sim.px4.parameters import SLOTS, PX4Parameters
 Kind = Literal["GYRO", "ACC"]
 _PRIORITY, _EXTERNAL_PRIORITY = 50, 75
 THRESHOLD = 0.01
-"""rad/s or m/s^2 (and the same for scales): a vector is used only if it is farther than this from the one in use."""
+"""Smallest change of offset (rad/s, m/s^2) or scale: a new vector must be farther than this from the one in use."""
 
 
 class SensorCalibration:
-    """Correction of one triad.
+    """Correction of one triad in PX4's memory.
 
     Args:
         kind: selects the parameters.
@@ -36,14 +36,14 @@ class SensorCalibration:
         self.kind, self.device_id, self.external = kind, device_id, external
         self._store = store
         self.slot: int | None = None
-        """Slot with its device id; None: uncalibrated."""
+        """Number of the slot with this device id; None: uncalibrated."""
         self.offset = np.zeros(3)
-        """Offset in use: rad/s or m/s^2, sensor axes."""
+        """Offset in use: rad/s or m/s^2, in sensor axes."""
         self.scale = np.ones(3)
         self.rotation = np.eye(3)
-        """Sensor to vehicle."""
+        """Rotation from sensor to vehicle."""
         self.count = 0
-        """Changes of offset or scale since the last reset."""
+        """Number of changes of offset or scale since the last reset."""
         self.reset()
         self.parameters_update()
 
@@ -53,22 +53,22 @@ class SensorCalibration:
 
     @property
     def enabled(self) -> bool:
-        """CAL_x_PRIO 0 disables the sensor."""
+        """True if the sensor is enabled; CAL_x_PRIO 0 disables it."""
         return self.slot is None or self._store[f"CAL_{self.kind}{self.slot}_PRIO"] != 0
 
     def correct(self, raw: Array) -> Array:
-        """Correct a reading (3) in sensor axes and turn it into the vehicle's."""
+        """Correct a reading (3) in sensor axes, and rotate it into vehicle axes."""
         result: Array = self.rotation @ ((raw - self.offset) * self.scale)
         return result
 
     def reset(self) -> None:
-        """Reset: no slot, no offset, the board's rotation."""
+        """Reset to no slot, no offset, and the board's rotation."""
         self.slot = None
         self.offset, self.scale, self.count = np.zeros(3), np.ones(3), 0
         self._set_rotation(0 if self.external else int(self._store["SENS_BOARD_ROT"]))
 
     def parameters_update(self) -> None:
-        """Find the slot and use its values where they are far enough from those in use."""
+        """Find the slot, and use its values if they differ enough from the values in use."""
         store = self._store
         self.slot = find_slot(store, self.kind, self.device_id)
         if self.slot is None:
@@ -86,7 +86,7 @@ class SensorCalibration:
     def set_offset(self, offset: Array) -> bool:
         """Use an offset if its difference to the one in use is longer than 0.01.
 
-        A gyro without an offset uses any; an accelerometer does not: below 0.01 it never uses it.
+        A gyro without an offset uses any offset; an accelerometer never uses one below 0.01.
         """
         first = self.kind == "GYRO" and self.count == 0
         if (first or _far(self.offset, offset)) and np.isfinite(offset).all():
@@ -96,7 +96,7 @@ class SensorCalibration:
         return False
 
     def save(self, preferred_slot: int) -> bool:
-        """Write the values in use into its slot, or the preferred, or the first free one; False when all are taken."""
+        """Save the values in use to the sensor's slot, the preferred or the first free slot; False: none is free."""
         store = self._store
         slot = find_slot(store, self.kind, self.device_id)
         if slot is None:
@@ -123,7 +123,7 @@ class SensorCalibration:
 
 
 def find_slot(store: PX4Parameters, kind: Kind, device_id: int) -> int | None:
-    """Return the first slot whose CAL_x_ID is this device's."""
+    """Return the first slot whose CAL_x_ID is this device's id."""
     return next((slot for slot in range(SLOTS) if store[f"CAL_{kind}{slot}_ID"] == device_id), None)
 
 

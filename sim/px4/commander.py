@@ -29,18 +29,18 @@ ACK_DELAY_S = (0.003, 0.010)
 REBOOT_DELAY_S = 0.4
 DOWN_S = 3.0
 QUEUE = 8
-"""Queued commands while the commander waits for an authorisation; more are lost."""
+"""Maximum number of commands that wait while the commander waits for an authorisation; further ones are lost."""
 _UNANSWERED = {
     mavlink.MAV_CMD_PREFLIGHT_SET_SENSOR_OFFSETS,
     mavlink.MAV_CMD_PREFLIGHT_UAVCAN,
     mavlink.MAV_CMD_DO_MOUNT_CONTROL,
     mavlink.MAV_CMD_DO_SET_ROI,
 }
-"""Commands of other parts of the firmware, which do not exist here: no acknowledgement at all."""
+"""Commands of parts of the firmware that this double does not have: not acknowledged at all."""
 
 
 class Commander:
-    """Carries out commands; a handler returns the result, or None when the acknowledgement comes later or never."""
+    """Carries out commands; a handler returns the result, or None if the acknowledgement comes later or never."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class Commander:
 
     def restart(self) -> None:
         self.blocked = False
-        """Waiting for an authorisation, and doing nothing else."""
+        """True: the commander waits for an authorisation, and does nothing else."""
         self._waiting: deque[Command | int] = deque(maxlen=QUEUE)
 
     def handle(self, command: Command) -> None:
@@ -79,7 +79,7 @@ class Commander:
             self._carry_out(command)
 
     def receives_own_request(self, number: int) -> None:
-        """Answer a command that the autopilot sent to its own system id: UNSUPPORTED, to nobody (0/0)."""
+        """Answer a command that the autopilot sent to its own system id with UNSUPPORTED, addressed to nobody (0/0)."""
         if self.blocked:
             self._waiting.append(number)
         else:
@@ -156,7 +156,7 @@ class Commander:
         return None
 
     def _check(self, done: Callable[[list[str]], None]) -> None:
-        """Run all checks of an arm request: the failures, with the authorisation as the last."""
+        """Run all checks of an arm request; pass the failures on, with the authorisation as the last."""
         failures = self._checks.failures(self._double.now_s())
         authorization = self._authorization
         if authorization.required:

@@ -31,7 +31,7 @@ AUTOSAVE_S, AUTOSAVE_EVERY_S = 0.3, 2.0
 
 
 class PX4Double(PX4Board):
-    """An autopilot with up to four IMUs on a virtual aircraft; its port is TELEM2 (MAV_1), `ground` is TELEM1 (MAV_0).
+    """A PX4 with up to four IMUs on a virtual aircraft; its own port is TELEM2 (MAV_1), `ground` is TELEM1 (MAV_0).
 
     Not modelled: flight, thermal compensation, calibrations but the gyros',
     PREFLIGHT_STORAGE, ODOMETRY, boards that save to flash, the data rate of a port, MAVFTP, missions, logs, events,
@@ -68,7 +68,7 @@ class PX4Double(PX4Board):
         return self.parameters[name]
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a value silently, as if it had always been so: in use at once, whatever the threshold."""
+        """Set a parameter value without an announcement; it is in use at once, however small the change."""
         self.parameters.preset(name, value)
         for imu in self.vehicle_imus:
             imu.restart()
@@ -80,7 +80,7 @@ class PX4Double(PX4Board):
             self.parameters_changed()
 
     def arm(self) -> None:
-        """Arm, whatever the checks say; send the command to have them run."""
+        """Arm without checks; to have checks, send the arm command instead."""
         if not self.armed:
             self.armed, self._armed_s = True, self.now_s()
             self.say(mavlink.MAV_SEVERITY_INFO, "Armed by external command\t")
@@ -92,7 +92,7 @@ class PX4Double(PX4Board):
             self.learned_offsets.disarmed(self.now_s(), self.now_s() - self._armed_s)
 
     def prearm_failures(self, loop_s: float) -> list[str]:
-        """Reasons against arming, in the firmware's words without the prefix, without the authorisation."""
+        """Return the reasons against arming, without the authorisation, in the firmware's words without prefix."""
         return self.checks.failures(loop_s)
 
     # What its parts use.
@@ -101,7 +101,7 @@ class PX4Double(PX4Board):
         return BUILDERS[message_id](self, loop_s)
 
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
-        """Roll, pitch, yaw of ATTITUDE: truth and the first estimator's tilt error; yaw in (-pi, pi]."""
+        """Return roll, pitch, yaw of ATTITUDE: truth plus the first estimator's tilt error; yaw in (-pi, pi]."""
         self.update_estimators(loop_s)
         roll, pitch, yaw = self.aircraft.angles_rad(self.aircraft.time_at(loop_s))
         roll_error, pitch_error = self.vehicle_imus[0].estimator.tilt_error_rad
@@ -157,13 +157,13 @@ class PX4Double(PX4Board):
             imu.estimator.reset(since_s, error.accel_m_s2)
 
     def _read_boot_parameters(self) -> None:
-        """Read the parameters that count only at a boot."""
+        """Read the parameters that have an effect only at a boot."""
         companion, ground = self.ports
         companion.forwards = bool(self.parameters["MAV_1_FORWARD"])
         ground.forwards = bool(self.parameters["MAV_0_FORWARD"])
 
     def _update_imus(self, now_s: float) -> None:
-        """Update the IMUs' parameters; an estimator forgets its bias when an offset or scale changes."""
+        """Update the IMUs' parameters; an estimator deletes its bias when an offset or scale changes."""
         self.update_estimators(now_s)
         for imu in self.vehicle_imus:
             gyro, accel = imu.gyro.count, imu.accel.count
@@ -230,9 +230,9 @@ COMPONENT = 1
 
 
 def forward(system_id: int, ports: Sequence[PX4Port], came_by: PX4Port, message: Message, *, heartbeats: bool) -> None:
-    """Forward a packet to the other ports that it concerns.
+    """Forward a packet to the other ports on which its target was heard.
 
-    Autopilots 5.4: both ports need MAV_n_FORWARD = 1, and the target must have been heard there.
+    Both ports need MAV_n_FORWARD = 1 (autopilots 5.4).
     """
     system = int(getattr(message, "target_system", 0))
     component = int(getattr(message, "target_component", 0))
@@ -246,7 +246,7 @@ def forward(system_id: int, ports: Sequence[PX4Port], came_by: PX4Port, message:
 
 
 def is_for_us(system_id: int, message: Message, *, broadcast: bool) -> bool:
-    """Return True for messages to this autopilot and, with `broadcast`, for those to every system."""
+    """Return True for a message to this autopilot or, with `broadcast`, to every system."""
     system, component = int(getattr(message, "target_system", 0)), int(getattr(message, "target_component", 0))
     return (system == system_id or (broadcast and system == 0)) and component in (0, COMPONENT)
 
@@ -257,23 +257,23 @@ _CHUNK = 50
 
 
 class Voice:
-    """Sends texts on all ports, one at a time, where a ground station's HEARTBEAT is heard (autopilots 9.3.2).
+    """Sends texts, one at a time, on ports where a ground station's HEARTBEAT is received (autopilots 9.3.2).
 
-    Elsewhere they wait, and are dropped when they are 5 s old.
+    On other ports, texts wait, and are dropped when they are 5 s old.
     """
 
     def __init__(self, double: PX4Board) -> None:
         self._double = double
 
     def say(self, severity: int, text: str) -> None:
-        """Queue a text on every port; of more than eight the oldest is lost."""
+        """Queue a text on every port; if more than eight wait, the oldest is lost."""
         now_s = self._double.now_s()
         for port in self._double.ports:
             port.texts.append((now_s, severity, text))
             self.go_on(port)
 
     def heard(self, port: PX4Port, message: mavlink.MAVLink_heartbeat_message, loop_s: float) -> None:
-        """Note the time of a ground station's HEARTBEAT, and continue."""
+        """Store the time of a ground station's HEARTBEAT, and continue sending."""
         if message.type == mavlink.MAV_TYPE_GCS:
             port.gcs_heard_s = loop_s
         self.go_on(port)

@@ -15,40 +15,40 @@ from sim.firmware.channel import Message
 from sim.px4.board import PX4Board
 
 YAW_BIT = 8
-"""Bit of EKF2_EV_CTRL."""
+"""Bit of EKF2_EV_CTRL that enables yaw."""
 LONGEST_GAP_S = 0.2
 STOPS_AFTER_S = 0.4
 RESTARTS_AFTER_S = 1.0
-"""Time since the last fusion until it starts again."""
+"""Time without fusion after which EKF2 starts the fusion again."""
 CONVERGED_AFTER = 500
-"""Accepted TIMESYNC exchanges until stamps are used."""
+"""Number of accepted TIMESYNC exchanges after which time stamps are used."""
 LONGEST_ROUND_TRIP_S = 0.010
 GATE_SIGMAS = 2.6
-"""EKF2_HDG_GATE."""
+"""Gate of the heading innovation in sigmas (EKF2_HDG_GATE)."""
 FAILS_AFTER_S = 1.0
 FUSED_S = 2.0
 COMPASS_FADES_S = 10.0
-"""Time constant of the magnetometer correcting a wrong heading, without external yaw."""
+"""Time constant with which the magnetometer corrects a wrong heading, without external yaw."""
 
 
 class ExternalVision:
-    """The chain from message to heading; `restart` at each boot."""
+    """Processes external vision, from the message to the heading; call `restart` at each boot."""
 
     def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
-        """Rejected messages by reason."""
+        """Number of rejected messages by reason."""
         self.consumed = 0
-        """Messages whose orientation reached EKF2."""
+        """Number of messages whose orientation reached EKF2."""
         self.sigma_rad = math.nan
-        """Sigma of the yaw last used by EKF2."""
+        """Sigma of the last yaw that EKF2 has used."""
         self.late_s = math.nan
-        """Age of the last sample by its stamp."""
+        """Age of the last sample, by its time stamp."""
         self.restart()
 
     def restart(self) -> None:
         self.active = False
-        """cs_ev_yaw of its status flags."""
+        """Status flag cs_ev_yaw: EKF2 uses the external yaw."""
         self.yaw_error_rad = 0.0
         self.exchanges = 0
         self._offset_s = 0.0
@@ -58,18 +58,18 @@ class ExternalVision:
 
     @property
     def converged(self) -> bool:
-        """Stamps are used; before, every sample counts as new."""
+        """True: time stamps are used; before, every sample counts as new."""
         return self.exchanges >= CONVERGED_AFTER
 
     def timesync(self, their_ns: int, sent_ns: int, loop_s: float) -> None:
-        """Handle an answer to a request of our own."""
+        """Handle an answer to one of our TIMESYNC requests."""
         now_s = self._double.boot_us(loop_s) * 1e-6
         if now_s - sent_ns * 1e-9 < LONGEST_ROUND_TRIP_S:
             self.exchanges += 1
             self._offset_s = 0.5 * (sent_ns * 1e-9 + now_s) - their_ns * 1e-9
 
     def update(self, loop_s: float) -> None:
-        """Bring the heading to this time."""
+        """Advance the heading to this time."""
         if self.active and loop_s - self._heard_s > STOPS_AFTER_S:
             self.active = False
             self._say("vision data stopped")
@@ -80,7 +80,7 @@ class ExternalVision:
         self._updated_s = loop_s
 
     def take(self, message: Message, loop_s: float) -> None:
-        """Handle a message, if it is an attitude."""
+        """Handle a message if it contains an attitude."""
         if isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
             angles = (message.roll, message.pitch, message.yaw)
             if not all(map(math.isfinite, angles)):
@@ -130,5 +130,5 @@ class ExternalVision:
         return math.remainder(yaw_rad - truth, 2.0 * math.pi)
 
     def _say(self, words: str) -> None:
-        """Log on its console only, as the real one."""
+        """Print on the autopilot's console only, as the real firmware does."""
         self.rejected[words] += 1

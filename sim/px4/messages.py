@@ -22,12 +22,12 @@ from sim.px4.board import PX4Board
 Message = mavlink.MAVLink_message
 Builder = Callable[["PX4Board", float], Message | None]
 _PUBLISHED_AFTER_S = 0.0008
-"""SCALED_IMU carries the time of publishing, HIGHRES_IMU that of sampling."""
+"""Delay from sampling to publishing: SCALED_IMU carries the time of publishing, HIGHRES_IMU that of sampling."""
 _HOLD_MODE = 4 << 16 | 3 << 24
 
 
 def heartbeat(double: PX4Board, loop_s: float) -> Message:
-    """HEARTBEAT: UNINIT while a pre-flight check fails."""
+    """Build HEARTBEAT; the state is UNINIT while a pre-flight check fails."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     base |= mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
     state = mavlink.MAV_STATE_UNINIT
@@ -43,7 +43,7 @@ def heartbeat(double: PX4Board, loop_s: float) -> Message:
 
 
 def highres_imu(double: PX4Board, loop_s: float) -> Message:
-    """HIGHRES_IMU: the primary IMU less the published estimate of its bias; the temperature is the air's."""
+    """Build HIGHRES_IMU: the primary IMU less the published estimate of its bias, and the air's temperature."""
     t_s, height_m = double.aircraft.time_at(loop_s), double.aircraft.site.height_m
     sample_s, output = double.imu_output(double.primary_imu, loop_s)
     double.update_estimators(loop_s)
@@ -56,7 +56,7 @@ def highres_imu(double: PX4Board, loop_s: float) -> Message:
 
 
 def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
-    """SCALED_IMU, 2, 3: corrected, no estimator, truncated to mG and mrad/s; None without that IMU."""
+    """Build SCALED_IMU, 2 or 3: corrected, without estimator, truncated to mG and mrad/s; None: no such IMU."""
     if index >= len(double.imus):
         return None
     t_s = double.aircraft.time_at(loop_s)
@@ -69,19 +69,19 @@ def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
 
 
 def attitude(double: PX4Board, loop_s: float) -> Message:
-    """ATTITUDE: the estimator's."""
+    """Build ATTITUDE from the estimator."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s).output[:3] - double.vehicle_imus[0].estimator.gyro_bias_rad_s
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
 
 
 def timesync(double: PX4Board, loop_s: float) -> Message:
-    """TIMESYNC: a request of its own."""
+    """Build TIMESYNC: a request of the autopilot."""
     return mavlink.MAVLink_timesync_message(0, double.boot_us(loop_s) * 1000)
 
 
 def home_position(double: PX4Board, loop_s: float) -> Message:
-    """HOME_POSITION: its place."""
+    """Build HOME_POSITION: the aircraft's place."""
     site = double.aircraft.site
     return mavlink.MAVLink_home_position_message(
         round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7), round(site.height_m * 1000.0),
@@ -90,14 +90,14 @@ def home_position(double: PX4Board, loop_s: float) -> Message:
 
 
 def extended_sys_state(double: PX4Board, loop_s: float) -> Message:
-    """EXTENDED_SYS_STATE: it never leaves the ground."""
+    """Build EXTENDED_SYS_STATE, which always reports an aircraft on the ground."""
     return mavlink.MAVLink_extended_sys_state_message(
         mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_ON_GROUND
     )
 
 
 def estimator_status(double: PX4Board, loop_s: float) -> Message:
-    """ESTIMATOR_STATUS: the source of its heading is not in it."""
+    """Build ESTIMATOR_STATUS, which does not contain the source of the heading."""
     flags = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
     flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
     return mavlink.MAVLink_estimator_status_message(
@@ -106,7 +106,7 @@ def estimator_status(double: PX4Board, loop_s: float) -> Message:
 
 
 def autopilot_version(double: PX4Board, loop_s: float) -> Message:
-    """AUTOPILOT_VERSION: PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
+    """Build AUTOPILOT_VERSION with the capabilities PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
         | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE

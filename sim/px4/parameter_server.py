@@ -15,13 +15,13 @@ from sim.px4.port import PX4Port
 DOES_NOT_EXIST, READ_ONLY, TYPE_UNSUPPORTED, TYPE_MISMATCH = 1, 5, 6, 7
 ECHO_S = (0.0002, 0.001)
 TELL_AFTER_S = (0.005, 0.015)
-"""Delay until every port announces a change."""
+"""Delay, from and to, after which every port announces a change."""
 HASH_NAME = "_HASH_CHECK"
 NO_INDEX = 65535
 LIST_PERIOD_S, LIST_CHUNK = 0.020, 20
-"""929 took 0.92 s on the real firmware."""
+"""Period and number of parameters per burst of a list: 929 parameters took 0.92 s on the real firmware."""
 MEANINGLESS_INDEX = 14736
-"""Index of a PARAM_ERROR that names a parameter: the real one does not set it."""
+"""Index in a PARAM_ERROR that names a parameter: the real firmware leaves this field unset."""
 
 
 class PX4ParameterServer:
@@ -35,7 +35,7 @@ class PX4ParameterServer:
         self._telling.clear()
 
     def set(self, port: PX4Port, message: mavlink.MAVLink_param_set_message, loop_s: float) -> None:
-        """Handle PARAM_SET: the name must exist, the type must be its own; stored and echoed here at once."""
+        """Handle PARAM_SET: the name must exist and the type must be right; store and echo here at once."""
         double, store = self._double, self._double.parameters
         name, kind = message.param_id, message.param_type
         value = float(float_as_int(message.param_value)) if kind == INT32 else message.param_value
@@ -61,7 +61,7 @@ class PX4ParameterServer:
                 self._send_soon(port, name, wrong=names_match(double.faults.wrong_echo, name))
 
     def read(self, port: PX4Port, message: mavlink.MAVLink_param_request_read_message) -> None:
-        """Handle PARAM_REQUEST_READ by name (index -1) or by index; unknown is an error, or silence before 1.17."""
+        """Handle PARAM_REQUEST_READ by name (index -1) or index; an unknown one gets an error; before 1.17, silence."""
         store = self._double.parameters
         index, name = message.param_index, message.param_id
         if index >= 0:
@@ -76,7 +76,7 @@ class PX4ParameterServer:
             self._error(port, message, name, DOES_NOT_EXIST, index=index if index >= 0 else MEANINGLESS_INDEX)
 
     def list_all(self, port: PX4Port) -> None:
-        """Handle PARAM_REQUEST_LIST: a hash first, then all; a repeated request starts anew, without the hash."""
+        """Handle PARAM_REQUEST_LIST: send a hash first, then all; a repeated request starts again, without the hash."""
         if not port.listing:
             port.listing = True
             if self._double.parameters["MAV_HASH_CHK_EN"]:
@@ -84,7 +84,7 @@ class PX4ParameterServer:
             self._list_from(port, 0)
 
     def tell_changes(self) -> None:
-        """Announce all unsaved values on every port, the writer's own port too."""
+        """Announce all unsaved values on every port, including the writer's own port."""
         low, high = TELL_AFTER_S
         for number in range(len(self._double.ports)):
             if number not in self._telling:

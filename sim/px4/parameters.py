@@ -1,4 +1,4 @@
-"""PX4's parameters: defaults, the store, and the way of a change to its users.
+"""PX4's parameters: defaults, the store, and the delays after which a change reaches its users.
 
 Facts: PX4 `src/lib/parameters/parameters.cpp`, `autosave.cpp`, `SubscriptionInterval.cpp` and its metadata (2026-08),
 autopilots 4, 5.2, 7.5 and 9.2.
@@ -35,7 +35,7 @@ _FIXED: dict[str, float] = {
 
 
 def default_parameters() -> dict[str, float]:
-    """Defaults by name: an int is an INT32, a float a REAL32."""
+    """Return the defaults by name: an int is an INT32, a float a REAL32."""
     table = dict(_FIXED)
     for slot in range(SLOTS):
         for kind in ("GYRO", "ACC"):
@@ -52,9 +52,9 @@ def default_parameters() -> dict[str, float]:
 INT32 = mavlink.MAV_PARAM_TYPE_INT32
 REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 SMALLEST_CHANGE = 1.1920929e-07
-"""A float that changes by no more than this is stored, but not announced and not saved for that.
+"""Largest change of a float that has no consequence: the value is stored, but neither announced nor saved.
 
-A value that differs from its default by no more is not saved at all.
+A value that differs from its default by at most this change is not saved at all.
 """
 
 
@@ -64,9 +64,9 @@ class PX4Parameters:
     def __init__(self, defaults: Mapping[str, float]) -> None:
         self._defaults = {name: v if isinstance(v, int) else float32(v) for name, v in sorted(defaults.items())}
         self.values: dict[str, float] = dict(self._defaults)
-        """Values in use, and read back."""
+        """Values in use, which are also read back."""
         self.saved: dict[str, float] = dict(self._defaults)
-        """Values that a boot loads."""
+        """Values that a boot loads from the storage."""
         self.unsaved: set[str] = set()
         """Names changed since the last save: announced on every port."""
         self.names = tuple(self.values)
@@ -80,14 +80,14 @@ class PX4Parameters:
         return self.values[name]
 
     def is_int(self, name: str) -> bool:
-        """INT32, else REAL32."""
+        """Return True for an INT32, False for a REAL32."""
         return isinstance(self._defaults[name], int)
 
     def type_of(self, name: str) -> int:
         return INT32 if self.is_int(name) else REAL32
 
     def set(self, name: str, value: float) -> bool:
-        """Store, without limits; return whether the change counts."""
+        """Store a value without checking limits; return True if the change must be announced."""
         new = int(value) if self.is_int(name) else float32(value)
         old = self.values[name]
         changed = new != old if self.is_int(name) else abs(new - old) > SMALLEST_CHANGE
@@ -114,11 +114,11 @@ class PX4Parameters:
         self.unsaved.clear()
 
     def preset(self, name: str, value: float) -> None:
-        """Set and save silently, as if it had always been so."""
+        """Set and save a value without an announcement, as if it had always been so."""
         self.values[name] = self.saved[name] = int(value) if self.is_int(name) else float32(value)
 
     def on_the_wire(self, name: str) -> float:
-        """Value as PARAM_VALUE carries it: the bytes of an int32 in the place of a float."""
+        """Return a value as PARAM_VALUE carries it: the bytes of an int32 in the place of a float."""
         value = self.values[name]
         return bytes_as_float(int(value)) if self.is_int(name) else value
 
@@ -139,9 +139,9 @@ INTERVAL_S = 1.0
 
 
 class Consumer:
-    """One reader of parameters that looks every `period_s`, and at changes at most once a second.
+    """A reader of parameters, with an opportunity every `period_s`; on average it reads at most once a second.
 
-    After a quiet time it skips two looks, then it waits (autopilots 9.2: effect after 4 ms, or up to 1 s).
+    After a quiet time, two changes have an effect at the next opportunity, later ones within 1 s (autopilots 9.2).
     """
 
     def __init__(self, double: AutopilotDouble, period_s: float, action: Callable[[float], None]) -> None:

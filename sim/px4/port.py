@@ -16,14 +16,14 @@ from sim.firmware.channel import Channel, Message, Stream
 
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 MAIN_LOOP_S = 0.0015
-"""Pause of a port's loop on a fast link."""
+"""Pause between the loops of a port on a fast link."""
 GCS_TIMEOUT_S = 2.5
 TEXT_QUEUE = 8
 
 
 @dataclass(slots=True)
 class PacedStream(Stream):
-    """A stream, and its nominal time of the last message."""
+    """A stream, and the nominal time of its last message."""
 
     last_s: float = 0.0
 
@@ -80,18 +80,18 @@ class PX4Port(Channel):
         super().__init__(system_id, handle)
         self.defaults, self.period_s = dict(defaults), period_s
         self.forwards = False
-        """MAV_n_FORWARD at the last boot."""
+        """True: MAV_n_FORWARD was 1 at the last boot."""
         self.seen: set[tuple[int, int]] = set()
         """System and component of every sender heard since the boot."""
         self.gcs_heard_s = -math.inf
-        """Time of the last HEARTBEAT of type GCS."""
+        """Time of the last HEARTBEAT with type GCS."""
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=TEXT_QUEUE)
-        """Time, severity and text of waiting texts; the oldest is lost."""
+        """Waiting texts with time and severity; if there are too many, the oldest is lost."""
         self.text_number = 0
         self.text_next_s = 0.0
 
     def restart(self, now_s: float) -> None:
-        """Handle a boot: default streams, nobody seen."""
+        """Handle a boot: default streams, no senders heard."""
         self.streams.clear()
         self.seen.clear()
         self.texts.clear()
@@ -101,17 +101,17 @@ class PX4Port(Channel):
         self.streams[HEARTBEAT].next_s = now_s
 
     def has_seen(self, system: int, component: int) -> bool:
-        """Return True where a target was heard here; system 0 stands for anybody."""
+        """Return True if a target was heard on this port; system 0 stands for anybody."""
         if system == 0:
             return bool(self.seen)
         return any(s == system and component in (0, c) for s, c in self.seen)
 
     def has_ground_station(self, now_s: float) -> bool:
-        """Texts are sent here."""
+        """Return True if texts are sent on this port."""
         return now_s - self.gcs_heard_s <= GCS_TIMEOUT_S
 
     def set_stream(self, message_id: int, interval_s: float | None, now_s: float) -> None:
-        """Start, change or (None) stop a stream; 0: the default of this port, which may be to stop."""
+        """Start, change or (None) stop a stream; 0: this port's default rate, which can be none."""
         if interval_s == 0.0:
             rate = self.defaults.get(message_id, 0.0)
             interval_s = 1.0 / rate if rate else None
@@ -122,7 +122,7 @@ class PX4Port(Channel):
             self._plan(stream)
 
     def due(self, now_s: float) -> list[int]:
-        """Message ids that are due."""
+        """Return the ids of messages that are due."""
         due = []
         for message_id, stream in self.streams.items():
             if stream.next_s <= now_s + 1e-9:
@@ -136,6 +136,6 @@ class PX4Port(Channel):
         return due
 
     def _plan(self, stream: PacedStream) -> None:
-        """Plan the first sample at which it is due: 0.3 of a loop's pause before its interval is over."""
+        """Plan the first sample at which a stream is due: 0.3 of a loop's pause before its interval is over."""
         wanted_s = stream.last_s + stream.interval_s - 0.3 * MAIN_LOOP_S
         stream.next_s = (math.floor(wanted_s / self.period_s) + 1) * self.period_s

@@ -21,7 +21,7 @@ from sim.px4.vehicle_imu import VehicleImu
 GYRO_TIME_S = 1.07
 GYRO_TRIES = 20
 LINGERS_S = 0.6
-"""Busy for so long after the last text, so that it gets through."""
+"""Time for which the calibration stays busy after the last text, so that the text gets through."""
 _INFO, _CRITICAL = mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_CRITICAL
 
 
@@ -36,7 +36,7 @@ class CommandedCalibrations:
         self._double = double
 
     def gyros(self) -> None:
-        """Run with param1 = 1: mean of 250 samples of each gyro."""
+        """Calibrate with param1 = 1: mean of 250 samples of each gyro."""
         self._double.calibrating = True
         self._double.say(_INFO, "[cal] calibration started: 2 gyro")
         for percent in range(0, 101, 10):
@@ -58,7 +58,7 @@ class CommandedCalibrations:
         return self._double.aircraft.still_at(t_s) and self._double.aircraft.still_at(t_s - over_s)
 
     def _mean(self, imu: VehicleImu, over_s: float) -> Array:
-        """Raw mean (6) over the time that ends now, with its white noise."""
+        """Return the raw mean (6) over the time that ends now, with its white noise."""
         t_s = self._double.aircraft.time_at(self._double.now_s())
         mean: Array = imu.model.expected_block(np.linspace(t_s - over_s, t_s, 21)[1:]).mean(axis=0)
         return mean + self._double.random.standard_normal(6) * imu.density / math.sqrt(over_s)
@@ -83,7 +83,7 @@ class CommandedCalibrations:
 
 POLL_S = 0.5
 SAMPLE_S = 0.02
-"""Period of its samples."""
+"""Period of the samples of this calibration."""
 QUIET_S = 5.0
 MIN_COUNT = 100
 MAX_VARIANCE = 0.001
@@ -95,24 +95,24 @@ ACCEL_WORTH_M_S2, GYRO_WORTH_RAD_S = 0.05, 0.01
 
 
 class BackgroundGyroCalibration:
-    """IMU_GYRO_CAL_EN: started at boot; while disarmed and still it replaces offsets that are far wrong."""
+    """IMU_GYRO_CAL_EN: runs from boot on; on a disarmed, motionless aircraft it replaces offsets that are far wrong."""
 
     def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.running = False
         self.commits = 0
-        """Number of its writes."""
+        """Number of times that offsets were written."""
         self._begin(0.0)
 
     def restart(self, loop_s: float) -> None:
-        """Handle a boot: the parameter counts now, and not again before the next one."""
+        """Handle a boot: the parameter has an effect only now."""
         self.running = bool(self._double.parameters["IMU_GYRO_CAL_EN"])
         self._begin(loop_s)
         if self.running:
             self._double.later(POLL_S, self._poll)
 
     def parameters_updated(self, loop_s: float) -> None:
-        """Read the parameters again and start anew; for 5 s it then writes nothing."""
+        """Read the parameters again and start again; nothing is written in the next 5 s."""
         for calibration in self._own:
             calibration.parameters_update()
         self._changed_s = loop_s
@@ -158,7 +158,7 @@ class BackgroundGyroCalibration:
             self._reset(now_s)
 
     def _collect(self, now_s: float) -> bool:
-        """Collect samples since the last call; False when something moved or warmed."""
+        """Collect samples since the last call; return False if something moved or warmed up."""
         double = self._double
         times = np.arange(self._until_s + SAMPLE_S, now_s + SAMPLE_S / 2.0, SAMPLE_S)
         self._until_s = now_s
@@ -188,7 +188,7 @@ class BackgroundGyroCalibration:
 
     @staticmethod
     def _moments(parts: list[Array]) -> tuple[Array, Array]:
-        """Mean and variance of all samples from those of equally long parts."""
+        """Return mean and variance of all samples from those of equally long sections."""
         table = np.array(parts)
         means, variances = table[:, :3], table[:, 3:]
         return means.mean(axis=0), variances.mean(axis=0) + means.var(axis=0)
@@ -203,7 +203,7 @@ class LearnedOffsets:
     def __init__(self, double: PX4Board) -> None:
         self._double = double
         self.commits = 0
-        """Number of its writes."""
+        """Number of times that offsets were written."""
         self._quiet_until_s = -math.inf
 
     def restart(self) -> None:
@@ -218,7 +218,7 @@ class LearnedOffsets:
             self._double.later(_QUIET_AFTER_CHANGE_S + _SETTLES_S, self._claim)
 
     def disarmed(self, loop_s: float, armed_for_s: float) -> None:
-        """Handle a disarming by the pilot."""
+        """Handle a disarm by the pilot."""
         if armed_for_s > 1.0:
             self._commit(loop_s, self._double.vehicle_imus)
 

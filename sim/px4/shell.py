@@ -19,14 +19,14 @@ from sim.px4.board import PX4Board
 _BYTES = 70
 _PROMPT = "pxh> "
 _STEP_S = 0.01
-"""A port's loop sends one message each time, if the line has room."""
+"""Pause of a port's loop, which sends one message each time if the line has room."""
 _PACKET = 93
 STATUS_S = 0.1
 """Period of `vehicle_imu_status`."""
 
 
 class Shell:
-    """Answers on every port; `typed` has the received lines."""
+    """A console that answers on every port; `typed` contains the received lines."""
 
     def __init__(self, double: PX4Board) -> None:
         self._double = double
@@ -130,7 +130,7 @@ class Shell:
         ]
 
     def _statuses(self, loop_s: float) -> list[list[str]]:
-        """Means of 0.1 s of raw readings, turned into the vehicle's axes; constant until the next is published."""
+        """Return means over 0.1 s of raw readings in vehicle axes; constant until the next mean is published."""
         t_s = math.floor(self._double.aircraft.time_at(loop_s) / STATUS_S) * STATUS_S
         found = []
         for imu in self._double.vehicle_imus:

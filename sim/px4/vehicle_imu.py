@@ -1,4 +1,4 @@
-"""One IMU of the PX4 double: means over an integration interval, corrected for offset and temperature; its estimator.
+"""One IMU of the PX4 double, with its estimator: means over an interval, corrected for offset and temperature.
 
 A sample is the mean of the sensor over one interval, so its white noise is N / sqrt(interval). It is independent of the
 next sample's (real outputs at 4 ms: autopilots 9.3.2). Rounding inside the sensor adds white noise only.
@@ -17,15 +17,15 @@ from sim.px4.calibration import SensorCalibration
 from sim.px4.parameters import PX4Parameters
 
 ACCEL_LIMIT_M_S2, GYRO_LIMIT_RAD_S = 0.4, 0.15
-"""EKF2_ABL_LIM and EKF2_GYR_B_LIM."""
+"""Limits of EKF2's bias estimates (EKF2_ABL_LIM, EKF2_GYR_B_LIM)."""
 _LEARNS_S = 1.05
 _SHARE_EARLY, _SHARE_LATE, _SETTLES_S = 0.3, 0.2, 60.0
-"""Part of a horizontal change that goes into the tilt: about half soon after a start, a fifth later."""
+"""Share of a horizontal change that goes into the tilt: about half soon after a start, a fifth later."""
 _PUBLISHED_EVERY_S, _PUBLISHED_STEP = 1.0, 0.001
 _WANDER = np.array([0.4 * math.radians(1.0 / 3600.0)] * 3 + [5e-6 * STANDARD_GRAVITY_M_S2] * 3)
-"""Wander from one publication to the next; the sum decays by a fiftieth."""
+"""Sigma of the wander from one publication to the next; the sum decays by a fiftieth each time."""
 _OBVIOUS_M_S2 = 0.5
-"""A larger error cannot be a bias: it counts as tilt."""
+"""Size of an error above which EKF2 takes it for tilt, not bias."""
 
 
 class Ekf2:
@@ -33,13 +33,12 @@ class Ekf2:
 
     States are in vehicle FRD; `update` takes the current errors of the corrected IMU output (output minus truth).
 
-    The gyro bias and the vertical accelerometer's are found within seconds, the Earth's rotation known. Of a horizontal
-    one everything goes into the tilt at the start; a later change goes mostly into a bias estimate, so that after a
-    write the old tilt stays, for minutes, until a reboot. A new offset clears the estimate (autopilots 9.2, 9.3.2).
+    Gyro biases and the vertical accelerometer bias are estimated within seconds; the Earth's rotation is known. At the
+    start, a horizontal accelerometer bias goes into the tilt. A later change goes mostly into a bias estimate: after a
+    write, the old tilt stays for minutes or until a reboot. A new offset clears the estimate (autopilots 9.2, 9.3.2).
 
-    Biases are published once a second, or as soon as one has moved by 0.001 (rad/s, m/s^2), and stand still between
-    (`PublishSensorBias` of EKF2.cpp); at rest they wander by fractions of a deg/h (seen in the real one: 0.2 to 0.5
-    deg/h, up to 10 micro-g).
+    Biases are published once a second, or as soon as one has moved by 0.001 (rad/s, m/s^2), and are constant between
+    (`PublishSensorBias` of EKF2.cpp). At rest they wander: 0.2 to 0.5 deg/h, up to 10 micro-g in the real firmware.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -50,14 +49,14 @@ class Ekf2:
         self.gyro_bias_rad_s = np.zeros(3)
         self.accel_bias_m_s2 = np.zeros(3)
         self._tilt_m_s2 = np.zeros(2)
-        """Horizontal specific force, x and y, equivalent to the tilt's error."""
+        """Horizontal specific force, x and y, that corresponds to the tilt error."""
         self._started_s = 0.0
         self.time_s = 0.0
         """Time of the last update."""
         self.accel_steady_since_s = self.gyro_steady_since_s = 0.0
 
     def reset(self, t_s: float, accel_error: Array) -> None:
-        """Start at this time: the accelerometer defines level."""
+        """Start at this time: the accelerometer defines the horizontal."""
         self.gyro_bias_rad_s, self.accel_bias_m_s2 = np.zeros(3), np.zeros(3)
         self.published, self._published_s = np.zeros(6), t_s
         self._tilt_m_s2 = accel_error[:2].copy()
@@ -76,12 +75,12 @@ class Ekf2:
 
     @property
     def tilt_error_rad(self) -> tuple[float, float]:
-        """Errors of roll and pitch."""
+        """Return the errors of roll and pitch."""
         x, y = self._tilt_m_s2 / STANDARD_GRAVITY_M_S2
         return -float(y), float(x)
 
     def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
-        """Advance to this time, with these errors since the last update."""
+        """Advance to this time, with the errors (output minus truth) since the last update."""
         span = max(t_s - self.time_s, 0.0)
         learnt = 1.0 - math.exp(-span / _LEARNS_S)
         self.gyro_bias_rad_s += learnt * (gyro_error - self.gyro_bias_rad_s)
@@ -104,7 +103,7 @@ class Ekf2:
 
 
 RAW_RATE_HZ = 1000.0
-"""Rate of the sensor's own samples; their rounding adds white noise."""
+"""Rate of the sensor's own samples, whose rounding adds white noise."""
 
 
 class VehicleImuSample(NamedTuple):
@@ -113,7 +112,7 @@ class VehicleImuSample(NamedTuple):
     t_s: float
     """End of the interval, aircraft time."""
     output: Array
-    """Corrected rates and specific forces (6), vehicle FRD."""
+    """Corrected rates and specific forces (6) in vehicle FRD."""
 
 
 class VehicleImu:
@@ -138,20 +137,20 @@ class VehicleImu:
         steps = np.repeat([model.spec.gyro.step, model.spec.accel.step], 3)
         density = np.sqrt(model.white**2 + steps**2 / 12.0 / RAW_RATE_HZ)
         self.density = density
-        """White noise of the six axes as the firmware sees it, unit * sqrt(s)."""
+        """White noise of the six axes that the firmware sees, in unit * sqrt(s)."""
         self._noise = np.empty((0, 6))
         self._last: VehicleImuSample | None = None
         self.restart()
 
     def restart(self) -> None:
-        """Handle a boot: everything is read anew."""
+        """Handle a boot: read all parameters again."""
         self.gyro = SensorCalibration("GYRO", self.device_id, self._store, external=self.external)
         self.accel = SensorCalibration("ACC", self.device_id, self._store, external=self.external)
         self._last = None
 
     @property
     def calibrated(self) -> bool:
-        """Both triads have a slot."""
+        """True: both triads have a slot."""
         return self.gyro.calibrated and self.accel.calibrated
 
     def correct(self, raw: Array) -> Array:
@@ -159,11 +158,11 @@ class VehicleImu:
         return result
 
     def corrected(self, t_s: float) -> Array:
-        """Output without noise (6): rates and specific forces in vehicle FRD."""
+        """Return the output without noise (6): rates and specific forces in vehicle FRD."""
         return self.correct(self.model.expected(t_s))
 
     def sample(self, t_s: float) -> VehicleImuSample:
-        """Newest sample at this time; constant within the interval."""
+        """Return the newest sample at this time; it is constant within the interval."""
         end_s = math.floor(t_s / self.interval_s + 1e-6) * self.interval_s
         if self._last is None or end_s > self._last.t_s + 1e-9:
             if not len(self._noise):
@@ -174,7 +173,7 @@ class VehicleImu:
         return self._last
 
     def raw_mean(self, t_s: float, over_s: float) -> Array:
-        """Mean (6) of the sensor until this time, in vehicle FRD, uncorrected; a repeated call returns the same."""
+        """Return the sensor's mean (6) until this time, uncorrected, in vehicle FRD; repeated calls agree."""
         seed = [round(t_s / over_s), self.index, 7]
         noise = np.random.default_rng(seed).standard_normal(6) * (self.density / math.sqrt(over_s))
         raw = self.model.expected(t_s - over_s / 2.0) + noise

@@ -21,7 +21,7 @@ _TCP_PORTS = 10
 
 
 def measuring_parameters(scenario: Scenario, *, gyr_cal: bool) -> dict[str, float]:
-    """Defaults that give the simulated sensors the aircraft's biases and no others (autopilots 9.3).
+    """Return defaults that give the simulated sensors the aircraft's biases and no others (autopilots 9.3).
 
     The second IMU gets the same physics; the firmware adds the difference between its model and the first.
     """
@@ -51,7 +51,7 @@ def measuring_parameters(scenario: Scenario, *, gyr_cal: bool) -> dict[str, floa
 
 
 class ArduPilot(FirmwareVehicle):
-    """Links and files. SERIAL0 goes to the ground station, SERIAL1 to the companion, both UDP.
+    """A real ArduPilot with its links and files. SERIAL0 goes to the ground station, SERIAL1 to the companion (UDP).
 
     The firmware speaks first.
 
@@ -83,10 +83,10 @@ class ArduPilot(FirmwareVehicle):
         self.url = f"udpin:{self._companion[0]}:{self._companion[1]}"
         self.ground_target = ground or (LOOPBACK, free_udp_port())
         self.scripts = folder / "scripts"
-        """Folder for Lua scripts before a start; scripting is on."""
+        """Folder for Lua scripts, to be filled before a start; scripting is on."""
 
     def _process_of(self, *model: str) -> FirmwareProcess:
-        """The binary with this physics, not started: place, date, parameters, free ports, two links."""
+        """Return the binary with this physics, not started: place, date, parameters, free ports, two links."""
         self.scripts.mkdir(exist_ok=True)
         ours = self.folder / "ours.parm"
         ours.write_text("".join(f"{name} {value:.9g}\n" for name, value in self._parameters.items()), encoding="ascii")
@@ -139,7 +139,7 @@ class ArduPilotSitl(ArduPilot, SitlVehicle):
         return self.backend.physics_s
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """True bias: IMU 1 is the model; IMU 2 is the same, moved by the difference of the two at the start."""
+        """Return the true bias: IMU 1's is the model's; IMU 2's adds the difference of the two at the start."""
         first, second = self.scenario.flight_controller_imus[:2]
         bias = first.true_bias(t_s)
         if instance == 1:

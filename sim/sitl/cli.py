@@ -99,7 +99,7 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
 
 
 def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) -> SitlVehicle:
-    """The firmware that the options name, not started."""
+    """Return the firmware that the options name, not started."""
     if arguments.command == "px4" or (arguments.command == "residuals" and arguments.binary.name.startswith("px4")):
         return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
     links = {"companion": arguments.udp, "ground": arguments.ground} if arguments.command == "ardupilot" else {}

@@ -24,7 +24,7 @@ class LossyLink:
     """A UDP relay between firmware and companion; an async context manager.
 
     Args:
-        loss: share of lost datagrams in either direction, 0..1; may be changed at any time.
+        loss: share of lost datagrams in either direction, 0..1; can be changed at any time.
         seed: seed of the losses.
         near_port: port to which the firmware sends; None: any free one.
     """
@@ -32,7 +32,7 @@ class LossyLink:
     def __init__(self, *, loss: float = 0.0, seed: int = 1, near_port: int | None = None) -> None:
         self.loss = loss
         self.near = (LOOPBACK, free_udp_port() if near_port is None else near_port)
-        """Address for the firmware's `udpclient`."""
+        """Address to which the firmware's `udpclient` sends."""
         self.far = (LOOPBACK, free_udp_port())
         """Address at which the companion listens."""
         self.lost = self.passed = 0
@@ -46,11 +46,11 @@ class LossyLink:
 
     @property
     def url(self) -> str:
-        """URL for the companion's configuration."""
+        """URL of this relay for the companion's configuration."""
         return f"udpin:{self.far[0]}:{self.far[1]}"
 
     def sent(self, condition: Callable[[Message], bool]) -> asyncio.Future[Message]:
-        """Next message of the companion that meets the condition, done when it passes or gets lost."""
+        """Return a future for the companion's next message that meets the condition; done when it passes or is lost."""
         future: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
         self._waiting.append((condition, future))
         return future
@@ -98,7 +98,7 @@ class _Face(asyncio.DatagramProtocol):
         self._take(data, addr)
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore: nobody listens at present."""
+        """Ignore the error: nobody listens at present."""
 
 
 READY_WITHIN_S = 40.0
@@ -107,7 +107,7 @@ _IMU = '[[imu]]\nname = "fc{0}"\nsource = "autopilot"\ninstance = {0}\nprofile =
 
 
 def daemon_configuration(vehicle: FirmwareVehicle, folder: Path, more: str = "", url: str | None = None) -> str:
-    """A companion.toml for the vehicle's IMUs with the ports in the folder; `more` is appended."""
+    """Return a companion.toml for the vehicle's IMUs with the ports in the folder; `more` is appended."""
     host, port = vehicle.url.removeprefix("udpin:").rsplit(":", 1)
     text = configuration(vehicle.scenario, directory=folder, udp=(host, int(port)))
     text = text.replace(vehicle.url, url or vehicle.url)
@@ -140,8 +140,8 @@ async def companion_daemon(
     Args:
         vehicle: running; nobody else listens on its companion link.
         folder: existing folder for the ports, the configuration, the log and the companion's storage.
-        more: further lines of its configuration.
-        url: URL of its link to the vehicle (None: the vehicle's own).
+        more: further lines of the companion's configuration.
+        url: URL of the companion's link to the vehicle (None: the vehicle's own URL).
     """
     (folder / "companion.toml").write_text(daemon_configuration(vehicle, folder, more, url), encoding="utf-8")
     async with devices(vehicle.scenario, folder), CompanionProcess(folder) as daemon:

@@ -52,7 +52,7 @@ class GroundStation(Station):
         self._types: dict[str, int] = {}
 
     def texts_since(self, since_s: float) -> str:
-        """All STATUSTEXT of the vehicle after an instant (loop time), chunks joined."""
+        """Return all STATUSTEXT of the vehicle after an instant (loop time), with chunks joined."""
         return "".join(message.text for message in self.all(mavlink.MAVLink_statustext_message, since_s=since_s))
 
     async def run(self) -> None:
@@ -77,7 +77,7 @@ class GroundStation(Station):
         return self.all(kind, since_s=since_s)[-1]
 
     def vehicle_heartbeats(self, since_s: float = 0.0) -> list[mavlink.MAVLink_heartbeat_message]:
-        """Heartbeats of the autopilot itself."""
+        """Return the heartbeats of the autopilot itself."""
         return [
             message
             for message in self.all(mavlink.MAVLink_heartbeat_message, since_s=since_s)
@@ -116,7 +116,7 @@ class GroundStation(Station):
         raise KeyError(name)
 
     def send_put(self, name: str, value: float, kind: int | None = None) -> None:
-        """Send PARAM_SET in the firmware's encoding, of the type heard before (else REAL32), without waiting."""
+        """Send PARAM_SET in the firmware's encoding, with the type received before (else REAL32), without waiting."""
         kind = self._types.get(name, mavlink.MAV_PARAM_TYPE_REAL32) if kind is None else kind
         if self.firmware == "px4" and kind in _INTEGERS:
             value = struct.unpack("<f", struct.pack("<i", round(value)))[0]
@@ -127,7 +127,7 @@ class GroundStation(Station):
             await self.put(name, value)
 
     async def whole_list(self, within_s: float = 60.0) -> dict[str, float]:
-        """Read every parameter that the autopilot lists; lost ones are requested by index."""
+        """Read every parameter that the autopilot lists; request lost ones by index."""
         loop = asyncio.get_running_loop()
         since_s, deadline_s = loop.time(), loop.time() + within_s
         self.send(mavlink.MAVLink_param_request_list_message(self.vehicle, 1))
@@ -157,7 +157,7 @@ class GroundStation(Station):
 
     @asynccontextmanager
     async def restored(self, *names: str) -> AsyncIterator[dict[str, float]]:
-        """Remember parameters, and restore them at the end, in the same order."""
+        """Store parameters, and restore them at the end in the same order."""
         before = {name: await self.get(name) for name in names}
         try:
             yield dict(before)
@@ -211,7 +211,7 @@ class GroundStation(Station):
         return self.all(kind, since_s=since_s)
 
     async def imu(self, kind: type[mavlink.MAVLink_message], seconds: float, *, rate_hz: float = 100.0) -> Array:
-        """Readings (n, 6) of an IMU message: rates in rad/s, specific forces in m/s^2. The stream stays on."""
+        """Return readings (n, 6) of an IMU message: rates in rad/s, specific forces in m/s^2. The stream stays on."""
         result = await self.stream(kind.id, rate_hz)
         await asyncio.sleep(0.1)
         seen = await self.collect(kind, seconds)
@@ -221,7 +221,7 @@ class GroundStation(Station):
 
 
 def imu_row(message: mavlink.MAVLink_message) -> Sequence[float]:
-    """Three rates (rad/s) and three specific forces (m/s^2) of HIGHRES_IMU, RAW_IMU or SCALED_IMU*."""
+    """Return three rates (rad/s) and three specific forces (m/s^2) of HIGHRES_IMU, RAW_IMU or SCALED_IMU*."""
     row = [getattr(message, name) for name in ("xgyro", "ygyro", "zgyro", "xacc", "yacc", "zacc")]
     if message.get_type() == "HIGHRES_IMU":
         return row

@@ -1,7 +1,7 @@
 """The physics of a PX4 SITL: a TCP server that feeds HIL_SENSOR in lockstep with HIL_ACTUATOR_CONTROLS.
 
 Time in HIL_SENSOR is what the firmware sets its clock to, so it starts near zero at every boot. Sensor 0 also carries
-magnetometer and barometer; the firmware passes its IMU values through 16 bits, those of sensor 1 as they are
+magnetometer and barometer; the firmware passes sensor 0's IMU values through 16 bits, sensor 1's unchanged
 (autopilots 9.3).
 """
 
@@ -26,12 +26,12 @@ from sim.sitl.samples import Sample, SampleBlocks
 IMU_FIELDS = 0o77
 MAGNETOMETER_FIELDS = 0o700
 BAROMETER_FIELDS = 0x200 | 0x800 | 0x1000
-"""Absolute pressure, pressure altitude, temperature; without differential pressure."""
+"""Flags for absolute pressure, pressure altitude and temperature, but not for differential pressure."""
 ARMED_FLAG = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
 FIFO_STEPS = (math.radians(2000.0 / 32768.0),) * 3 + (STANDARD_GRAVITY_M_S2 / 2048.0,) * 3
-"""The firmware's simulator truncates sensor 0 to 16-bit numbers."""
+"""Steps to which the firmware's simulator truncates sensor 0 (16-bit numbers): rad/s, m/s^2."""
 _ABOVE = 1e-3
 
 
@@ -96,7 +96,7 @@ class Codec:
         )
 
     def actuator_controls(self, data: bytes) -> list[tuple[int, bool]]:
-        """Time in us and armed flag of every HIL_ACTUATOR_CONTROLS in the bytes."""
+        """Return time in us and armed flag of every HIL_ACTUATOR_CONTROLS in the bytes."""
         try:
             messages = self._codec.parse_buffer(data) or ()
         except Exception:  # noqa: BLE001 - the generated parser's own faults on garbage
@@ -117,12 +117,12 @@ class Codec:
 
 FRAME_HZ = 250
 SLOW_EVERY = FRAME_HZ // 50
-"""Frames between readings of magnetometer and barometer."""
+"""Number of frames between readings of magnetometer and barometer."""
 GPS_EVERY = FRAME_HZ // 5
 LOCKSTEP_TIMEOUT_S = 0.2
-"""The firmware answers every frame once its outputs run; before that, and when it hangs, we continue alone."""
+"""Timeout of the answer to a frame; then we go on alone. The firmware answers every frame once its outputs run."""
 MAX_BEHIND_S = 0.25
-"""Frames later than this are not made up for."""
+"""Delay in s beyond which late frames are skipped."""
 _MAGNETIC_NOISE_GAUSS = 0.0005
 _PRESSURE_NOISE_HPA = 0.01
 _POSITION_NOISE_E7 = 1.0
@@ -163,16 +163,16 @@ class HilBackend:
         self._driving: asyncio.Task[None] | None = None
         self._answered = asyncio.Event()
         self.locked = False
-        """The firmware answers our frames."""
+        """True: the firmware answers our frames."""
         self.port = 0
         self.boots = 0
-        """Connections: starts of the firmware."""
+        """Number of connections, one for each start of the firmware."""
         self.frames = 0
-        """Frames sent, since the last boot."""
+        """Number of frames sent since the last boot."""
         self.unanswered = 0
-        """Frames without an answer in time although the firmware had answered before."""
+        """Number of frames without an answer in time after the firmware had begun to answer."""
         self.armed = False
-        """Armed, by the firmware's outputs."""
+        """True: armed, according to the firmware's outputs."""
 
     @property
     def physics_s(self) -> float:
@@ -196,7 +196,7 @@ class HilBackend:
             self._server = None
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Handle a connection; the firmware before it, if any, is gone."""
+        """Handle a connection; an earlier firmware, if any, has ended."""
         if self._driving is not None:
             self._driving.cancel()
         cast("socket.socket", writer.get_extra_info("socket")).setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

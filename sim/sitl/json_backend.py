@@ -27,11 +27,11 @@ class ServoPacket(NamedTuple):
     """A frame of the firmware's servo outputs."""
 
     frame_rate_hz: int
-    """Inverse of the step."""
+    """Frame rate, the inverse of the step."""
     frame_count: int
-    """Grows by one with every answered frame; starts anew with the firmware. Repeated: the answer was lost."""
+    """Counter that grows by one with every answered frame and restarts with the firmware. Repeated: answer lost."""
     pwm_us: tuple[int, ...]
-    """16 channels, or 32 with SERVO_32_ENABLE."""
+    """Pulse widths of 16 channels, or 32 with SERVO_32_ENABLE."""
 
 
 def decode_servos(data: bytes) -> ServoPacket | None:
@@ -46,7 +46,7 @@ def decode_servos(data: bytes) -> ServoPacket | None:
 
 
 def encode_frame(physics_s: float, sample: Sample) -> bytes:
-    """Encode the answer: the first IMU of the sample, the true attitude, and a vehicle that stays at home."""
+    """Encode the answer: the sample's first IMU, the true attitude, and a vehicle that stays at its place."""
     return (
         b'\n{"timestamp":%.6f,"imu":{"gyro":[%.9g,%.9g,%.9g],"accel_body":[%.9g,%.9g,%.9g]},'
         b'"position":[0,0,0],"attitude":[%.8f,%.8f,%.8f],"velocity":[0,0,0]}\n'
@@ -56,7 +56,7 @@ def encode_frame(physics_s: float, sample: Sample) -> bytes:
 
 _LARGEST_PACKET = 256
 _ASKS_AGAIN_S = 0.5
-"""The firmware repeats an unanswered packet after a second. A repeat sooner after our answer was queued before it."""
+"""Time after our answer within which a repeated packet is ignored: the firmware repeats it only after a second."""
 
 
 class JsonBackend:
@@ -84,9 +84,9 @@ class JsonBackend:
         self._last_s = 0.0
         self.port = 0
         self.boots = 0
-        """Firmware starts seen."""
+        """Number of firmware starts seen."""
         self.frames = 0
-        """Frames sent, since the last boot."""
+        """Number of frames sent since the last boot."""
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
@@ -121,7 +121,7 @@ class JsonBackend:
                 self._socket.sendto(answer, peer)
 
     def answer(self, data: bytes, peer: tuple[str, int]) -> bytes:
-        """Answer a packet; empty for an invalid one; never raises."""
+        """Return the answer to a packet, empty for an invalid packet; never raises."""
         packet = decode_servos(data)
         if packet is None:
             return b""
@@ -132,14 +132,14 @@ class JsonBackend:
         return self._frame(packet)
 
     def _begin(self, peer: tuple[str, int]) -> None:
-        """Handle a start of the firmware: its time starts from zero, and so must ours, or it would leap."""
+        """Handle a start of the firmware: reset our time to zero with the firmware's, which would leap otherwise."""
         self._peer, self._count, self.physics_s = peer, -1, 0.0
         self.blocks.restart()
         self.boots += 1
         self.frames = 0
 
     def _again(self) -> bytes:
-        """Repeat the frame if the first was lost; a second answer to one packet would stay in its queue."""
+        """Repeat the frame if the first answer was lost; a second answer to one packet would stay in the queue."""
         assert self._loop is not None
         now_s = self._loop.time()
         if now_s - self._last_s < _ASKS_AGAIN_S:

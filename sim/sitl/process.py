@@ -17,14 +17,14 @@ LOOPBACK = "127.0.0.1"
 
 
 def free_udp_port() -> int:
-    """A free UDP port of the loopback address."""
+    """Return a free UDP port of the loopback address."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
 
 
 def free_tcp_window(size: int) -> int:
-    """The first of `size` consecutive TCP ports that are free."""
+    """Return the first of `size` consecutive TCP ports that are free."""
     for _ in range(50):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
             probe.bind((LOOPBACK, 0))
@@ -50,7 +50,7 @@ def ports_free(ports: Iterable[tuple[int, socket.SocketKind]]) -> bool:
 
 
 def unlocked(path: Path) -> bool:
-    """Return True where no other process holds a record lock (fcntl, not flock) on a file."""
+    """Return True if no other process holds a record lock (fcntl, not flock) on a file."""
     with contextlib.suppress(OSError):
         descriptor = os.open(path, os.O_RDWR)
         try:
@@ -63,7 +63,7 @@ def unlocked(path: Path) -> bool:
 
 
 GOODBYE_S = 2.0
-"""Time from SIGTERM to SIGKILL."""
+"""Time between SIGTERM and SIGKILL."""
 LOG_LINES = 12
 _PR_SET_PDEATHSIG = 1
 _LOG_TAIL_BYTES = 8192
@@ -74,7 +74,7 @@ class BinaryError(RuntimeError):
 
 
 def check_binary(path: Path, option: str = "--binary") -> Path:
-    """Return the absolute path of an executable."""
+    """Return the absolute path of an executable; raise BinaryError if it is missing or not executable."""
     path = path.expanduser()
     found = path if path.parent != Path() or path.exists() else Path(shutil.which(str(path)) or path)
     if not found.is_file():
@@ -127,7 +127,7 @@ class FirmwareProcess:
                 raise BinaryError(f"{self.command[0]}: cannot be run: {error.strerror}") from None
 
     async def stop(self) -> None:
-        """End it and all its children, as a power cut does: nothing more is saved."""
+        """Kill the firmware and all its children, as a power cut does: nothing more is saved."""
         process = self._process
         if process is None:
             return
@@ -140,13 +140,13 @@ class FirmwareProcess:
         self._process = None
 
     async def wait(self) -> None:
-        """Wait until it ends, and raise a BinaryError with the last lines of its log."""
+        """Wait until the process ends, then raise a BinaryError with the last lines of its log."""
         assert self._process is not None
         code = await self._process.wait()
         raise BinaryError(self._obituary(code))
 
     async def until(self, condition: Callable[[], bool], within_s: float, what: str) -> None:
-        """Wait for a condition; raise BinaryError if the process dies before, or after `within_s`."""
+        """Wait for a condition; raise BinaryError if the process dies first, or after `within_s`."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
         while not condition():
@@ -160,7 +160,7 @@ class FirmwareProcess:
             await asyncio.sleep(0.02)
 
     def log_tail(self, lines: int = LOG_LINES) -> list[str]:
-        """Last lines of its log, without blank ones."""
+        """Return the last lines of the process log, without blank lines."""
         try:
             with self.log.open("rb") as log:
                 log.seek(max(0, self.log.stat().st_size - _LOG_TAIL_BYTES))
@@ -180,11 +180,11 @@ class FirmwareProcess:
         return "" if not tail else " Its last words:\n  " + "\n  ".join(tail)
 
     def _signal(self, number: signal.Signals) -> None:
-        """Signal its group, whose id is the leader's process id."""
+        """Signal the process group, whose id is the leader's process id."""
         assert self._process is not None
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, number)
 
     def _die_with_us(self) -> None:
-        """Run in the child: end it when the simulator is killed (Linux)."""
+        """Run in the child: have it killed when the simulator is killed (Linux)."""
         self._libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

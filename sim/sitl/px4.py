@@ -15,7 +15,7 @@ from sim.sitl.process import LOOPBACK, BinaryError, FirmwareProcess, check_binar
 from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 
 INSTANCES = 10
-"""Beyond ten, the firmware gives several vehicles the same companion port."""
+"""Maximum number of instances; beyond ten, the firmware gives several vehicles the same companion port."""
 _TCP_SIMULATOR = 4560
 UDP_COMPANION, _UDP_COMPANION_LOCAL = 14540, 14580
 UDP_GROUND_LOCAL = 18570
@@ -30,17 +30,17 @@ MEASURING_PARAMETERS: dict[str, float] = {
     "CBRK_SUPPLY_CHK": 894281,
     "COM_ARM_WO_GPS": 1,
 }
-"""Set at the first boot only; later stored values are the firmware's own."""
+"""Parameters set at the first boot only; later the stored values are the firmware's own."""
 
 
 def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
-    """All ports of an instance or its peers, except the ground station's 14550, which all instances share."""
+    """Return all ports of an instance or its peers, except the ground station's 14550, which all instances share."""
     udp = (UDP_COMPANION, _UDP_COMPANION_LOCAL, UDP_GROUND_LOCAL, _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL)
     return [(_TCP_SIMULATOR + instance, socket.SOCK_STREAM)] + [(p + instance, socket.SOCK_DGRAM) for p in udp]
 
 
 def free_instance() -> int:
-    """The first instance whose ports and lock are free."""
+    """Return the first instance whose ports and lock are free."""
     for instance in range(INSTANCES):
         if unlocked(Path(f"/tmp/px4_lock-{instance}")) and ports_free(ports_of(instance)):  # noqa: S108 - PX4's own
             return instance
@@ -94,7 +94,7 @@ class Px4(FirmwareVehicle):
         return FirmwareProcess(command, self.folder)
 
     async def power_on(self) -> None:
-        """Start the binary with its stored parameters; without any, with ours."""
+        """Start the binary with its stored parameters; if there are none, with ours."""
         first: dict[str, str] = {}
         if not (self.folder / self.stored[0]).exists():
             first = {f"PX4_PARAM_{name}": f"{value:g}" for name, value in self._parameters.items()}
@@ -120,7 +120,7 @@ class Px4Sitl(Px4, SitlVehicle):
         return self.backend.physics_s if self.backend.locked else 0.0
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """True bias; each sensor has its own model."""
+        """Return the true bias; each sensor has a model of its own."""
         return self.imus[instance - 1].true_bias(t_s)
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:

@@ -26,10 +26,10 @@ from sim.station import open_udp
 STEP = np.array([1e-3] * 3 + [1e-3 * STANDARD_GRAVITY_M_S2] * 3)
 """Steps of the SCALED_IMU messages: mrad/s and mG."""
 SWAYS_STEPS = 10.0
-"""An aircraft that moves by more shows all digits in its integers."""
+"""Range of the true readings, in steps, above which no correction for truncation is needed: all digits occur."""
 _NEAR_S = 0.005
 _STEADY_SIGMA = 1.0 / math.sqrt(2.0)
-"""PX4 integrates by the trapezoid rule: an output is the mean of two samples (autopilots 9.3.2)."""
+"""Factor for the noise of PX4, whose output is the mean of two samples (trapezoid rule; autopilots 9.3.2)."""
 PX4_RATE_HZ = 250.0
 GRID = np.array(FIFO_STEPS)
 """Steps of PX4's sensor 0."""
@@ -64,7 +64,7 @@ async def mean_reading(vehicle: SitlVehicle, ground: GroundStation, instance: in
 
 
 async def residual(vehicle: SitlVehicle, ground: GroundStation, instance: int, seconds: float) -> Array:
-    """Excess of an IMU's reading over the truth of the aircraft, after its offsets; as in `mean_reading`."""
+    """Return an IMU's reading less the aircraft's truth, with the firmware's offsets applied; as in `mean_reading`."""
     aircraft, begun_s = vehicle.aircraft, vehicle.now_s
     ahead = np.concatenate(aircraft.truth(begun_s + np.linspace(0.0, min(seconds, 30.0), 301)), axis=1)
     if (np.ptp(ahead, axis=0) > SWAYS_STEPS * STEP).any():
@@ -90,7 +90,7 @@ async def _residual_on_the_move(vehicle: SitlVehicle, ground: GroundStation, ins
 
 
 def excess(aircraft: VirtualAircraft, rows: Array, times: Array) -> Array:
-    """Excess of readings of a swaying aircraft (6); their delay is fitted too.
+    """Return the mean excess (6) of readings over the truth of a swaying aircraft; the readings' delay is fitted too.
 
     Args:
         aircraft: the truth.
@@ -112,24 +112,24 @@ def excess(aircraft: VirtualAircraft, rows: Array, times: Array) -> Array:
 
 
 def _own_s(message: mavlink.MAVLink_message) -> float:
-    """Time by the firmware's clock."""
+    """Return the time by the firmware's clock."""
     fields = message.to_dict()
     return float(fields["time_usec"]) * 1e-6 if "time_usec" in fields else float(fields["time_boot_ms"]) * 1e-3
 
 
 async def _corrections(ground: GroundStation) -> tuple[list[float], list[float]]:
-    """Offsets and scales of PX4's first slots, gyro then accelerometer."""
+    """Return offsets and scales of PX4's first slots, gyro then accelerometer."""
     offset = [await ground.get(f"CAL_{sensor}0_{axis}OFF") for sensor in ("GYRO", "ACC") for axis in "XYZ"]
     return offset, [1.0, 1.0, 1.0, *[await ground.get(f"CAL_ACC0_{axis}SCALE") for axis in "XYZ"]]
 
 
 def gridded_mean(values: Array, sigma: float, grid: float, offset: float, scale: float = 1.0) -> float:
-    """Most likely mean of PX4's sensor 0: three rounded readings averaged 1 2 1, corrected, truncated; in last digits.
+    """Return the likeliest mean of PX4's sensor 0, in last digits; rounded, averaged 1 2 1, corrected, truncated.
 
     Args:
         values: the integers (n).
         sigma: sigma of one reading of the sensor.
-        grid: its steps.
+        grid: steps of the sensor.
         offset: subtracted by the firmware.
         scale: factor applied afterwards.
     """
@@ -156,7 +156,7 @@ def gridded_mean(values: Array, sigma: float, grid: float, offset: float, scale:
 
 
 def truncated_mean(values: Array, sigma: float) -> float:
-    """Most likely mean of Gaussian readings truncated towards zero, in units of the last digit.
+    """Return the likeliest mean of Gaussian readings truncated towards zero, in units of the last digit.
 
     Args:
         values: the integers (n).
@@ -188,7 +188,7 @@ def _log_likelihood(means: Array, sigmas: Array, below: Array, above: Array, cou
 
 
 def _phi(x: Array) -> Array:
-    """Integral of the normal distribution; the table is fine enough for counting."""
+    """Return the integral of the normal distribution from a table, which is fine enough for counting."""
     result: Array = np.interp(x, _GRID, _PHI)
     return result
 
@@ -200,21 +200,21 @@ _PHI = np.array([0.5 * (1.0 + math.erf(value / math.sqrt(2.0))) for value in _GR
 OBSERVE_S = 60.0
 """Length of each observation."""
 SETTLE_S = 40.0
-"""After a start: the estimator has its position and the first transients are over."""
+"""Time after a start in which the estimator finds its position and the first transients end."""
 OWN_CALIBRATION_S = 60.0
-"""ArduPilot's gyro calibration gives up after about 30 s; it must not be asked twice (autopilots 9.3.1)."""
+"""Timeout of ArduPilot's gyro calibration, which gives up after about 30 s; do not repeat it (autopilots 9.3.1)."""
 QUIET_S = 3.0
 GYROS, QUICK, LEVEL = (1.0,), (0.0, 0.0, 0.0, 0.0, 4.0), (0.0, 0.0, 0.0, 0.0, 2.0)
 """Parameters of MAV_CMD_PREFLIGHT_CALIBRATION: gyros; accelerometers by one pose; level."""
 _QUICK_NAME = {"ardupilot": "simple, param5 = 4", "px4": "quick, param5 = 4"}
 _LEVEL = {"ardupilot": ("AHRS_TRIM_X", "AHRS_TRIM_Y"), "px4": ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF")}
-"""Parameters set by a level calibration: rad, degrees."""
+"""Parameters that a level calibration sets: in rad for ArduPilot, degrees for PX4."""
 CALIBRATE_WITHIN_S = 420.0
-"""Time limit for two IMUs on a busy machine."""
+"""Timeout of the companion's calibration of two IMUs on a busy machine."""
 OWN_TRIES = 3
-"""Tries of the firmware's own gyro calibration: it averages 0.25 s, and one may be good by chance."""
+"""Number of tries of the firmware's own gyro calibration: it averages 0.25 s, so one result can be good by chance."""
 STILL = "[calibration]\nmin_still_s = 60\nmax_s = 60\n"
-"""Measure a whole minute, as the figures of autopilots 9.3.
+"""Settings to measure a whole minute, as for the figures of autopilots 9.3.
 
 By default the companion stops where the part's flicker, known from its profile, makes more averaging useless.
 """
@@ -273,7 +273,7 @@ async def ground_station(vehicle: FirmwareVehicle) -> AsyncIterator[GroundStatio
 
 
 async def own_calibration(vehicle: FirmwareVehicle, ground: GroundStation, *params: float) -> str:
-    """Run MAV_CMD_PREFLIGHT_CALIBRATION to its end; return its answer and texts."""
+    """Run MAV_CMD_PREFLIGHT_CALIBRATION until it ends; return its answer and texts."""
     loop = asyncio.get_running_loop()
     since_s = loop.time()
     result = await ground.command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, *params, wait_s=OWN_CALIBRATION_S)

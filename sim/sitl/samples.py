@@ -17,9 +17,9 @@ from sim.earth import Array
 from sim.imu_model import ImuModel
 
 BLOCK_S = 0.02
-"""Lead of the readings."""
+"""Time by which readings are made in advance."""
 JUMP_S = 0.25
-"""Lag behind the wall clock at which the aircraft's time jumps instead of hurrying."""
+"""Lag of aircraft time behind the wall clock at which it jumps instead of running faster."""
 _SLOWEST, _FASTEST = 0.8, 1.25
 _BLOCKS_KEPT = 30_000
 
@@ -37,8 +37,8 @@ class SampleBlocks:
     """Samples one frame apart, whose aircraft time follows the wall clock.
 
     A firmware's simulated time runs beside the wall clock, a little behind it on a busy machine; the serial devices of
-    the same aircraft live on the wall clock. So that both see the same motions, aircraft time is stretched by at most a
-    fifth while it catches up, and jumps when it is `JUMP_S` late. On a still aircraft none of this shows.
+    the same aircraft live on the wall clock. So that both see the same motions, aircraft time runs at 0.8 to 1.25 times
+    the firmware's speed, and jumps when it is `JUMP_S` late. On a motionless aircraft none of this shows.
     """
 
     def __init__(self, aircraft: VirtualAircraft, imus: Sequence[ImuModel]) -> None:
@@ -47,7 +47,7 @@ class SampleBlocks:
         self._samples: list[Sample] = []
         self._at = 0
         self.jumps = 0
-        """Number of times the machine was too slow to keep up."""
+        """Number of jumps, each because the machine was too slow."""
         self._track: deque[tuple[float, float]] = deque(maxlen=_BLOCKS_KEPT)
         self._own_s = 0.0
 
@@ -66,7 +66,7 @@ class SampleBlocks:
         self._own_s = 0.0
 
     def aircraft_times(self, own_s: Array) -> Array:
-        """Aircraft times of instants of the firmware's clock since its start, of the last ten minutes."""
+        """Return aircraft times for instants of the firmware's clock since its start, in the last ten minutes."""
         own, aircraft = np.array([*self._track, (self._own_s, self._next_s)]).T
         times: Array = np.interp(own_s, own, aircraft)
         return times

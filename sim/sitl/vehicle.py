@@ -17,30 +17,30 @@ from sim.sitl.process import FirmwareProcess
 from sim.sitl.samples import SampleBlocks
 
 BOOT_S = 60.0
-"""Limit of the boot: a binary that does not ask for physics by then never will."""
+"""Time limit of the boot: a binary that has not asked for physics by then never will."""
 
 SLOWEST = 10.0
-"""Wall seconds per second of the firmware, at most."""
+"""Largest ratio of wall time to the firmware's simulated time."""
 
 
 class Backend(Protocol):
-    """Gives a firmware its physics, or follows them."""
+    """Gives a firmware its physics, or follows the firmware's physics."""
 
     boots: int
-    """Starts of the firmware, including its own restarts."""
+    """Number of starts of the firmware, including its own restarts."""
 
 
 class FirmwareVehicle(ABC):
     """A firmware binary and a scenario's aircraft. An async context manager on a real event loop.
 
     Args:
-        scenario: the aircraft and its sensors; its double is not used.
+        scenario: the aircraft and its sensors; the scenario's autopilot double is not used.
         folder: folder for the binary's files, made if missing. Stored files survive `power_cycle`.
     """
 
     firmware: Firmware
     instances: tuple[int, ...] = (1,)
-    """IMUs to calibrate and observe: those whose telemetry resolves a mean to some deg/h."""
+    """IMUs to calibrate and observe: those whose telemetry resolves a mean to a few deg/h."""
     process: FirmwareProcess
     backend: Backend
     system_id: int
@@ -49,7 +49,7 @@ class FirmwareVehicle(ABC):
     ground_target: tuple[str, int]
     """Address to which the firmware sends for the ground station."""
     stored: tuple[str, ...]
-    """Names of the files with its parameters."""
+    """Names of the files with the firmware's parameters."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         self.scenario, self.folder = scenario, folder
@@ -63,14 +63,14 @@ class FirmwareVehicle(ABC):
 
     @abstractmethod
     def true_bias(self, instance: int, t_s: float) -> Bias:
-        """Bias of IMU `instance` (1..) of the firmware at an aircraft time."""
+        """Return the true bias of IMU `instance` (1..) of the firmware at an aircraft time."""
 
     @abstractmethod
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
         """Open the back end and make the process, not started."""
 
     async def __aenter__(self) -> Self:
-        """Start back end and binary, and wait until its simulated time passes."""
+        """Start back end and binary, and wait until the firmware's simulated time advances."""
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
             self.process = await self._open(self._stack)
@@ -93,7 +93,7 @@ class FirmwareVehicle(ABC):
         )
 
     async def power_off(self) -> None:
-        """Cut its power."""
+        """Cut the power of the autopilot."""
         await self.process.stop()
 
     async def power_cycle(self, off_s: float = 0.5) -> None:
@@ -102,14 +102,14 @@ class FirmwareVehicle(ABC):
         await self.power_on()
 
     async def factory_reset(self) -> None:
-        """Cut its power, delete its stored state, and start it again."""
+        """Cut the power, delete the stored state, and start the firmware again."""
         await self.power_off()
         for name in self.stored:
             (self.folder / name).unlink(missing_ok=True)
         await self.power_on()
 
     async def sleep(self, seconds: float) -> None:
-        """Wait for so much time on the firmware's clock, which a busy machine slows down."""
+        """Wait for a time on the firmware's clock, which a busy machine slows down."""
         begun_s, starts = self.physics_s, self.backend.boots
         async with asyncio.timeout(SLOWEST * seconds + 1.0):
             while self.backend.boots == starts and self.physics_s - begun_s < seconds:
