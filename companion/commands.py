@@ -148,7 +148,7 @@ class Calibrate(Command, frozen=True, tag="calibrate"):
         Literal["both", "gyros", "accelerometers"],
         Field(by=_ALL, flags={"gyros": "gyros only", "accelerometers": "accelerometers only"}),
     ] = "both"
-    wait: Annotated[bool, Field("wait for the end, show progress, print the record")] = False
+    wait: Annotated[bool, Field(by=Interface(0))] = False
     timeout_s: Annotated[
         _Seconds | None,
         _SECONDS._replace(
@@ -169,33 +169,23 @@ class Calibrate(Command, frozen=True, tag="calibrate"):
 
 
 class Align(Command, frozen=True, tag="align"):
-    help = "measure the gradienter's zero (by turning), how it sits, or the accelerometers"
+    help = "measure the gradienter's zero, or the accelerometers by hand"
     by = _SHELL | Interface.PAGE
     action: Annotated[
         Literal["zero", "tilts", "turn", "faces", "show", "forget"] | None,
-        Field(
-            "zero: on one spot; tilts: that, and 4 tilts; without a gradienter, turn: level on one spot;"
-            " faces: accelerometers, about 12 poses held by hand",
-            by=by,
-            flags={
-                "show": "the alignment that is kept",
-                "forget": "go back to the configuration's zero and sigma",
-            },
-            positional=True,
-        ),
+        Field(by=by),
     ] = None
     headings: Annotated[
         Literal[2, 4] | None,
         Field(
-            "2 (default for zero): turn by 180 deg, then on the same way to the start;"
-            " 4 (default for turn): every 90 deg",
+            "2 (default for zero): turn by 180 deg, then the same way to the start; 4 (default for turn): every 90 deg",
             by=by,
         ),
     ] = None
-    level: Annotated[bool, Field("turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)", by=by)] = False
-    write: Annotated[bool, Field("turn, faces: write what was found to the autopilot", by=by)] = False
+    level: Annotated[bool, Field("after faces: write the tilt of the board (AHRS_TRIM, SENS_BOARD)", by=by)] = False
+    write: Annotated[bool, Field("write the result to the autopilot", by=by)] = False
     wait: Annotated[bool, Field(by=Interface(0))] = True
-    timeout_s: Annotated[_Seconds | None, _SECONDS._replace(help="give up after so long (default 900)")] = None
+    timeout_s: Annotated[_Seconds | None, _SECONDS._replace(help="give up after this time (default 900)")] = None
 
 
 class Cancel(Command, frozen=True, tag="cancel"):
@@ -217,7 +207,7 @@ class Undo(Command, frozen=True, tag="undo"):
 
 
 class AutopilotSetup(Command, frozen=True, tag="autopilot-setup"):
-    help = "what the autopilot needs set: heading, gate, offsets"
+    help = "parameters that the autopilot needs for the gate, the offsets and the heading"
 
 
 class History(Command, frozen=True, tag="history"):
@@ -235,7 +225,7 @@ class History(Command, frozen=True, tag="history"):
 
 
 class Temperature(Command, frozen=True, tag="temperature"):
-    help = "how the gyros' biases follow the temperature, as far as seen"
+    help = "gyro biases over temperature, as measured so far"
     action: Annotated[
         Literal["write", "undo"] | None,
         Field(
@@ -253,7 +243,7 @@ class Temperature(Command, frozen=True, tag="temperature"):
 
 
 class RecordInputs(Command, frozen=True, tag="record"):
-    help = "record everything to a file until Ctrl-C (the last hour is kept anyway)"
+    help = "record all inputs to a file until Ctrl-C (the last hour is kept anyway)"
     file: Annotated[
         str | None,
         Field("default: one beside the daemon's own", metavar="FILE", positional=True, allowed_words="a path"),

@@ -117,8 +117,8 @@ class CompanionProcess:
         return answer
 
     async def calibrate(self, within_s: float, *, progress: int | None = None) -> Record:
-        """Run `companion calibrate --wait --json`; return the record. Progress goes to stderr or `progress`."""
-        words = ("calibrate", "--wait", "--timeout", str(within_s), "--json")
+        """Run `companion calibrate --json`; return the record. Progress goes to stderr or `progress`."""
+        words = ("calibrate", "--timeout", str(within_s), "--json")
         process = await asyncio.create_subprocess_exec(
             *self.command(*words), stdout=asyncio.subprocess.PIPE, stderr=progress
         )

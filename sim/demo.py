@@ -76,7 +76,7 @@ async def _run(folder: Path, seed: int) -> int:
         print("\nStarting the daemon: companion run", flush=True)
         daemon = await stack.enter_async_context(companion)
         await daemon.ready()
-        print("Calibrating all IMUs at once: companion calibrate --wait\n", flush=True)
+        print("Calibrating all IMUs at once: companion calibrate\n", flush=True)
         record = await daemon.calibrate(CALIBRATE_WITHIN_S)
         if record["state"] != "done":
             print(f"\nThe calibration {record['state']}: {record['reason']}", file=sys.stderr)
@@ -114,8 +114,8 @@ def _models(scenario: Scenario) -> dict[str, ImuModel]:
 
 
 async def _set_up(companion: CompanionProcess, scenario: Scenario, udp: int) -> None:
-    """Let `companion setup` write the configuration; the only input is the IMUs' sensor types."""
-    parts = [word for name, model in _models(scenario).items() for word in ("--part", f"{name}={model.spec.name}")]
+    """Let `companion setup` write the configuration; options answer what it cannot detect."""
+    parts = ["--part", f"own={scenario.serial_imu.spec.name}", "--law", scenario.gradienter_law]
     print(f"\nSetting up (half a minute at most): companion setup --yes {' '.join(parts)}", flush=True)
     ports = [str(companion.folder / name) for name in scenario.ports]
     answer = await companion.ask("setup", *ports, "--udp", str(udp), "--yes", *parts)

@@ -1,4 +1,4 @@
-"""`python -m sim rest FILE.csv`: a log of a simulated IMU at rest for hours, to try `companion profile` with."""
+"""`python -m sim rest FILE.csv`: a log of a simulated IMU at rest for hours, to try `companion log profile` with."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ def daemon(load: Load, *, recording: bool) -> Iterator[int]:
                 raise SystemExit(f"the daemon does not push:\n{log.read_text()}")
             if asked is None and companion_status(config) is not None:
                 asked = subprocess.Popen(
-                    [sys.executable, "-m", "companion", "-c", str(config), "calibrate", "--wait"],
+                    [sys.executable, "-m", "companion", "-c", str(config), "calibrate"],
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
                 )

@@ -12,23 +12,47 @@ import asyncio
 import logging
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Final
 
 from companion import __version__, config, messages
 from companion.cli.terminal import (
+    DONE,
     FAILED,
     NO_DAEMON,
     USAGE,
     Command,
+    Commands,
     DaemonRefusedError,
     Parser,
-    adder,
     how_to_start,
     print_json,
     print_lines,
 )
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
 from companion.links.system.process import OneLineFormatter
+
+GROUPS: Final = {
+    "every day": ("status", "calibrate", "cancel", "undo", "history", "report", "explain"),
+    "set-up": ("setup", "check", "ports", "align", "autopilot", "page", "service"),
+    "expert": ("run", "log", "ground", "fleet"),
+}
+"""Commands by group, in the order of `companion --help`."""
+
+
+class _Overview(Parser):
+    """Parser of the whole command line; its help lists the commands by group."""
+
+    commands: Commands
+
+    def format_help(self) -> str:
+        lines = ["companion: field self-calibration of gyro and accelerometer biases", ""]
+        for title, names in GROUPS.items():
+            lines += [f"{title}:", *(f"  {name:11}{self.commands[name].description}" for name in names)]
+        lines += ["", "companion COMMAND --help describes a command. All take --json (one JSON object on stdout),"]
+        lines += [f"and -c FILE (configuration; default {config.DEFAULT_PATH}). companion --version."]
+        return "\n".join([*lines, ""])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -73,14 +97,24 @@ def _parser() -> Parser:
     common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
     common.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
-    parser = Parser(
-        prog="companion", parents=[common], description="Field self-calibration of gyro and accelerometer biases."
-    )
+    parser = _Overview(prog="companion", parents=[common])
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
-    subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    add = adder(subcommands, common)
-    for module in (local, client, desk, profile):
-        module.add_commands(add)
-    ground.add_ground(subcommands, common)
-    ground.add_fleet(subcommands, common)
+    commands = Commands(parser, common, listed=False)
+    log = commands.group("log", "record, replay, learn a noise profile, judge a flight")
+    autopilot = commands.group("autopilot", "arming script, parameters and temperature curves of the autopilot")
+    local.add_commands(commands, autopilot)
+    client.add_commands(commands, autopilot, log)
+    desk.add_commands(log)
+    profile.add_commands(log)
+    ground.add_ground(commands)
+    ground.add_fleet(commands)
+    commands.add("help", partial(_help, parser), "describe a command").add_argument(
+        "words", nargs="*", metavar="COMMAND"
+    )
+    parser.commands = commands
     return parser
+
+
+async def _help(parser: Parser, options: argparse.Namespace) -> int:
+    parser.parse_args([*options.words, "--help"])
+    return DONE

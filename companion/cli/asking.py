@@ -46,16 +46,22 @@ class Asking:
             return
         self.say("", question.words, *([f"  {question.hint}"] if question.hint else []))
         while True:
-            print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
+            self._prompt(now)
             answer = (await self._line()).strip() or now
             if self._echoes:
                 self.say(answer)
+            if answer.lower() in ("?", "help"):
+                self.say(f"  {question.more or question.hint or 'docs/guide.md explains every step.'}")
+                continue
             try:
                 question.put(answer)
             except ConfigError as error:
                 self.say(f"  {error}")
             else:
                 return
+
+    def _prompt(self, now: str) -> None:
+        print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
 
     async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
         found = by_default
@@ -133,12 +139,15 @@ class PageAsking(Asking):
         with contextlib.suppress(asyncio.CancelledError):
             await self._serving
 
+    def _prompt(self, now: str) -> None:
+        print_lines(f"  [{now}] answer on the page >" if now else "  answer on the page >", end=" ")
+
     def say(self, *lines: str) -> None:
         super().say(*lines)
         self._lines += lines
 
     async def ask(self, question: Question) -> None:
-        shown = ("words", "hint", "now", "choices")
+        shown = ("words", "hint", "now", "choices", "more")
         self._question = {key: getattr(question, key) for key in shown}
         try:
             await super().ask(question)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,9 +13,9 @@ from typing import Final
 
 from companion import commands, messages
 from companion.cli import show
-from companion.cli.monitor import monitor
+from companion.cli.monitor import FIGURES, monitor
 from companion.cli.terminal import (
-    AddCommand,
+    Commands,
     DaemonRefusedError,
     add_fields,
     conclude,
@@ -22,6 +23,7 @@ from companion.cli.terminal import (
     print_lines,
     request_of,
 )
+from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
 from companion.links.system.connection import ask
 
@@ -29,58 +31,95 @@ SILENT_S: Final = 2.0  # Silence after which the command reports that it waits f
 
 
 CANCEL: Final = {"command": "cancel"}
+ALIGNMENTS: Final = {
+    "zero": ("the gradienter's zero, by turning it on one place", ("headings", "timeout_s")),
+    "tilts": ("the zero, and the accelerometers' scale on four tilts", ("timeout_s",)),
+    "turn": (
+        "accelerometers without a gradienter, by turning on one place",
+        ("headings", "level", "write", "timeout_s"),
+    ),
+    "faces": ("accelerometers by hand, in about 12 poses on any side", ("write", "timeout_s")),
+    "show": ("show the stored alignment", ()),
+    "forget": ("return to the zero and sigma of the configuration", ()),
+}
+"""Kinds of `companion align`: help, and the fields of the request that each uses."""
 
 
-def add_commands(add: AddCommand) -> None:
-    for kind, command in (
-        (commands.Status, status),
-        (commands.Calibrate, calibrate),
-        (commands.Align, align),
-        (commands.Cancel, cancel),
-        (commands.Undo, undo),
-        (commands.AutopilotSetup, setup),
-        (commands.History, history),
-        (commands.Temperature, temperature),
-        (commands.Monitor, monitor),
-        (commands.RecordInputs, record),
+def add_commands(top: Commands, autopilot: Commands, log: Commands) -> None:
+    for to, name, kind, command in (
+        (top, "status", commands.Status, status),
+        (top, "calibrate", commands.Calibrate, calibrate),
+        (top, "cancel", commands.Cancel, cancel),
+        (top, "undo", commands.Undo, undo),
+        (top, "history", commands.History, history),
+        (autopilot, "params", commands.AutopilotSetup, setup),
+        (autopilot, "temperature", commands.Temperature, temperature),
+        (log, "record", commands.RecordInputs, record),
     ):
-        add_fields(add(kind.name(), command, kind.help), kind, commands.Interface.COMMAND_LINE)
+        add_fields(to.add(name, command, kind.help), kind, commands.Interface.COMMAND_LINE)
+    top["status"].add_argument("--watch", action="store_true", help="go on until Ctrl-C")
+    option = top["calibrate"].add_argument
+    option("--no-wait", dest="wait", action="store_false", help="start it and return at once")
+    option("--wait", action="store_true", default=True, help=argparse.SUPPRESS)  # the default since 0.3
+    actions = top.group("align", commands.Align.help)
+    for action, (words, fields) in ALIGNMENTS.items():
+        sub = actions.add(action, align, words)
+        sub.set_defaults(action=action)
+        add_fields(sub, commands.Align, commands.Interface.COMMAND_LINE, fields)
 
 
-async def request(
-    options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None, *, in_place: bool = False
-) -> Object:
-    """Send a request to the daemon, show its progress on stderr, and return its result.
+class _Progress:
+    """Progress on stderr: on a terminal the last line counts in place; elsewhere a line is printed per step or 10 %."""
 
-    Ctrl-C sends the request `at_interrupt`, after the first reply; without one, the daemon continues. `in_place`: show
-    the progress on a single line that is overwritten.
+    def __init__(self) -> None:
+        self._in_place = sys.stderr.isatty()
+        self._line, self._step = "", ""
+
+    def show(self, percent: int, words: str) -> None:
+        line = f"[{percent:3d} %] {words}"
+        step = FIGURES.sub("", words) + ("" if self._in_place else f" {percent // 10}")
+        if self._in_place and line != self._line:
+            width = shutil.get_terminal_size().columns - 1
+            start = "\r" if step == self._step else "\n" if self._line else ""
+            sys.stderr.write(start)
+            print_lines(line[:width].ljust(len(self._line[:width])), end="", error=True)
+        elif step != self._step:
+            print_lines(line, error=True)
+        self._line, self._step = line, step
+
+    def close(self) -> None:
+        if self._in_place and self._line:
+            print_lines("", error=True)
+
+
+async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None) -> Object:
+    """Send a request, show its progress on stderr, return its result.
+
+    Ctrl-C after the first reply sends the request `at_interrupt`; None: the daemon continues.
 
     Raises:
         DaemonRefusedError: the daemon refuses the request.
     """
     reply: Object = {}
-    shown = ""
+    progress = _Progress()
     ends = "Ctrl-C ends the waiting alone" if at_interrupt is None else "Ctrl-C cancels"
     waiting = f"waiting for the daemon's answer; {ends}"
     silent = asyncio.get_running_loop().call_later(SILENT_S, lambda: print_lines(waiting, error=True))
     try:
         async for reply in ask(load_config(options).control.path, wanted):
             silent.cancel()
-            if reply["kind"] == "progress" and reply["text"] != shown:
-                shown = reply["text"]
-                if in_place:
-                    sys.stderr.write("\r")
-                    print_lines(f"{shown:78}", end="", error=True)
-                    continue
-                print_lines(f"[{reply['percent']:3d} %] {reply.get('word', reply['state'])}: {shown}", error=True)
+            if reply["kind"] == "progress":
+                progress.show(reply["percent"], f"{reply.get('word', reply['state'])}: {reply['text']}")
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:
             raise
-        return await request(options, at_interrupt)
+        reply = await request(options, at_interrupt)
+        if reply.get("reason") == "cancelled by companion cancel":
+            reply["reason"] = "Cancelled (Ctrl-C). Nothing was written."
+        return reply
     finally:
         silent.cancel()
-        if in_place and shown:
-            print_lines("", error=True)
+        progress.close()
     if reply.pop("kind") == "error":
         raise DaemonRefusedError(reply["reason"])
     return reply
@@ -93,6 +132,8 @@ def _conclude(options: argparse.Namespace, answer: Object, lines: Sequence[str],
 
 
 async def status(options: argparse.Namespace) -> int:
+    if options.watch:
+        return await monitor(options)
     answer = (await request(options, {"command": "status"}))["status"]
     return conclude(options, answer, show.status_lines(answer), good=True)
 
@@ -107,7 +148,7 @@ async def calibrate(options: argparse.Namespace) -> int:
 
 def _conclude_briefly(options: argparse.Namespace, reply: Object, *, good: bool = True) -> int:
     answer = {key: reply.get(key) for key in ("state", "reason")}
-    return _conclude(options, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
+    return _conclude(options, answer, [reply["reason"]], good=good)
 
 
 async def cancel(options: argparse.Namespace) -> int:
@@ -117,12 +158,24 @@ async def cancel(options: argparse.Namespace) -> int:
 async def undo(options: argparse.Namespace, kind: type[commands.Command] = commands.Undo) -> int:
     reply = await request(options, request_of(options, kind))
     answer = {key: reply.get(key) for key in ("state", "reason", "written", "undone", "undoable")}
-    lines = [f"{answer['state']}: {answer['reason']}", show.undo_line(answer["undoable"] or ())]
+    undone = (answer["undone"] or {}).get("what", "")
+    lines = [_heading(answer), *show.written_lines(answer["written"] or {})]
+    lines += ["automatic calibration is off until you calibrate"] if undone.endswith("calibration") else []
+    lines.append(show.undo_line(answer["undoable"] or ()))
     return _conclude(options, answer, lines, good=answer["state"] == "done")
 
 
 async def history(options: argparse.Namespace) -> int:
-    reply = await request(options, request_of(options, commands.History))
+    """Show the history: the daemon's, or without a daemon the stored one."""
+    try:
+        reply = await request(options, request_of(options, commands.History))
+    except DaemonUnreachableError as error:
+        if isinstance(error, DaemonDeniedError) or not (storage := load_config(options).storage.path).is_dir():
+            raise
+        from companion.storage.records import stored_history
+
+        print_lines(f"companion: {error}; the stored history:", error=True)
+        reply = stored_history(storage, options.limit)
     keys = ("numbers", "records", "armings", "by_hand", "interrupted", "flights")
     answer = {key: reply.get(key, []) for key in keys}
     return conclude(options, answer, show.history_lines(**answer), good=True)
@@ -165,7 +218,7 @@ async def record(options: argparse.Namespace) -> int:
     wanted, stop = request_of(options, commands.RecordInputs), {"command": "record", "stop": True}
     if "file" in wanted:
         wanted["file"] = str(Path.cwd() / wanted["file"])
-    answer = await request(options, wanted, stop, in_place=True)
+    answer = await request(options, wanted, stop)
     lines: list[str] = []
     if "file" in answer:
         lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
@@ -240,7 +293,7 @@ def stands_lines(record: Object) -> list[str]:
             f"gradienter zero: x {x:+.4f} y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally"
         )
         zero = [
-            "in the configuration the same is said by these lines (then: companion align --forget):",
+            "in the configuration the same is said by these lines (then: companion align forget):",
             "    [gradienter]",
             f"    offset_deg = [{configured[0] + x:.4f}, {configured[1] + y:.4f}]",
             f"    sigma_deg = {sigma:.4f}",

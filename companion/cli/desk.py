@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from companion.cli import show
-from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path, within
+from companion.cli.terminal import Commands, conclude, print_lines, storage_path, within
 from companion.errors import ConfigError, StorageError
 from companion.estimation.records.flight_record import (
     HEADS,
@@ -41,14 +41,14 @@ MOST_DIFFERENCES: Final = 20
 MOST_REASONS: Final = 12
 
 
-def add_commands(add: AddCommand) -> None:
-    player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
+def add_commands(log: Commands) -> None:
+    player = log.add("replay", replay, "calibrate from a recording, or from any log of an IMU at rest")
     player.add_argument(
         "files", nargs="+", type=Path, metavar="FILE",
         help="a recording (.mcap), or several that follow on one another; or a log (CSV; .ulg, .bin)",
     )  # fmt: skip
     _add_log_options(player)
-    command = add("flight", flight, "what a log of the autopilot says of a flight")
+    command = log.add("flight", flight, "judge a flight by the autopilot's log")
     command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
 
 
@@ -58,11 +58,11 @@ async def replay(options: argparse.Namespace) -> int:
     try:
         formats = [format_of(file) for file in options.files]
     except StorageError as error:
-        raise ConfigError(f"companion replay: {error}") from None
+        raise ConfigError(f"companion log replay: {error}") from None
     if set(formats) == {"recording"}:
         return _replay_recording(options)
     if len(formats) > 1:
-        raise ConfigError(f"companion replay: found {len(formats)} files; allowed with a log: one")
+        raise ConfigError(f"companion log replay: found {len(formats)} files; allowed with a log: one")
     return _replay_log(options, options.files[0])
 
 

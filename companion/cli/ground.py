@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from companion.cli.terminal import (
     DONE,
+    Commands,
     Parser,
     add_fields,
-    adder,
     conclude,
     print_lines,
     request_of,
@@ -41,9 +41,7 @@ _NEEDS_MORE: Final = (
 )
 
 
-def add_ground(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
-    words = "from the laptop on the ground, over the telemetry link (no ground station program needed)"
-    ground = commands.add_parser("ground", help=words, description=words)
+def add_ground(commands: Commands) -> None:
     link = Parser(add_help=False)
     link.add_argument("--url", type=_url, default=DEFAULT_URL, help=f"{URLS} (default {DEFAULT_URL})")
     option, of_byte = link.add_argument, within(1, 255, int)
@@ -51,7 +49,7 @@ def add_ground(commands: argparse._SubParsersAction[Parser], common: Parser) -> 
     option("--component", type=of_byte, default=191, metavar="N", help="the companion's component id (default 191)")
     option("--within", type=seconds, default=5.0, metavar="S", help="how long to look for the companion (default 5)")
     option("--signing-key-file", type=Path, metavar="FILE", help="sign, and believe nobody else (docs/security.md)")
-    add = adder(ground.add_subparsers(title="commands", metavar="COMMAND", required=True), common, link)
+    add = commands.group("ground", "the same from a laptop on the ground, over the telemetry link", link).add
     calibrate = add("calibrate", _calibrate, "calibrate now and show how it goes; Ctrl-C cancels")
     add_fields(calibrate, Calibrate, Interface.GROUND)
     for name, words in (
@@ -125,10 +123,8 @@ def _url(text: str) -> str:
 # --- fleet
 
 
-def add_fleet(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
-    words = "many aircraft: collect what they tell over MQTT in one database"
-    fleet = commands.add_parser("fleet", help=words, description=words)
-    add = adder(fleet.add_subparsers(title="commands", metavar="COMMAND", required=True), common)
+def add_fleet(commands: Commands) -> None:
+    add = commands.group("fleet", "collect the reports of many aircraft over MQTT in one database").add
     words = "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
     run = add("run", _run, words)
     words = "postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)"

@@ -7,7 +7,7 @@ import dataclasses
 import datetime
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,7 +18,7 @@ from companion.cli import show
 from companion.cli.terminal import (
     DONE,
     USAGE,
-    AddCommand,
+    Commands,
     Parser,
     conclude,
     config_path,
@@ -38,9 +38,7 @@ if TYPE_CHECKING:
     from companion.links.serial.ports import SerialPort
 
 
-def add_setup(add: AddCommand) -> None:
-    parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
-    option = parser.add_argument
+def _add_setup_options(option: Callable[..., argparse.Action]) -> None:
     option("ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all free ports)")
     option("--page", metavar="ADDRESS:PORT", help="ask on a page there, such as 0.0.0.0:8191 for a phone")
     option("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
@@ -63,34 +61,37 @@ async def setup(options: argparse.Namespace) -> int:
     return await session.setup(options)
 
 
-def add_commands(add: AddCommand) -> None:
-    add_setup(add)
+def add_commands(commands: Commands, autopilot: Commands) -> None:
+    add = commands.add
+    words = "find autopilot and sensors, ask for the rest, write the file"
+    _add_setup_options(add("setup", setup, words).add_argument)
     option = add("run", run, "run the daemon in the foreground").add_argument
     option("-v", "--verbose", action="store_true", help="log what happens in detail")
-    option = add("check", check, "check configuration, ports, sensors and autopilot; say what is wrong").add_argument
+    option = add("check", check, "check configuration, ports, sensors and autopilot").add_argument
     option("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
-    option = add("ports", ports, "list serial ports with their stable names").add_argument
+    option = add("ports", ports, "list the serial ports, and name what is connected (--listen)").add_argument
     words = "listen on these ports and name the devices (default: all free ports), for up to half a minute; sends"
     option("--listen", nargs="*", metavar="PORT", help=f"{words} nothing, but opening a port restarts an Arduino")
     words = "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it"
-    add("lua", lua, words)
-    installer = add("install-service", install, "start the companion at every boot: unit, udev rules, configuration")
+    autopilot.add("script", script, words)
+    service = commands.group("service", "start the companion at every boot, or no longer")
+    installer = service.add("install", install, "install the systemd unit, udev rules and a first configuration")
     installer.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
-    words = "take that away again; configuration and records stay"
-    for service in (installer, add("uninstall-service", install, words)):
-        service.set_defaults(installs=service is installer)
-        option = service.add_argument
+    remover = service.add("remove", install, "remove unit and rules; configuration and records stay")
+    for command in (installer, remover):
+        command.set_defaults(installs=command is installer)
+        option = command.add_argument
         option("--root", type=_absolute, default=Path("/"), metavar="DIR", help="for packages (default /)")
         option("--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)")
-    words = "make a page (one HTML file) of a calibration: needs no daemon, no network"
+    words = "make a page (one HTML file) of a calibration"
     option = add("report", report, words).add_argument
     option("record", nargs="?", type=within(1, 1e9, int), metavar="NUMBER", help="default: the latest")
     option("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
     option("--storage", type=Path, metavar="DIR", help="folder with records/ (default: as in the configuration)")
-    words = "explain a message: what causes it, what to do"
+    words = "explain a message: its cause, and what to do"
     option = add("explain", explain, words).add_argument
     option("words", nargs="+", metavar="WORDS", help="the message or a part of it, its identifier, or what it is about")
-    add("web-token", web_token, "where the page is, and the token that its buttons need")
+    add("page", page, "address of the page, and the token for its buttons")
 
 
 def _absolute(text: str) -> Path:
@@ -118,7 +119,7 @@ async def _first_run(path: Path) -> None:
 
     if is_writable(path):
         asks = Parser()
-        add_setup(lambda *_: asks)
+        _add_setup_options(asks.add_argument)
         await session.setup(asks.parse_args(FIRST_RUN, argparse.Namespace(json=False)), goes_on=True)
 
 
@@ -163,14 +164,14 @@ def _heard(heard: Heard | str) -> dict[str, object]:
     }
 
 
-async def lua(options: argparse.Namespace) -> int:
+async def script(options: argparse.Namespace) -> int:
     from companion.lua import ARMING_SCRIPT, INSTALLATION
 
-    script = ARMING_SCRIPT.read_text(encoding="utf-8")
+    text = ARMING_SCRIPT.read_text(encoding="utf-8")
     if options.json:
-        print_json({"name": ARMING_SCRIPT.name, "script": script, "installation": list(INSTALLATION)})
+        print_json({"name": ARMING_SCRIPT.name, "script": text, "installation": list(INSTALLATION)})
         return DONE
-    sys.stdout.write(script)
+    sys.stdout.write(text)
     for number, step in enumerate(INSTALLATION, 1):
         print_lines(f"{number}. {step}", error=True)
     return DONE
@@ -185,7 +186,7 @@ async def explain(options: argparse.Namespace) -> int:
     return conclude(options, answer, lines or [reason], good=bool(found))
 
 
-async def web_token(options: argparse.Namespace) -> int:
+async def page(options: argparse.Namespace) -> int:
     from companion.web.access import is_loopback, kept_token, page_url, split_address
 
     config = load_config(options)

@@ -27,7 +27,7 @@ SILENT_S: Final = 5.0
 """Time without a reply after which the monitor reports that the daemon is silent."""
 AGAIN_S: Final = 1.0
 
-_FIGURES: Final = re.compile(r"\d+([.,:]\d+)*")
+FIGURES: Final = re.compile(r"\d+([.,:]\d+)*")
 _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 
@@ -83,10 +83,10 @@ class _Lines:
     def show(self, status: Object) -> None:
         headline = summary.headline(status)
         tenths = (status["progress"] or 0) // 10
-        lines: dict[tuple[object, ...], str] = {(_FIGURES.sub("", headline), tenths): headline}
+        lines: dict[tuple[object, ...], str] = {(FIGURES.sub("", headline), tenths): headline}
         for _, name, words, _ in summary.rows(status):
             line = f"{name}: {words}"
-            lines[(_FIGURES.sub("", line),)] = line
+            lines[(FIGURES.sub("", line),)] = line
         self._print(lines | {(line,): line for line in show.end_lines(status)})
 
     def gone(self, why: str) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from companion.cli.desk import add_table_options, log_lines
-from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds, storage_path
+from companion.cli.terminal import Commands, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
@@ -28,8 +28,8 @@ LEAST_S: Final = 600  # Minimum time at rest: a profile from less fails its own 
 _UNITS: Final[dict[Triad, tuple[float, str, int]]] = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
-def add_commands(add: AddCommand) -> None:
-    sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
+def add_commands(log: Commands) -> None:
+    sub = log.add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
     add_table_options(sub)
@@ -77,7 +77,7 @@ async def profile(options: argparse.Namespace) -> int:
             raise ConfigError(f"--save: found IMUs {found}; allowed: one; say which with --imu")
         file = store.write(msgspec.structs.replace(results[0][0], name=options.save))
         lines.append(f'saved: {file}; profile = "{options.save}" in [[imu]] takes it, after a restart')
-        lines.append(f"check it: companion replay LOG --windows 60 --profile {file}")
+        lines.append(f"check it: companion log replay LOG --windows 60 --profile {file}")
     answer = {
         "state": "done" if good else "failed",
         "reason": "; ".join(refused),

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import msgspec
 
@@ -19,7 +19,7 @@ from companion.cli.asking import Asking, PageAsking
 from companion.cli.show import failures, finding_lines, problems
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
-from companion.config.sections import Config, Imu, Storage
+from companion.config.sections import Config, Imu, Law, Platform, Storage
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
@@ -28,7 +28,7 @@ from companion.links.serial.listening import ports_to_try
 from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
 from companion.setup import draft as drafting
-from companion.setup.draft import Draft, Question, part_key, storage_beside
+from companion.setup.draft import LAW_KEY, PLATFORMS, Draft, Question, mounting_of, one_of, part_key, storage_beside
 from companion.setup.survey import USUAL_PORTS, Survey, same_port, same_url, survey
 
 KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
@@ -37,6 +37,9 @@ WITHOUT: Final = {
     "compass": "no compass: the gyros' sigmas are a little wider",
 }
 CHECK_S: Final = 10.0
+SEARCH: Final = "search again"
+USUAL_URLS: Final = ("serial:/dev/ttyACM0:115200", "serial:/dev/serial0:921600", "udpin:0.0.0.0:14550")
+PLACES: Final = f"USB {USUAL_URLS[0]}, UART {USUAL_URLS[1]}, UDP {USUAL_URLS[2]}, or tcp:HOST:PORT."
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
 """Warning about the autopilot's IMUs 2 and 3: SCALED_IMU2 and SCALED_IMU3 have a resolution of 1 mrad/s and 1 mg."""
 
@@ -76,6 +79,7 @@ class _Session:
     def __init__(self, options: argparse.Namespace, asking: Asking, *, goes_on: bool = False) -> None:
         self.asking, self._goes_on = asking, goes_on
         self._so_far = "nothing was written"
+        self._measured: set[str] = set()  # Keys that the guided test has answered
         self._options = options
         self._path = config_path(options)
         self.answer: dict[str, Any] = {
@@ -115,11 +119,13 @@ class _Session:
             **{f"{device}.mounting": how for device, how in mountings.items()},
         }
         given = {key: words for key, words in asked.items() if words is not None}
+        _refuse_wrong(given)
         found = await self._listen(draft)
-        await self._take_autopilot(draft, found)
+        while not await self._take_autopilot(draft, found):
+            found = await self._listen(draft)
         for kind in KINDS:
             await self._take_device(draft, found, kind)
-        await self._ask(draft, list(draft.questions()), given)
+        await self._ask(draft, draft.questions(), given)
         daemon = await _daemon_status(draft.parsed())
         told: dict[str, str | None] = {}
         if daemon is not None:
@@ -129,13 +135,15 @@ class _Session:
         names = [imu["name"] for imu in draft.wanted["imu"]]
         to_ask = [name for name in names if told.get(name) is None or name in parts]
         given = {part_key(name): part for name, part in parts.items()}
-        await self._ask(draft, list(draft.part_questions(to_ask)), given)
+        await self._ask(draft, draft.part_questions(to_ask), given)
         draft.parsed()
         text = draft.result()
         self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
         if not drafting.holds(self._path, text):
             say("", f"{self._path} will say (and, as comments, all defaults):", "")
-            say(*(f"    {line}" for line in text.splitlines() if line and not line.startswith("#")))
+            lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+            followed = zip(lines, [*lines[1:], "["], strict=True)
+            say(*(f"    {line}" for line, after in followed if not (line.startswith("[") and after.startswith("["))))
             if not await self.asking.agrees("Write it?"):
                 raise CompanionError("not wanted")
             self._write(text)
@@ -180,8 +188,11 @@ class _Session:
             self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
         return found
 
-    async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
-        """Set the autopilot's url: the configured one if detected or in use, else a detected one, else a typed one."""
+    async def _take_autopilot(self, draft: Draft, found: Survey) -> bool:
+        """Set the autopilot's url: the configured one if detected or in use, else a detected one, else a typed one.
+
+        Returns False if the operator asks for another search.
+        """
         say, was = self.asking.say, draft.url
         heard = found.autopilots
         if self._options.mavlink is not None:
@@ -198,11 +209,21 @@ class _Session:
                 "no autopilot was heard (its port's protocol MAVLink 2? TX to RX? --mavlink URL names its place)"
             )
         else:
-            say(
-                "No autopilot was heard. Has it power? Is its port set to MAVLink 2? TX to RX, RX to TX, ground?",
-                "Where is it: serial:/dev/serial0:921600, udpin:0.0.0.0:14550, or tcp:HOST:PORT?",
-            )
-            await self.asking.ask(Question("Autopilot", "", draft.take_url))
+            return await self._ask_for_autopilot(draft)
+        return True
+
+    async def _ask_for_autopilot(self, draft: Draft) -> bool:
+        """Ask where the autopilot is; return False for a further search."""
+        again = False
+
+        def put(words: str) -> None:
+            nonlocal again
+            if not (again := words.strip().lower() in ("", SEARCH)):
+                draft.take_url(words)
+
+        self.asking.say("No autopilot was heard. Has it power? Is its port set to MAVLink 2? TX to RX, RX to TX?")
+        await self.asking.ask(Question("Where is the autopilot?", SEARCH, put, PLACES, (SEARCH, *USUAL_URLS), PLACES))
+        return not again
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
         """Choose one of the detected devices of a kind; keep the configured one if its port is in use."""
@@ -243,11 +264,12 @@ class _Session:
         await self.asking.ask(Question(f"{what}: which?", "1", put, choices=numbers))
         return chosen
 
-    async def _ask(self, draft: Draft, questions: Sequence[Question], given: dict[str, str]) -> None:
-        strange = given.keys() - {question.key for question in questions}
-        if strange:
-            raise ConfigError(f"{', '.join(sorted(strange))}: there is no such device to say it of")
+    async def _ask(self, draft: Draft, questions: Iterator[Question], given: dict[str, str]) -> None:
+        left = dict(given)
         for question in questions:
+            left.pop(question.key, None)
+            if question.key in self._measured:
+                continue
             if question.key in given:
                 try:
                     question.put(given[question.key])
@@ -255,10 +277,42 @@ class _Session:
                     raise ConfigError(f"{question.key}: {error}") from None
                 self.asking.say(f"{question.key}: {given[question.key]}")
             elif not self.asking.yes:
-                await self.asking.ask(question)
+                await self._ask_one(draft, question)
+            elif question.key == LAW_KEY and not question.now:
+                protocol = draft.wanted["gradienter"]["protocol"]
+                raise ConfigError(f"{LAW_KEY}: {protocol} does not tell; name it by --law, or test it (without --yes)")
             else:
                 guess = " (a guess)" if question.key in draft.guessed else ""
                 self.asking.say(f"{question.key}: {question.now}{guess}")
+        if left:
+            raise ConfigError(f"{', '.join(sorted(left))}: there is no such device to say it of")
+
+    async def _ask_one(self, draft: Draft, question: Question) -> None:
+        """Ask a question; for the law of the gradienter's readings, offer the guided test too."""
+        while True:
+            tests = False
+
+            def put(words: str, question: Question = question) -> None:
+                nonlocal tests
+                tests = question.key == LAW_KEY and words.strip().lower() == "test"
+                if not tests:
+                    question.put(words)
+
+            await self.asking.ask(dataclasses.replace(question, put=put))
+            if not tests:
+                return
+            from companion.daemon.process.check import find_law  # takes seconds on a small board
+
+            try:
+                law, yaw_deg = await find_law(draft.parsed(), self.asking.say)
+            except CompanionError as error:
+                self.asking.say(f"  The test has no result: {error}.")
+                continue
+            self._measured = {LAW_KEY, "gradienter.mounting"}
+            draft.put_law(law)
+            draft.put_mounting("gradienter", str(yaw_deg))
+            self.asking.say(f"  The gradienter reads {law}, and is turned by {yaw_deg} deg.")
+            return
 
     def _write(self, text: str) -> None:
         kept = drafting.put(self._path, text)
@@ -333,13 +387,27 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
         sigma_deg = parsed.gradienter.sigma_deg or tilt_sigma_deg(parsed.gradienter.protocol)
         until = f"until then accelerometers to {math.radians(sigma_deg) * 1e3:.1f} mg"
         yield f"{command} align zero   (once: the gradienter's zero; {until})"
-    yield f"{command} calibrate --wait   (disarmed, standing still, hands off)"
+    yield f"{command} calibrate   (disarmed, standing still, hands off)"
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
         yield f"{command} align faces --write   (once: accelerometers too, held by hand in six positions, 5 min)"
 
 
 # --- the IMUs of the autopilot
+
+
+def _refuse_wrong(given: dict[str, str]) -> None:
+    """Refuse wrong options before the search for devices, which takes half a minute."""
+    for key, words in given.items():
+        try:
+            if key.endswith("mounting"):
+                mounting_of(words)
+            elif key == LAW_KEY:
+                one_of(words, get_args(Law))
+            else:
+                one_of(PLATFORMS.get(words, words), get_args(Platform))
+        except ConfigError as error:
+            raise ConfigError(f"{key}: {error}") from None
 
 
 def _named_values(option: str, given: Sequence[str], allowed: str, names: Sequence[str] = ()) -> dict[str, str]:

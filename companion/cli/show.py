@@ -40,7 +40,9 @@ def record_lines(record: Object) -> list[str]:
     for imu in record["imus"]:
         lines += _imu_lines(imu)
     lines += [f"warning: {warning}" for warning in record["warnings"]]
-    return lines
+    written = sum(len(imu["written"]) for imu in record["imus"])
+    done = f"{written} parameters written to the autopilot; to restore them: companion undo"
+    return [*lines, done if written and record["state"] == "done" else "Nothing was changed on the autopilot."]
 
 
 def _magnetic_lines(magnetic: Object | None) -> list[str]:
@@ -67,10 +69,12 @@ def _imu_lines(imu: Object) -> list[str]:
 
 
 def written_lines(written: Object) -> list[str]:
-    return [
-        f"  {name:16} {_number(one['before'], '+.6f')} -> {one['after']:+.6f}  {outcome_word(one['outcome'])}"
-        for name, one in written.items()
-    ]
+    lines = []
+    for name, one in written.items():
+        values = [_number(one["before"], "+.6f"), _number(one["after"], "+.6f")]
+        first, last = reversed(values) if one["outcome"] == "rolled_back" else values
+        lines.append(f"  {name:16} {first} -> {last}  {outcome_word(one['outcome'])}")
+    return lines
 
 
 def axes(values: Sequence[float], sigmas: Sequence[float] | None, form: str, scale: float = 1.0) -> str:

@@ -10,9 +10,9 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Collection, Coroutine, Iterable
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, Self
 from urllib.parse import quote
 
 from companion import commands, config
@@ -27,8 +27,6 @@ USAGE: Final = 2
 NO_DAEMON: Final = 3
 
 Command = Callable[[argparse.Namespace], Coroutine[Any, Any, int]]
-AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
-"""Function that adds a subcommand to an argument parser, from its name, its coroutine and its help text."""
 
 
 class DaemonRefusedError(CompanionError):
@@ -117,11 +115,39 @@ class _Removed(argparse.Action):
         parser.error(str(refusal_of_words(parser.prog, self.option_strings[0])))
 
 
+MEANT: Final = {
+    "monitor": "status --watch",
+    "watch": "status --watch",
+    "web-token": "page",
+    "install-service": "service install",
+    "uninstall-service": "service remove",
+    "lua": "autopilot script",
+    "autopilot-setup": "autopilot params",
+    "temperature": "autopilot temperature",
+    "record": "log record",
+    "replay": "log replay",
+    "flight": "log flight",
+    "profile": "log profile",
+    "start": "service install (starts at every boot), or companion run (here and now)",
+    "stop": "cancel (the calibration); sudo systemctl stop companion (the service)",
+    "doctor": "check",
+    "test": "check",
+    "restore": "undo",
+    "install": "service install",
+}
+"""Commands by their names before 0.3, and by names that people try."""
+_NEAR: Final = 0.75  # Least ratio of `difflib` at which a word counts as misspelt
+
+
+def _misspelt(word: str, known: Iterable[str]) -> str | None:
+    return next(iter(difflib.get_close_matches(word, list(known), 1, _NEAR)), None)
+
+
 class Parser(argparse.ArgumentParser):
     """Argument parser that reports a usage error in one line, with a suggestion for a misspelt word."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
-        super().__init__(*arguments, **keywords)
+        super().__init__(*arguments, **{"allow_abbrev": False, **keywords})
         for command, _, option in (words.partition(" --") for words in COMMAND_LINE):
             if option and command == self.prog:
                 self.add_argument(f"--{option}", action=_Removed, nargs="?", help=argparse.SUPPRESS)
@@ -130,24 +156,50 @@ class Parser(argparse.ArgumentParser):
         print_lines(f"{self.prog}: {message} (see {self.prog} --help)", error=True)
         self.exit(USAGE)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        options, unknown = super().parse_known_args(args, namespace)
+        if word := next((word.partition("=")[0] for word in unknown if word.startswith("-")), None):
+            near = _misspelt(word, self._option_string_actions)
+            self.error(f"unknown option {word}{f'; did you mean {near}?' if near else ''}")
+        return options, unknown
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is None or value in action.choices or value is argparse.SUPPRESS:
             return
         if (refusal := refusal_of_words(self.prog, str(value))) is not None:
             self.error(refusal)
         choices = list(map(str, action.choices))
-        near = difflib.get_close_matches(str(value), choices, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"allowed: {', '.join(choices)}"
+        if self.prog == "companion" and (meant := MEANT.get(str(value))):
+            self.error(f"no command {value!r}; type companion {meant}")
+        near = _misspelt(str(value), choices)
+        if action.metavar == "COMMAND":
+            self.error(f"no command {str(value)!r}{f'; did you mean {near}?' if near else ''}")
+        hint = f"did you mean {near}?" if near else f"allowed: {', '.join(choices)}"
         raise argparse.ArgumentError(action, f"found {str(value)!r}; {hint}")
 
 
-def adder(to: argparse._SubParsersAction[Parser], *parents: Parser) -> AddCommand:
-    def add(name: str, command: Command, words: str) -> Parser:
-        sub = to.add_parser(name, parents=parents, help=words, description=words)
+class Commands:
+    """Commands of one parser, and the options that all of them have."""
+
+    def __init__(self, parser: Parser, *parents: Parser, listed: bool = True) -> None:
+        shown = None if listed else argparse.SUPPRESS
+        self._to = parser.add_subparsers(
+            title="commands", metavar="COMMAND", required=True, prog=parser.prog, help=shown, parser_class=Parser
+        )
+        self._parents = parents
+
+    def __getitem__(self, name: str) -> Parser:
+        return self._to.choices[name]
+
+    def add(self, name: str, command: Command, words: str) -> Parser:
+        sub = self._to.add_parser(name, parents=self._parents, help=words, description=words)
         sub.set_defaults(command=command)
         return sub
 
-    return add
+    def group(self, name: str, words: str, *parents: Parser) -> Self:
+        """Add a command that has commands of its own, with further common options."""
+        sub = self._to.add_parser(name, help=words, description=words)
+        return type(self)(sub, *self._parents, *parents)
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
@@ -169,9 +221,17 @@ seconds: Final = within(1e-3, 1e6, unit=" s")  # Type of an argument for a time 
 _ARGUMENTS: Final = {float: seconds, int: within(1, 1e6, int)}
 
 
-def add_fields(parser: argparse.ArgumentParser, kind: type[commands.Command], by: commands.Interface) -> None:
+def add_fields(
+    parser: argparse.ArgumentParser,
+    kind: type[commands.Command],
+    by: commands.Interface,
+    only: Collection[str] | None = None,
+) -> None:
+    """Add an option for each field of a command that the interface may set, or for those named in `only`."""
     groups: dict[str, argparse._ActionsContainer] = {}
     for name, field in kind.fields(by).items():
+        if only is not None and name not in only:
+            continue
         to: argparse._ActionsContainer = parser
         if group := field.group or (name if field.flags else ""):
             to = groups.get(group) or parser.add_mutually_exclusive_group(required=field.positional)

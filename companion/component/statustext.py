@@ -38,7 +38,7 @@ LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
 GOES_ON = "... "  # Beginning of a line that continues the one before
-SPOKEN = 4  # Number of spoken texts stored for the web page and `companion monitor`
+SPOKEN = 4  # Number of spoken texts stored for the web page and `companion status --watch`
 STALE_S = 20.0
 """Age at which a text that waits for the link is dropped; results of jobs are never dropped for age."""
 RECENT_TEXTS = 32

@@ -111,4 +111,4 @@ def _with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
 
 def _allowed(names: Sequence[str]) -> str:
     known = ", ".join(f'"{each}"' for each in (*CATALOGUE, *sorted(names)))
-    return f"{known}, or one that companion profile --save has saved"
+    return f"{known}, or one that companion log profile --save has saved"

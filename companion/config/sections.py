@@ -49,7 +49,7 @@ def _range(words: str, entry: str) -> range:
 
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-"""Names of the built-in noise profiles of IMUs; `companion profile --save` estimates and saves further ones."""
+"""Names of the built-in noise profiles of IMUs; `companion log profile --save` estimates and saves further ones."""
 UNKNOWN: Final[Profile] = "unknown"
 """Noise profile for an IMU of unknown type: as noisy as the worst of the common types."""
 GradienterProtocol = Literal[
@@ -129,7 +129,7 @@ class AllanModel(msgspec.Struct, frozen=True):
 
 
 class NoiseProfile(msgspec.Struct, frozen=True):
-    """Noise of one type of IMU: a built-in profile, or one estimated by `companion profile --save`."""
+    """Noise of one type of IMU: a built-in profile, or one estimated by `companion log profile --save`."""
 
     name: NonEmpty
     gyro: AllanModel
@@ -159,6 +159,11 @@ class Imu(Section, frozen=True):
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
     read_only: bool = False  # True: nothing is ever sent to the device on this port
     profile: str | NoiseProfile | None = None  # Noise profile: a built-in one (`Profile`), or a saved one
+
+    @property
+    def is_flown(self) -> bool:
+        """Whether the autopilot flies with this IMU."""
+        return self.source == "autopilot" or self.autopilot_instance is not None
 
 
 class Gradienter(Section, frozen=True):

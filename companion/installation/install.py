@@ -136,7 +136,7 @@ def start_service(run: Run | None = None) -> Iterator[InstallStep]:
 
 
 def how_to_start() -> str:
-    return _START_PACKAGED if _is_packaged() else "sudo companion install-service"
+    return _START_PACKAGED if _is_packaged() else "sudo companion service install"
 
 
 def uninstall(target: Installation, run: Run | None = None) -> Iterator[InstallStep]:

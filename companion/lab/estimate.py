@@ -41,7 +41,7 @@ _REMEDIES: Final = Remedies(
     "say --latitude-deg",
     "say --height-m",
     no_heading="no --heading-deg",
-    part="name its part (--profile), or learn it (companion profile)",
+    part="name its part (--profile), or learn it (companion log profile)",
     mounting="--mounting {}",
     any_bias="--any-bias takes it",
 )

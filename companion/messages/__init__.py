@@ -42,6 +42,7 @@ KINDS: Final[Mapping[Kind, str]] = {
 ANY: Final = "…"
 NO_MATCH: Final = "Type the line from the screen, or find the topic in docs/index.md"
 _CERTAIN_LETTERS: Final = 8  # Minimum number of letters in a pattern that can identify a message in a longer line
+_LONGEST: Final = 300  # Characters of a line that are searched: the time grows with a power of its length
 _SIMILAR: Final = 0.8  # Minimum similarity (difflib's ratio) at which a word counts as misspelt
 _LEAST_SCORE: Final = 0.4  # Minimum share of the searched words, by weight, that a found message must contain
 _NAMED: Final = 0.1  # Bonus for a message that has one of the searched words in its key `words`
@@ -87,7 +88,7 @@ def message(identifier: str, **fields: object) -> str:
 
 def explain(line: str) -> tuple[str, Entry] | None:
     """Find the message that a line of text contains, the longest one if it contains several; None: there is none."""
-    shown = [(letters, identifier) for letters, identifier, pattern in _patterns() if pattern.search(line)]
+    shown = [(letters, identifier) for letters, identifier, pattern in _patterns() if pattern.search(line[:_LONGEST])]
     return (found := max(shown)[1], catalogue()[found]) if shown else None
 
 

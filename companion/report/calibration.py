@@ -10,6 +10,7 @@ from typing import Final
 
 from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord, ImuRecord, Outcome, Record, outcome_word
+from companion.messages import remedy
 from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, join, row, tag
 from companion.report.page import (
@@ -36,8 +37,8 @@ _ARMED: Final = attrgetter("armed_at", "state", "reason")
 _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
     "verified": ("ok", "read back, and seen in the telemetry"),
     "stored": ("warn", "read back; its effect could not be seen"),
-    "failed": ("bad", "not set, or not put back"),
-    "rolled_back": ("warn", "the old value is in force again"),
+    "failed": ("bad", "not set, or not restored"),
+    "rolled_back": ("warn", "the old value is active again"),
 }
 
 
@@ -98,6 +99,7 @@ def calibration_page(
         _headline(number, record),
         damaged(problems),
         _warnings(record),
+        tag("p", "±: one sigma of the next minutes.", class_="soft") if record.imus else None,
         *(_imu(imu) for imu in record.imus[:MAX_IMUS]),
         card("caution", f"{more} more IMUs are not shown.") if more > 0 else None,
         _written(record),
@@ -116,7 +118,7 @@ def _headline(number: int, record: Record) -> Markup:
         tag("p", tag("span", record.state.upper(), class_=f"state {record.state}")),
         tag("p", _in_short(record), class_="lead"),
         tag("p", record.reason) if record.state == "done" else card("alarm", tag("p", record.reason)),
-        card("alarm", f"Undone {moment(undone)}: the values from before are in force again.") if undone else None,
+        card("alarm", f"Undone {moment(undone)}: the values from before are active again.") if undone else None,
     )
 
 
@@ -141,64 +143,72 @@ def _warnings(record: Record) -> Markup | None:
     more = len(found) - MAX_WARNINGS
     return join(
         tag("h2", "Warnings"),
-        *(card("caution", tag("p", words)) for words in found[:MAX_WARNINGS]),
+        *(card("caution", tag("p", words), tag("p", remedy(words), class_="soft")) for words in found[:MAX_WARNINGS]),
         card("caution", f"{more} more warnings are not shown.") if more > 0 else None,
-        tag("p", "What to do about each: docs/messages.md."),
     )
 
 
 def _imu(imu: ImuRecord) -> Markup:
     temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
-    is_corrected = imu.residual_gyro_rad_s or imu.residual_accel_m_s2
-    residual = " residual: error of its output before this write." if is_corrected else None
+    found = [triad for triad in TRIADS if imu.of(triad).bias is not None]
+    names = " and ".join(NAMES[triad].lower() for triad in TRIADS if triad not in found)
+    held = ", ".join(NAMES[triad].lower() for triad in TRIADS if triad in imu.held_back)
+    heads = [f"{NAMES[triad]}, {UNITS[triad].name}" for triad in found]
+    cells = zip(AXES, *(_column(imu, triad) for triad in found), strict=True)
     return join(
         tag("h2", f"IMU {imu.name}"),
         tag("p", f"{imu.samples} samples, {temperature}", class_="soft"),
-        tag("p", "σ use: one sigma for the next minutes. σ stat: what averaging left.", residual, class_="soft"),
-        tag("div", *(_triad(imu, triad) for triad in TRIADS), class_="pairs"),
+        card("caution", f"{names.capitalize()} not determined: not requested, or a warning says why.")
+        if names
+        else None,
+        card("caution", f"Held back: {held} measured, not written.") if held else None,
+        tag("table", tag("tr", *(tag("th", words) for words in ["", *heads])), *(row(*line) for line in cells)),
+        tag("details", tag("summary", "Noise and change"), *(_details(imu, triad) for triad in found))
+        if found
+        else None,
     )
 
 
-def _triad(imu: ImuRecord, triad: Triad) -> Markup:
+def _column(imu: ImuRecord, triad: Triad) -> list[str]:
+    bias, _, use, *_ = imu.of(triad)
+    assert bias is not None
+    assert use is not None
+    return [" ± ".join(with_sigma(bias[k], use[k], UNITS[triad].si)) for k in range(3)]
+
+
+def _details(imu: ImuRecord, triad: Triad) -> Markup:
+    """Show what averaging left of the noise, and the error of the output before the write."""
     unit, unit_name, _ = UNITS[triad]
-    bias, stat, use, _, left, _ = imu.of(triad)
-    title = tag("h3", f"{NAMES[triad]}, {unit_name}")
-    if bias is None or stat is None or use is None:
-        return tag("div", title, card("caution", "Not determined: not asked for, or a warning above says why."))
-    rows = []
-    for k in range(3):
-        value, sigma = with_sigma(bias[k], use[k], unit)
-        residual = with_sigma(left[k], use[k], unit)[0] if left else None
-        rows.append(row(AXES[k], value, f"±{sigma}", with_sigma(0.0, stat[k], unit)[1], residual))
-    heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]
-    held = card("caution", "Held back: measured, not written. What was in force before still is.")
-    return tag(
-        "div",
-        title,
-        held if triad in imu.held_back else None,
-        tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows),
-    )
+    _, stat, use, _, left, _ = imu.of(triad)
+    assert stat is not None
+    assert use is not None
+    heads = ["", "σ after averaging", *(["error before the write"] if left else [])]
+    rows = [
+        row(AXES[k], with_sigma(0.0, stat[k], unit)[1], with_sigma(left[k], use[k], unit)[0] if left else None)
+        for k in range(3)
+    ]
+    table = tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows)
+    return tag("div", tag("h3", f"{NAMES[triad]}, {unit_name}"), table)
 
 
 def _written(record: Record) -> Markup | None:
-    if not any(imu.written for imu in record.imus):
+    outcomes = [one.outcome for imu in record.imus for one in imu.written.values()]
+    if not outcomes:
         return None
-    parts: list[Child] = [tag("h2", "Written to the autopilot")]
-    seen: set[Outcome] = set()
+    parts: list[Child] = [tag("summary", f"{len(outcomes)} parameters")]
     for imu in record.imus[:MAX_IMUS]:
         if not imu.written:
             continue
         rows = []
         for name, one in imu.written.items():
-            seen.add(one.outcome)
-            class_, _ = _OUTCOMES[one.outcome]
-            head = tag("td", name, ": ", tag("strong", outcome_word(one.outcome), class_=class_), colspan="3")
-            values = (("before", one.before), ("after", one.after), ("read back", one.read_back))
-            cells = [tag("td", tag("small", words), _setting(value)) for words, value in values]
-            rows += [row(head, class_="name"), row(*cells, class_="values")]
+            words = tag("strong", outcome_word(one.outcome), class_=_OUTCOMES[one.outcome][0])
+            read = [f"; read back {_setting(one.read_back)}"] if one.read_back != one.after else []
+            rows += [row(tag("td", name, ": ", words, colspan="2"), class_="name")]
+            rows += [row(tag("td", _setting(one.before), " → ", _setting(one.after), *read), class_="values")]
         parts += [tag("h3", f"IMU {imu.name}"), tag("table", *rows, class_="setting")]
-    parts += [tag("p", f"{outcome_word(outcome)}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in sorted(seen)]
-    return tag("section", *parts)
+    seen = sorted(set(outcomes))
+    parts += [tag("p", f"{outcome_word(outcome)}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in seen]
+    return tag("section", tag("h2", "Written to the autopilot"), tag("details", *parts))
 
 
 def _setting(value: float | None) -> str:
@@ -228,7 +238,7 @@ def _angle(value: float | None, sigma: float | None, sign: str) -> str:
     return f"{value:{sign}.2f} deg" if sigma is None else f"{' ± '.join(with_sigma(value, sigma, 1.0, sign))} deg"
 
 
-def _drift(records: Numbered) -> Markup:
+def _drift(records: Numbered) -> Markup | None:
     number, record = records[-1]
     names = [imu.name for imu in record.imus] or [imu.name for _, one in records for imu in one.imus]
     parts: list[Child] = [tag("h2", "Biases up to now")]
@@ -243,7 +253,7 @@ def _drift(records: Numbered) -> Markup:
         if figures:
             parts += [tag("h3", f"IMU {name}"), tag("div", *figures, class_="pairs")]
     if len(parts) == 1:
-        parts.append(card("", "Fewer than two finished calibrations: nothing to compare with yet."))
-    elif record.state == "done":
+        return None
+    if record.state == "done":
         parts.append(tag("p", "The ring is this calibration.", class_="soft"))
     return tag("section", *parts)

@@ -27,8 +27,18 @@ from companion.rotations import ROTATIONS_DEG
 from companion.setup.document import Table, render
 from companion.storage.state import read_regular, write_atomically
 
-UNDOCUMENTED_LAW: Final = "axis"
+_PLACEHOLDER: Final = "axis"  # Law until the operator or the guided test names it
+PLATFORMS: Final = {"boat": "deck", "ship": "deck", "car": "deck"}
+_LAWS: Final = (
+    "axis: elevation of each axis above the horizon (servo, MEMS inclinometers). slope: slope of the liquid's surface"
+    " (five-pin electrolytic vials). euler: pitch and roll (attitude sensors, compasses). test: two tilts find out."
+)
+_DECK: Final = (
+    "deck: everything that sways or turns while the aircraft stands on it: a boat, a dock, a car with its engine on."
+    " It takes longer, and gyros need a compass."
+)
 _LASTING: Final = {"name", "source", "mounting", "profile", "autopilot_instance"}
+LAW_KEY: Final = "gradienter.law"
 _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compass", "imu": "companion's own IMU"}
 
 
@@ -42,6 +52,7 @@ class Question:
     """Function that stores the operator's answer in the draft; it raises ConfigError for a wrong answer."""
     hint: str = ""
     choices: Sequence[str] = ()  # Answers that a page shows as buttons
+    more: str = ""  # Answer to "?" and "help"
     key: str = ""
 
 
@@ -124,9 +135,9 @@ class Draft:
                 section[key] = value
         if kind == "gradienter" and "law" not in section:
             known = PROTOCOLS["gradienter"][protocol].law
-            section["law"] = known or UNDOCUMENTED_LAW
+            section["law"] = known or _PLACEHOLDER
             if known is None:
-                self.guessed.add("gradienter.law")
+                self.guessed.add(LAW_KEY)
 
     def other_imus(self) -> list[Table]:
         imus = self.wanted["imu"]
@@ -144,20 +155,23 @@ class Draft:
         yield Question(
             "Where is it calibrated: on the ground, or on a deck (a boat)?",
             self.wanted.get("vehicle", {}).get("platform", "ground"),
-            lambda words: self._put("vehicle", "platform", one_of(words, get_args(Platform)), "ground"),
+            self._put_platform,
             choices=get_args(Platform),
+            more=_DECK,
             key="vehicle.platform",
         )
         if (gradienter := self.section("gradienter")) is not None:
             known = PROTOCOLS["gradienter"][gradienter["protocol"]].law
-            unknown = "Its data sheet tells, or docs/calibration.md. A wrong one costs milli-g."
+            unknown = "Its data sheet tells; a wrong one costs milli-g. A test of a minute finds out: two tilts."
+            guessed = LAW_KEY in self.guessed
             yield Question(
-                "What do the gradienter's two readings mean: axis, slope or euler?",
-                gradienter["law"],
-                lambda words: self._put("gradienter", "law", one_of(words, get_args(Law))),
+                f"What do the gradienter's readings mean: axis, slope{', euler or test?' if guessed else ' or euler?'}",
+                "" if guessed else gradienter["law"],
+                self.put_law,
                 f"Its documents say {known}." if known else unknown,
-                get_args(Law),
-                "gradienter.law",
+                (*get_args(Law), *(["test"] if guessed else [])),
+                more=_LAWS,
+                key=LAW_KEY,
             )
         kinds: Sequence[Kind] = ("gradienter", "compass", "imu")
         for kind in kinds:
@@ -165,10 +179,10 @@ class Draft:
                 yield Question(
                     f"How is the {_NAMES[kind]} turned in the aircraft, seen from above: 0, 90, 180 or 270?",
                     mounting_words(section.get("mounting", "ROTATION_NONE")),
-                    functools.partial(self._put_mounting, kind),
+                    functools.partial(self.put_mounting, kind),
                     "Degrees clockwise; 0: its front is to the aircraft's front. Or ROLL PITCH YAW, or ROTATION_...",
                     ("0", "90", "180", "270"),
-                    f"{kind}.mounting",
+                    key=f"{kind}.mounting",
                 )
 
     def part_questions(self, names: Collection[str]) -> Iterator[Question]:
@@ -192,7 +206,7 @@ class Draft:
                 f"Its board's data sheet says; any other part: {UNKNOWN}, whose noise is learned at rest. Gyros known,"
                 f" at best, to: {price} deg/h.",
                 choices,
-                key,
+                key=key,
             )
 
     def _put_part(self, imu: Table, key: str, choices: Sequence[str], words: str) -> None:
@@ -202,8 +216,15 @@ class Draft:
             imu["profile"] = part
         self.guessed.discard(key)
 
-    def _put_mounting(self, kind: Kind, words: str) -> None:
-        self._put(kind, "mounting", _mounting(words), "ROTATION_NONE")
+    def _put_platform(self, words: str) -> None:
+        platform = PLATFORMS.get(words.strip().lower(), words)
+        self._put("vehicle", "platform", one_of(platform, get_args(Platform)), "ground")
+
+    def put_law(self, words: str) -> None:
+        self._put("gradienter", "law", one_of(words, get_args(Law)))
+
+    def put_mounting(self, kind: Kind, words: str) -> None:
+        self._put(kind, "mounting", mounting_of(words), "ROTATION_NONE")
 
     def _put(self, name: str, key: str, value: Any, default: Any = None) -> None:
         before = copy.deepcopy(self.wanted)
@@ -236,7 +257,8 @@ def one_of(words: str, allowed: Sequence[str]) -> str:
     return found[0]
 
 
-def _mounting(words: str) -> str | list[float]:
+def mounting_of(words: str) -> str | list[float]:
+    """Return the mounting that an answer means; raise ConfigError for none."""
     name = words.strip().upper().replace(" ", "_")
     for candidate in (name, f"ROTATION_{name}"):
         if candidate in ROTATIONS_DEG:

@@ -20,7 +20,8 @@ from companion.errors import StorageError
 from companion.estimation.records import align_record, flight_record, history, record
 from companion.estimation.records.flight_record import KeptFlight
 from companion.estimation.records.record import ArmingRecord, Record
-from companion.storage.changes import ChangeSet
+from companion.formats import Object
+from companion.storage.changes import ChangeSet, interruptions_in
 from companion.storage.state import BoundedList, StateFile, numbers_in
 
 logger = logging.getLogger(__name__)
@@ -156,6 +157,32 @@ def alignments_in(directory: Path) -> BoundedList[Done]:
 
 def armings_in(directory: Path) -> BoundedList[ArmingRecord]:
     return BoundedList(directory / "armings.json", ArmingRecord, KEEP_ARMINGS)
+
+
+def stored_history(directory: Path, limit: int | None) -> Object:
+    """Read what `companion history` shows, the newest first; `in_force` of alignments is unknown without the autopilot.
+
+    Raises:
+        StorageError: a folder or file cannot be read.
+    """
+    armings = armings_in(directory).all()[::-1]
+    by_calibration: dict[str | None, list[ArmingRecord]] = {}
+    for arming in reversed(armings):
+        by_calibration.setdefault(arming.calibration, []).append(arming)
+    records = RecordStore(directory).newest(limit)
+    shown = [
+        msgspec.structs.replace(record, armings=tuple(by_calibration.get(record.started_at, ())))
+        for record in records.values()
+    ]
+    flights = FlightStore(directory).newest(limit)
+    return {
+        "numbers": list(records),
+        "records": msgspec.to_builtins(shown),
+        "armings": msgspec.to_builtins(armings[:limit]),
+        "by_hand": [{**msgspec.to_builtins(done), "in_force": None} for done in alignments_in(directory).all()[::-1]],
+        "interrupted": msgspec.to_builtins(interruptions_in(directory).all()[::-1][:limit]),
+        "flights": [msgspec.to_builtins(kept) | {"number": number} for number, kept in flights.items()],
+    }
 
 
 BIASES_VERSION: Final = 2

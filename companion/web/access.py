@@ -112,9 +112,9 @@ class Access:
         """Return the reason to refuse an action without the right token in its headers; None: accept."""
         given = _bare(headers.get(TOKEN_HEADER, ""))
         if not given:
-            return "needs the token: companion web-token, on the board, shows it"
+            return "needs the token: companion page, on the board, shows it"
         if not secrets.compare_digest(given.encode(), _bare(self.token).encode()):
             if self.handed_out:
                 return "the page was restarted: try again"
-            return "wrong token: companion web-token, on the board, shows the right one"
+            return "wrong token: companion page, on the board, shows the right one"
         return None

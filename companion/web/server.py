@@ -110,7 +110,7 @@ class Page:
     def status(self) -> Object:
         return {
             "good": self.problem is None,
-            "summary": self.problem or self.url + ("" if self.local else " (buttons: companion web-token)"),
+            "summary": self.problem or self.url + ("" if self.local else " (buttons: companion page)"),
             "url": None if self.problem else self.url,
             "viewers": len(self._viewers),
             "wrong_tokens": self._wrong_tokens,
@@ -220,7 +220,7 @@ class Page:
         """Return the reason to refuse a viewer; None: accept. If 16 are there, one with the token replaces another."""
         if not viewer.has_token:
             if len(self._viewers) >= MAX_VIEWERS:
-                return f"{MAX_VIEWERS} are looking already; the token makes room: companion web-token, on the board"
+                return f"{MAX_VIEWERS} are looking already; the token makes room: companion page, on the board"
             alike = sum(other.peer == viewer.peer and not other.has_token for other in self._viewers)
             if not self.local and alike >= MAX_STRANGERS:
                 return f"{MAX_STRANGERS} from this address are looking already without the token"

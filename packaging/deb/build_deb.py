@@ -94,7 +94,7 @@ def build(python: str, extras: str, work: Path, output: Path) -> Path:
     list_what_is_there(packages)
     retarget(interpreter, stage)
     system_files(stage)
-    metadata = read_metadata(next(packages.glob("companion-*.dist-info")))
+    metadata = read_metadata(next(packages.glob("mavlink_imu_calibration-*.dist-info")))
     version = f"{metadata['Version']}-1+{interpreter.name.replace('thon', '').replace('.', '')}"
     documents(stage, packages, version)
     settle(stage)
@@ -173,7 +173,7 @@ def install(interpreter: Path, extras: str, work: Path, wheels: Path, stage: Pat
     run(interpreter, "-m", "venv", "--symlinks", "--without-pip", home)
     pip = (work / "tools/bin/pip", "--python", home / "bin/python3", "install")
     quiet = ("--quiet", "--disable-pip-version-check", "--no-index", "--no-compile", "--find-links", wheels)
-    run(*pip, *quiet, f"companion[{extras}]" if extras else "companion")
+    run(*pip, *quiet, f"mavlink-imu-calibration[{extras}]" if extras else "mavlink-imu-calibration")
     return home / "lib" / interpreter.name / "site-packages"
 
 

@@ -61,11 +61,11 @@ version=$(dpkg-deb -f "$package" Version)
 expect 0 "^companion ${version%%-*}$" companion --version
 expect 0 'calibrate' companion --help
 expect 0 'ports\|no serial' companion ports
-expect 0 'arming:set_aux_auth_passed' companion lua
+expect 0 'arming:set_aux_auth_passed' companion autopilot script
 expect 2 'companion setup makes it' companion status
 expect 2 'companion setup makes it' companion check
-expect 1 'apt remove companion' companion uninstall-service
-expect 1 'systemctl enable --now companion' companion install-service
+expect 1 'apt remove companion' companion service remove
+expect 1 'systemctl enable --now companion' companion service install
 expect 0 '' systemctl enable companion.service
 expect 0 '' systemd-analyze verify --man=no /usr/lib/systemd/system/companion.service \
     /usr/lib/systemd/system/companion-setup.service

@@ -1,7 +1,7 @@
 """`python -m sim recordings DIR`: is sigma honest on real sensors, and is the estimate better than a plain mean?
 
-DIR has one folder per part, with recordings at rest in any format that `companion replay` reads. Files in the part's
-folder `moving` were recorded in motion from beginning to end. The file `part.toml` adds data to the recordings, all
+DIR has one folder for each part, with recordings of it at rest, as `companion log replay` reads them. Files in its
+folder `moving` were recorded in motion from beginning to end. Its file `part.toml` has what the recordings lack, all
 optional: `profile` (of the catalogue), `columns`, `rate_hz`, `powered_s` (since switch-on, at the beginning of a file).
 
 Every window is calibrated alone, as after a start. The window's truth is the plain mean of the raw samples of the

@@ -191,5 +191,5 @@ def _tcal_parameters(instance: int) -> dict[str, tuple[float, int]]:
 
 
 def device_id(instance: int) -> int:
-    """Return a 24-bit device id as ArduPilot makes it: SPI bus, chip select, device type."""
-    return 0x3A0002 + (instance << 8)
+    """A 24-bit id such as ArduPilot makes: SPI bus, chip select, device type (ICM-42688-P)."""
+    return 0x340002 + (instance << 8)

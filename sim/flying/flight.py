@@ -114,11 +114,11 @@ class Flight:
         await self._stack.aclose()
 
     async def set_up(self) -> None:
-        """Set the parameters of `companion autopilot-setup` from a ground station, and restart the autopilot.
+        """Set the parameters of `companion autopilot params` from a ground station, and restart the autopilot.
 
         Does nothing for an autopilot that has them stored.
         """
-        shown, stored = await self.daemon.ask("autopilot-setup"), self.plan.stored
+        shown, stored = await self.daemon.ask("autopilot", "params"), self.plan.stored
         only_one = self.plan.set_up == "today"
         content = "not applied" if only_one else "applied"
         if stored is None or not stored.exists():
@@ -138,7 +138,7 @@ class Flight:
             await self.vehicle.power_on()
             self._since_s = asyncio.get_running_loop().time()
             await self.vehicle.sleep(RESTARTED_S)
-            shown = await self.daemon.ask("autopilot-setup")
+            shown = await self.daemon.ask("autopilot", "params")
         if shown["state"] != content:
             raise RuntimeError(f"autopilot-setup: {shown}")
 

@@ -33,10 +33,10 @@ def test_ctrl_c_a_closed_terminal_and_who_has_to_wait(tmp_path: Path) -> None:
         async with flight_line(tmp_path) as line:
             config = str(line.config)
             first = await begun(config, "--json")
-            busy = await companion("-c", config, "calibrate", "--wait")
+            busy = await companion("-c", config, "calibrate")
             assert busy.code == FAILED
             assert "a gradienter alignment is running (1 of 3" in busy.err
-            busy = await companion("-c", config, "align", "--forget")
+            busy = await companion("-c", config, "align", "forget")
             assert busy.code == FAILED
             first.send_signal(signal.SIGINT)
             async with asyncio.timeout(40.0):
@@ -59,7 +59,7 @@ def test_ctrl_c_a_closed_terminal_and_who_has_to_wait(tmp_path: Path) -> None:
             assert third.code == FAILED
             assert third.json["state"] == "failed"
             assert third.json["reason"].startswith("not finished in the time given: 1 of 3")
-            none = await companion("-c", config, "align", "--show")
+            none = await companion("-c", config, "align", "show")
             assert none.code == DONE
             assert "no alignment is kept" in none.out
 

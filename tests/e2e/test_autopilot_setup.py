@@ -1,4 +1,4 @@
-"""`companion autopilot-setup`: what it says of the doubles' parameters, and what they then make of the stream."""
+"""`companion autopilot params`: what it says of the doubles' parameters, and what they then make of the stream."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ AFTER: dict[Firmware, dict[str, float]] = {
 
 
 GATE: dict[Firmware, str] = {
-    "ardupilot": "the arming script does not run (see: companion lua)",
+    "ardupilot": "the arming script does not run on the autopilot (see: companion autopilot script)",
     "px4": "set COM_ARM_AUTH_REQ 1",
 }
 RIVAL: dict[Firmware, str] = {"ardupilot": "INS_GYR_CAL", "px4": "IMU_GYRO_CAL_EN"}

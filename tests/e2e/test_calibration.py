@@ -154,7 +154,7 @@ async def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_a
         own_record = record.imus[1]
         assert set(own_record.written) == {*offset_names(2, "accel"), *offset_names(2, "gyro")}
         assert {written.outcome for written in own_record.written.values()} == {"stored"}
-        assert any("not seen" in warning for warning in own_record.warnings)
+        assert any("not verified" in warning for warning in own_record.warnings)
         assert own_record.gyro_bias_rad_s is not None
         written = [rig.double.parameter(name) for name in offset_names(2, "gyro")]
         np.testing.assert_allclose(written, own_record.gyro_bias_rad_s, atol=1e-9)

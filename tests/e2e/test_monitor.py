@@ -1,4 +1,4 @@
-"""`companion monitor` as a person runs it: on a terminal, in a pipe, and while the daemon comes and goes."""
+"""`companion status --watch` as a person runs it: on a terminal, in a pipe, and while the daemon comes and goes."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ async def monitor(config: Path, *words: str, terminal: bool = False) -> AsyncIte
     if terminal:
         fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "companion", "-c", str(config), "monitor", *words),
+        *(sys.executable, "-m", "companion", "-c", str(config), "status", "--watch", *words),
         stdout=theirs,
         stderr=theirs,
         env={**environment, "TERM": "xterm"},
@@ -116,7 +116,7 @@ def test_in_a_pipe_and_on_a_terminal_through_a_calibration_and_a_restart(tmp_pat
             await as_lines.until(lambda text: "NOT CALIBRATED: not calibrated yet" in text)
             await drawn.until(lambda text: "N O T   C A L I B R A T E D" in text)
 
-            await companion("-c", str(line.config), "calibrate", "--json")
+            await companion("-c", str(line.config), "calibrate", "--no-wait", "--json")
             await as_json.until(lambda text: any(word.startswith("MEASURING") for word in words(text)))
             await drawn.until(lambda text: re.search(r"M E A S U R I N G .*\[#+\.*\] \d+ %", text, re.DOTALL))
             await companion("-c", str(line.config), "cancel")

@@ -166,7 +166,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             button = "#align button[data-name='align turn']"
             await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'center'}})")
             await tab.touch(button)
-            await tab.until("$('standing').textContent === 'turn on the spot: pose 1 of 5' && $('wish').textContent")
+            await tab.until("$('standing').textContent === '1 of 5' && $('wish').textContent")
             await tab.lift()
             assert await tab.value("document.querySelectorAll('#how .nose').length") == 4
             await tab.value("scrollTo(0, 0)")
@@ -200,17 +200,17 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
         # It is not done before it has been cancelled.
         async with scene(tmp_path, "0.0.0.0:0", DESKTOP, still_s=(600.0, 600.0)) as here:
             tab = here.tab
-            kept = await companion("-c", str(here.line.config), "web-token", "--json")
+            kept = await companion("-c", str(here.line.config), "page", "--json")
             token = kept.json["token"]
             assert kept.json["url"].endswith(here.url.rpartition(":")[2])
             (file,) = tmp_path.rglob("web-token")  # noqa: ASYNC240 - a local folder
             assert stat.S_IMODE(file.stat().st_mode) == 0o600
-            shown = await companion("-c", str(here.line.config), "web-token")
+            shown = await companion("-c", str(here.line.config), "page")
             assert f"#token={token}" in shown.out
             check = await companion("-c", str(here.line.config), "check", "--json")
             (page,) = (one for one in check.json["findings"] if one["name"] == "page")
             assert page["good"]
-            assert page["words"].endswith(" (buttons: companion web-token)")
+            assert page["words"].endswith(" (buttons: companion page)")
             assert await pixels_needed(tab) == 0
 
             async def hold() -> None:
@@ -220,7 +220,7 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
 
             await hold()
             await tab.until("!document.querySelector('#ask').hidden")
-            assert "companion web-token" in await tab.value(SAID)
+            assert "companion page" in await tab.value(SAID)
             for typed in ("2222-2222-2222", token):
                 await tab.value("document.querySelector('#token').value = ''; document.querySelector('#token').focus()")
                 await tab.call("Input.insertText", text=typed)
@@ -230,7 +230,7 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
                 await tab.until(f"{SAID} !== 'token kept: press again' && !{SAID}.endsWith('asked for')")
                 said = await tab.value(SAID)
                 if typed != token:
-                    assert said == "calibrate: wrong token: companion web-token, on the board, shows the right one"
+                    assert said == "calibrate: wrong token: companion page, on the board, shows the right one"
                     assert (await here.status())["state"] == "idle"
             assert said == "calibrate: calibration started"
             assert (await here.status())["state"] != "idle"
@@ -256,11 +256,11 @@ def test_without_a_page_there_is_no_token_and_the_board_itself_needs_none(tmp_pa
 
     async def main() -> None:
         config.write_text(text)
-        none = await companion("-c", str(config), "web-token", "--json")
+        none = await companion("-c", str(config), "page", "--json")
         assert none.code == FAILED
         assert "[web]" in none.json["reason"]
         config.write_text(text + '[web]\nbind = "127.0.0.1:8191"\n')
-        local = await companion("-c", str(config), "web-token")
+        local = await companion("-c", str(config), "page")
         assert (local.code, local.out) == (
             DONE,
             "http://127.0.0.1:8191/ needs no token: only this board can reach it\n",

@@ -102,7 +102,7 @@ def sigma_deg_h(found: FoundPart) -> float:
 
 def test_the_part_named_by_the_autopilot_brings_its_profile(tmp_path: Path) -> None:
     parameters = ids("ardupilot", 0x2B, 0x2B)
-    unnamed = gyros(tmp_path / "a", None)
+    unnamed = gyros(tmp_path / "a", None, parameters=ids("ardupilot", 0x3A, 0x3A))
     by_itself = gyros(tmp_path / "b", None, parameters=parameters)
     configured = gyros(tmp_path / "c", "bmi088")
     price = (

@@ -226,7 +226,7 @@ def test_cut_at_any_byte_it_replays_up_to_the_cut(
     for cut in [1, len(MAGIC), 60, *(rng.randrange(begun, after) for _ in range(8)), after, len(data) - 5]:
         cut_path.write_bytes(data[:cut])
         if cut < 100:
-            assert companion(["replay", str(cut_path)]) == 1
+            assert companion(["log", "replay", str(cut_path)]) == 1
             said = capsys.readouterr().err
             assert "before anything was recorded" in said
             assert said.count("\n") == 1
@@ -353,7 +353,7 @@ def test_a_recording_of_an_older_version_names_the_version_that_reads_it(
         path = tmp_path / "other.mcap"
         path.write_bytes(usual[0].read_bytes().replace(b"format\x01\x00\x00\x004", b"format\x01\x00\x00\x00" + other))
         for command in ("replay", "profile"):
-            assert companion([command, str(path)]) == 1
+            assert companion(["log", command, str(path)]) == 1
             said = capsys.readouterr().err
             assert f"found recording format {other.decode()}; allowed: 4; companion 0." in said
             assert said.count("\n") == 1
@@ -363,15 +363,15 @@ def test_the_command_ends_with_0_when_biases_agree_and_with_1_when_they_do_not(
     usual: tuple[Path, Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, kept = usual
-    assert companion(["replay", str(path), "--json"]) == 0
+    assert companion(["log", "replay", str(path), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["state"] == "done"
     (one,) = answer["calibrations"]
     assert one["record"]["imus"][1]["gyro_bias_rad_s"] == pytest.approx(kept.imus[1].gyro_bias_rad_s, rel=1e-6)
-    assert companion(["replay", str(path)]) == 0
+    assert companion(["log", "replay", str(path)]) == 0
     assert "1 of 1 calibrations recomputed; biases within 0.01 sigma (at most " in capsys.readouterr().out
     other = to_json(msgspec.structs.replace(kept, imus=(kept.imus[1],)))
     other = other.replace(b'"gyro_bias_rad_s":[', b'"gyro_bias_rad_s":[1')
     nudged = rewritten(path, tmp_path / "o.mcap", lambda topic, data: other if topic == messages.RECORD else data)
-    assert companion(["replay", str(nudged)]) == 1
+    assert companion(["log", "replay", str(nudged)]) == 1
     assert "DIFFERENT imus[own].gyro_bias_rad_s[0]: recorded" in capsys.readouterr().out

@@ -76,7 +76,7 @@ async def test_without_the_script_the_quiet_ones_are_left_alone_and_the_words_na
         _, record = await calibrated(rig, What.GYROS)
         assert [imu.name for imu in record.imus if imu.gyro_bias_rad_s is not None] == ["fc1"]
         for imu in record.imus[1:]:
-            assert "companion lua" in " ".join(imu.warnings), imu.warnings
+            assert "companion autopilot script" in " ".join(imu.warnings), imu.warnings
         written = {write.name for write in rig.double.writes}
         assert not written & {*offset_names(2, "gyro"), *offset_names(3, "gyro")}
 

@@ -102,9 +102,9 @@ def test_a_second_reader_takes_some_of_the_bytes(path: Path, caplog: pytest.LogC
                         await asyncio.sleep(0.003)
 
                 stealing = asyncio.create_task(steal())
-                await one.until(lambda: "damaged" in one.words and "a second reader?" in one.words, 15.0)
+                await one.until(lambda: "damaged" in one.words and "a second program on the port?" in one.words, 15.0)
                 await one.until(lambda: one.counts.get("damaged"), 5.0)
-                assert said(caplog, "compass", "a second reader?")
+                assert said(caplog, "compass", "a second program on the port?")
                 stealing.cancel()
                 await asyncio.gather(stealing, return_exceptions=True)
                 os.close(thief)

@@ -160,7 +160,9 @@ def offsets(scenario: Scenario) -> dict[str, float]:
 async def calibrate(daemon: CompanionProcess) -> None:
     """Start a calibration and leave it alone."""
     await daemon.ready()
-    asking = await asyncio.create_subprocess_exec(*daemon.command("calibrate"), stdout=asyncio.subprocess.DEVNULL)
+    asking = await asyncio.create_subprocess_exec(
+        *daemon.command("calibrate", "--no-wait"), stdout=asyncio.subprocess.DEVNULL
+    )
     assert await asking.wait() == 0
 
 

@@ -49,7 +49,7 @@ def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> None:
             assert await choices() == ["ground", "deck"]
             assert not await tab.value("document.querySelector('main').offsetParent"), "nothing else is there yet"
             await press("ground")
-            await asks("axis, slope or euler")
+            await asks("axis, slope, euler or test")
             # What is typed wrong is said, and asked for again.
             await tab.value("$('words').value = 'round'; $('answer').requestSubmit()")
             await tab.until("$('told').textContent.includes(\"found 'round'; allowed: axis, slope, euler\")")

@@ -25,7 +25,7 @@ from tests.support.live_aircraft import QUICK, live_aircraft
 COMPANION = "/opt/companion/bin/companion"
 CONFIGURATION = "/etc/companion/companion.toml"
 SOCKET = "/run/companion/control.sock"
-INSTALL = (COMPANION, "install-service", "--executable", COMPANION)
+INSTALL = (COMPANION, "service", "install", "--executable", COMPANION)
 NOBODY = 65534
 WATCHDOG_S = 3
 
@@ -89,7 +89,8 @@ async def set_up(machine: Machine, configuration: str) -> None:
     # Without a configuration the page asks for one; here it listens to the simulated ports only.
     wanted = tomllib.loads(configuration)
     ports = [wanted[name]["port"] for name in ("gradienter", "compass")]
-    words = [COMPANION, "setup", *ports, "--mavlink", wanted["mavlink"]["url"], "--no-check", "--page", "0.0.0.0:0"]
+    words = [COMPANION, "setup", *ports, "--mavlink", wanted["mavlink"]["url"], "--law", "slope", "--no-check"]
+    words += ["--page", "0.0.0.0:0"]
     drop_in = f"[Service]\nExecStart=\nExecStart={' '.join(words)}\n"
     await machine.write("/etc/systemd/system/companion-setup.service.d/ports.conf", drop_in)
     _, out, _ = await machine.run(*INSTALL)
@@ -105,8 +106,8 @@ async def set_up(machine: Machine, configuration: str) -> None:
 
     await until(is_asked)
     ((port, token),) = re.findall(r"open once on the phone: http://\S+:(\d+)/#token=(\S+)", said)
-    # Platform, law, two mountings, part, to write it, to start it, to end.
-    assert await take_all(int(port), token) == 8
+    # Platform, two mountings, part, to write it, to start it, to end.
+    assert await take_all(int(port), token) == 7
     shown = await machine.show("companion", "ActiveState", "UnitFileState")
     assert shown == {"ActiveState": "active", "UnitFileState": "enabled"}
     _, out, _ = await machine.run("cat", CONFIGURATION, "/var/lib/private/companion/web-token")
@@ -195,7 +196,7 @@ async def spoken_to_by_the_group_alone(machine: Machine) -> None:
 
 
 async def calibrated(machine: Machine) -> None:
-    record = await ask(machine, "calibrate", "--accelerometers", "--wait", "--timeout", "60")
+    record = await ask(machine, "calibrate", "--accelerometers", "--timeout", "60")
     assert record["state"] == "done", record
     _, out, _ = await machine.run("stat", "-c", "%U", "/var/lib/private/companion")
     assert out.strip() not in ("root", "")
@@ -239,7 +240,7 @@ async def hung(machine: Machine) -> None:
 
 
 async def removed(machine: Machine) -> None:
-    _, out, _ = await machine.run(COMPANION, "uninstall-service")
+    _, out, _ = await machine.run(COMPANION, "service", "remove")
     assert f"kept       {CONFIGURATION}: yours" in out
     assert "kept       /var/lib/private/companion" in out
     shown = await machine.show("companion", "ActiveState", "LoadState")

@@ -45,7 +45,7 @@ async def _from_daemon(folder: Path, wanted: Sequence[str]) -> None:
     async with flight_line(folder, more=more, still_s=(10.0, 20.0)) as line, chromium(folder / "profile") as browser:
         words = ("-c", str(line.config))
         tab = await browser.tab()
-        done = await companion(*words, "calibrate", "--wait", "--json")
+        done = await companion(*words, "calibrate", "--json")
         if done.code:
             raise RuntimeError(done.err)
         if "page" in wanted:

@@ -58,17 +58,17 @@ def no_constant(word: str) -> float:
 
 
 COMMANDS = [
-    ["replay", "--latitude-deg", "40", "--height-m", "50"],
-    ["replay", "--pitch-deg", "0", "--roll-deg", "0", "--rate", "20"],
-    ["replay", "--windows", "10"],
-    ["profile"],
+    ["log", "replay", "--latitude-deg", "40", "--height-m", "50"],
+    ["log", "replay", "--pitch-deg", "0", "--roll-deg", "0", "--rate", "20"],
+    ["log", "replay", "--windows", "10"],
+    ["log", "profile"],
 ]
 
 
 def assert_one_line_or_a_result(path: Path, command: list[str]) -> None:
     code, out, err = said(path, *command)
     assert code in {0, 1, 2}
-    assert len(err.splitlines()) <= 1 or command[0] == "profile", err
+    assert len(err.splitlines()) <= 1 or command[1] == "profile", err
     if code != 2:
         answer = json.loads(out, parse_constant=no_constant)
         assert answer["state"] == ("done" if code == 0 else "failed")
@@ -119,6 +119,6 @@ def test_what_is_asked_of_a_good_log_is_answered(tmp_path: Path, command: list[s
     path = tmp_path / "log.csv"
     path.write_text("\n".join(GOOD) + "\n", encoding="utf-8")
     code, out, err = said(path, *command)
-    assert command[0] == "replay" or "a profile needs 60 s" in err
-    if "--windows" not in command and command[0] == "replay":
+    assert command[1] == "replay" or "a profile needs 60 s" in err
+    if "--windows" not in command and command[1] == "replay":
         assert (code, json.loads(out)["state"]) == (0, "done"), err + out[:300]

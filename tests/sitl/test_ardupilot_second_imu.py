@@ -44,7 +44,7 @@ def test_integers_that_hide_the_second_gyro_are_not_calibrated_and_the_words_say
             print(changed)
             assert_as_recorded(record, changed)
             words = " ".join([record["reason"], *imu_warnings(record)])
-            assert "companion lua" in words, record
+            assert "companion autopilot script" in words, record
             if record["state"] == "done":
                 b.assert_right(now)
                 second = next(imu for imu in record["imus"] if imu["name"] == "fc2")

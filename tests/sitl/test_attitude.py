@@ -45,13 +45,13 @@ class AttitudeBench:
         self.vehicle, self.ground, self.daemon = vehicle, ground, daemon
 
     async def set_up(self, *, net: bool = True) -> dict[str, Any]:
-        """Follow `companion autopilot-setup` from a ground station; without `net` no second set of sources."""
-        shown = await self.ask("autopilot-setup")
+        """Follow `companion autopilot params` from a ground station; without `net` no second set of sources."""
+        shown = await self.ask("autopilot", "params")
         wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
         await self.ground.put_all(
             {name: value for name, value in wanted.items() if net or name[:8] not in ("EK3_SRC2", "EK3_SRC3")}
         )
-        shown = await self.ask("autopilot-setup")
+        shown = await self.ask("autopilot", "params")
         assert shown["state"] == ("applied" if net else "not applied"), shown
         return shown
 
@@ -212,7 +212,7 @@ def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, scr
             await on.vehicle.sleep(3.0)
             await on.vehicle.power_cycle()
             await on.vehicle.sleep(35.0)
-            assert (await on.ask("autopilot-setup"))["net"]["kind"] == ("script" if script else "command")
+            assert (await on.ask("autopilot", "params"))["net"]["kind"] == ("script" if script else "command")
             await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
             await on.until_follows(0.0, 30.0)  # its compass, as long as there is no other
             record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)

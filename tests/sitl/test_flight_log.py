@@ -1,4 +1,4 @@
-"""`companion flight` on the logs of real firmware whose gyros are off by a known amount."""
+"""`companion log flight` on the logs of real firmware whose gyros are off by a known amount."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OFFSETS = {
 BIASES = tuple(f"SIM_{kind}1_BIAS_{axis}" for kind in ("GYR", "ACC") for axis in "XYZ")
 """Errors of ArduPilot's simulated first IMU. PX4's has none: there, an offset that is too small stands for an error."""
 JUDGED = (0, 1, 2, 5)
-"""Axes that `companion flight` judges: gyros, vertical accelerometer."""
+"""Axes that `companion log flight` judges: gyros, vertical accelerometer."""
 MOVED_DEG_H = (400.0, -300.0, 200.0)
 MOVED_MG = 5.0
 """Step of the vertical accelerometer; PX4 ignores offsets that differ by less than 1 mg."""
@@ -49,7 +49,7 @@ async def flown(craft: str, folder: Path) -> tuple[dict[str, Any], str, list[flo
         await flight.vehicle.sleep(STOOD_S)
         await flight.fly()
         *_, log = sorted(flight.vehicle.folder.rglob("*.ulg" if craft == "px4" else "*.BIN"))
-        answer = await flight.daemon.ask("flight", str(log))
+        answer = await flight.daemon.ask("log", "flight", str(log))
         (record, *_) = RecordStore(flight.folder / "state").history()
     found = answer["flights"][-1]
     return found, record.started_at, (px4_true_error(log) if craft == "px4" else ardupilot_true_error(log))

@@ -93,7 +93,7 @@ async def flying(folder: Path, **more: float) -> AsyncIterator[tuple[ArduPilotSi
 
 
 async def typed(daemon: CompanionProcess, *words: str) -> dict[str, Any]:
-    command = daemon.command("temperature", *words, "--json")
+    command = daemon.command("autopilot", "temperature", *words, "--json")
     process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
     output, _ = await process.communicate()
     answer: dict[str, Any] = json.loads(output)

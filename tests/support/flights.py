@@ -1,4 +1,4 @@
-"""Flights as `companion flight` keeps them, of made-up figures."""
+"""Flights as `companion log flight` keeps them, of made-up figures."""
 
 from __future__ import annotations
 

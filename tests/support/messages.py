@@ -31,7 +31,7 @@ NOT_FOR_PEOPLE = {
     "unfit",
     # Expressions and templates of other tools.
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
-    # Reasons beside the parameters that `companion autopilot-setup` prints.
+    # Reasons beside the parameters that `companion autopilot params` prints.
     "HeadingSetting",
     # Names of tasks.
     "create_task", "Thread",

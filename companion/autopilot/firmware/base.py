@@ -210,7 +210,7 @@ Net = Literal["script", "command", "autopilot", "none"]
 
 NETS: Final[dict[Net, str]] = {
     "script": "if the companion's heading ends in flight, the script switches to gyros and GNSS within a second",
-    "command": "if the companion's heading ends, it selects gyros and GNSS, unless its board fails (companion lua)",
+    "command": "if the companion's heading ends, it selects gyros and GNSS, unless its board fails (autopilot script)",
     "autopilot": "if the companion's heading ends, the autopilot returns to its magnetometer",
     "none": "if the companion's heading ends, no heading is left: fly only where you can land without one",
 }

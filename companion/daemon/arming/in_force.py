@@ -81,7 +81,7 @@ class ActiveCalibration:
             "accel": settings.target_accel_sigma_m_s2,
         }
         # IMUs used by the autopilot; if it uses none of the configured ones, all of them.
-        flown = [imu.name for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
+        flown = [imu.name for imu in config.imu if imu.is_flown]
         names = flown or [imu.name for imu in config.imu]
         self.what = What.BOTH if config.gradienter is not None else What.GYROS
         """Biases that an automatic calibration estimates: of gyros, and with a gradienter also of accelerometers."""

@@ -23,6 +23,7 @@ from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
 from companion.daemon.offsets.reboot import RebootOwed
 from companion.estimation.machine import State
+from companion.estimation.records.record import sigma_texts
 from companion.estimation.records.validity import Why
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
@@ -213,9 +214,7 @@ class Readiness:
         in_force = self.in_force
         if against := next((one.against for one in self._reasons(now_s) if one.against), None):
             return "uncalibrated", against
-        gyro, accel = in_force.sigma("gyro"), in_force.sigma("accel")
-        sigmas = [f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []
-        sigmas += [f"{accel / MG:.2f} mg"] if accel is not None else []
+        sigmas = sigma_texts(in_force.sigma("gyro"), in_force.sigma("accel"))
         if in_force.calibrated_s is not None:
             return "calibrated", ", ".join([f"calibrated {_ago(now_s - in_force.calibrated_s)} ago", *sigmas])
         if in_force.confirmed_s is not None:

@@ -25,7 +25,7 @@ from companion.estimation.records.record import ArmingRecord
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
-from companion.storage.records import FlightStore, armings_in
+from companion.storage.records import armings_in, stored_history
 
 logger = logging.getLogger(__name__)
 
@@ -192,33 +192,12 @@ class Arming(Subsystem):
         yield await self._core.offload(self._history, request.limit)
 
     def _history(self, limit: int | None) -> Object:
-        armings = self.armings.file.read()[::-1]
-        by_calibration: dict[str | None, list[ArmingRecord]] = {}
-        for arming in reversed(armings):
-            by_calibration.setdefault(arming.calibration, []).append(arming)
-        found = self._store.newest(limit)
         return {
             "kind": "result",
-            "numbers": list(found),
-            "records": [
-                msgspec.to_builtins(
-                    msgspec.structs.replace(record, armings=tuple(by_calibration.get(record.started_at, ())))
-                )
-                for record in found.values()
-            ],
-            "armings": [msgspec.to_builtins(arming) for arming in armings[:limit]],
+            **stored_history(self._core.config.storage.path, limit),
             "by_hand": self._by_hand.history()[:limit],
             "interrupted": self._recovery.interruptions()[:limit],
-            "flights": self._flights(limit),
         }
-
-    def _flights(self, limit: int | None) -> list[Object]:
-        try:
-            found = FlightStore(self._core.config.storage.path).newest(limit)
-        except StorageError as error:
-            logger.warning("%s", error)
-            return []
-        return [msgspec.to_builtins(kept) | {"number": number} for number, kept in found.items()]
 
 
 def _ago_s(now_s: float, time_s: float | None) -> float | None:

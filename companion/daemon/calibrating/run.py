@@ -130,7 +130,9 @@ class CalibrationRun(Job):
             else:
                 break
         await self._remember()
-        return "; ".join([in_words(self.solution, self._imu_records()), *self.log.notes])
+        flown = {imu.name for imu in self._core.config.imu if imu.is_flown}
+        records = [imu for imu in self._imu_records() if not flown or imu.name in flown]
+        return "; ".join([in_words(self.solution, records), *self.log.notes])
 
     @property
     def is_adoptable(self) -> bool:
@@ -189,7 +191,7 @@ class CalibrationRun(Job):
         weighed: Solution = await core.offload(weigh, solution, expectation)
         # A run with a result held back cannot be adopted: a request must not get half of a result.
         if self.automatic and core.wanted.push:
-            written = {i.name for i in core.config.imu if i.source == "autopilot" or i.autopilot_instance}
+            written = {imu.name for imu in core.config.imu if imu.is_flown}
             self.held_back = {key: doubt for key, doubt in weighed.doubted.items() if key[0] in written}
         self.solution = weighed
         points = memory.measured(solution, weighed.doubts, self.log.started, unix_s)

@@ -306,13 +306,13 @@ class Calibrating(Subsystem):
             curve, calibration = self.memory.curve(name, "gyro"), self._imus[name].in_force
             enabled_by = calibration.thermal.enabled_by
             if curve is None:
-                left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
+                left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion autopilot temperature)")
             elif degc is None:
                 left.append(f"imu {name}: it sends no temperature now")
             elif enabled_by and not overwrite and not self._wrote_curve(calibration.thermal):
                 left.append(
                     f"imu {name}: {enabled_by} is on, and not by the companion: kept"
-                    " (companion temperature --overwrite replaces it)"
+                    " (companion autopilot temperature --overwrite replaces it)"
                 )
             else:
                 gyro, accel = of_curve(curve, calibration.orientation), self._accelerometer_curve(name, curve)

@@ -18,14 +18,16 @@ from companion.config.sections import UNKNOWN, Config, Imu
 from companion.configured.models import SerialDevice, baud_of, cannot_work, doubtful, serial_devices
 from companion.daemon.interfaces.control import process_behind
 from companion.daemon.process.service import Service
-from companion.errors import DaemonDeniedError, DaemonUnreachableError
+from companion.errors import CalibrationRefusedError, DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
 from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, list_ports, port_faults, same_ports
 from companion.links.system.connection import ask
 from companion.messages import message
+from companion.physics.gradienter import Law
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, main_kind
+from companion.setup.law import Tilt, TiltTest, law_of
 
 STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then companion check again"
 ONLY_CHECKING: Final = "only a check is running: start companion run"
@@ -33,6 +35,7 @@ LOST_S: Final = 5.0
 HEARTBEAT_WITHIN_S: Final = 4.0
 IMUS_MOST_S: Final = 30.0
 """Longest wait until an autopilot's IMUs are known: enough for all retries on a slow line that loses packets."""
+TILTS_WITHIN_S: Final = 120.0  # Longest wait for the two tilts of the gradienter's test
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
@@ -181,7 +184,7 @@ async def run_check(
     for name in ("mqtt", "fleet", *(["page"] if is_running else [])):
         if (face := status[name]) is not None:
             findings.append(CheckLine(name, good=face["good"], words=face["summary"]))
-    findings += [_profile(profile) for profile in status["profiles"]]
+    findings += _profiles(status["profiles"])
     if config.push.attitude != "off" and is_running:
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
@@ -207,6 +210,28 @@ async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str |
     return {device["name"]: parts[device["name"]] for device in status["devices"] if device["good"]}
 
 
+async def find_law(config: Config, say: Callable[[str], object]) -> tuple[Law, int]:
+    """Guide through two tilts; return the law of the gradienter's readings and its yaw in the aircraft, deg.
+
+    Raises:
+        CalibrationRefusedError: the tilts did not come in time, or no law explains them.
+    """
+    service, test = Service(config, only_listening=ONLY_CHECKING), TiltTest(say)
+
+    def goes_on(listened_s: float) -> bool:
+        collector = service.core.collector
+        imus, second = collector.imu_seconds(), collector.tilt_second()
+        force = next((imus[imu.name].mean[3:] for imu in config.imu if imu.is_flown and imu.name in imus), None)
+        if force is not None and second is not None:
+            test.add(second.slot, Tilt(second.mean[:2], force))
+        return not test.complete and listened_s < TILTS_WITHIN_S
+
+    await service.listen(goes_on)
+    if not test.complete:
+        raise CalibrationRefusedError(f"no steady tilt {len(test.tilts) + 1} within {TILTS_WITHIN_S:g} s")
+    return law_of(test.tilts)
+
+
 def _autopilot(config: Config, vehicle: Object) -> CheckLine:
     if (age_s := vehicle["heartbeat_age_s"]) is not None:
         if age_s < LOST_S:
@@ -222,12 +247,16 @@ def _autopilot(config: Config, vehicle: Object) -> CheckLine:
     return CheckLine("autopilot", good=False, words=f"{vehicle['summary']}: {remedy}", remedy=remedy)
 
 
-def _profile(profile: Object) -> CheckLine:
-    words, remedy = profile["summary"], ""
-    if profile["name"] in (None, UNKNOWN):
-        remedy = f'set profile in [[imu]] "{profile["imu"]}", or companion setup again'
-        words = f"{words}: {remedy}"
-    return CheckLine(f"profile {profile['imu']}", good=True, words=words, remedy=remedy)
+def _profiles(profiles: Sequence[Object]) -> list[CheckLine]:
+    known = [one for one in profiles if one["name"] not in (None, UNKNOWN)]
+    found = [CheckLine(f"profile {one['imu']}", good=True, words=one["summary"]) for one in known]
+    if unknown := [one for one in profiles if one not in known]:
+        names = ", ".join(one["imu"] for one in unknown)
+        remedy = f"companion setup --part {unknown[0]['imu']}=PART"
+        found.append(
+            CheckLine("profile", good=True, words=f"{names}: {unknown[0]['summary']}: {remedy}", remedy=remedy)
+        )
+    return found
 
 
 def _gate(config: Config, setup: Object) -> CheckLine:

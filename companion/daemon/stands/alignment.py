@@ -103,7 +103,7 @@ class ActiveAlignment:
         different = [key for key in now.__struct_fields__ if getattr(record.gradienter, key) != getattr(now, key)]
         if different:
             names = ", ".join(f"gradienter.{key}" for key in different)
-            self.unused = f"measured with another {names}: companion align zero, or companion align --forget"
+            self.unused = f"measured with another {names}: companion align zero, or companion align forget"
 
 
 class ActiveSixPosition:

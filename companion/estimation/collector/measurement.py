@@ -315,7 +315,9 @@ class GroundWindows(WindowSource):
             return msgspec.structs.replace(status, progress=0.0, obstacle=CollectorObstacle(str(estimates)))
         own = [each for each, _ in estimates]
         needed, enough = max(expected_s(settings, own), stretch.good + 1), stretch.full or is_enough(settings, own)
-        return msgspec.structs.replace(status, enough=enough, progress=1.0 if enough else stretch.good / needed)
+        share = 1.0 if enough else stretch.good / needed
+        left = "" if enough else f", about {needed - stretch.good} s more"
+        return msgspec.structs.replace(status, enough=enough, progress=share, measuring=f"{status.measuring}{left}")
 
 
 def is_enough(settings: Settings, found: Sequence[Estimate]) -> bool:

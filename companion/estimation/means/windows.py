@@ -331,7 +331,7 @@ def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, str]:
             what = "not known: bias and" if useless.any() else "half a step unknown:"
             found[part] = (
                 f"{part} {imu.name} {_axes(useless if useless.any() else undecided)}: {what} noise smaller than its"
-                f" telemetry's steps of {step}: no floats (ArduPilot: companion lua; PX4: its console)"
+                f" telemetry's steps of {step}: no floats (ArduPilot: companion autopilot script; PX4: its console)"
             )
     return found
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 
 from companion import formats
+from companion.physics.units import DEG_H, MG
 from companion.samples import TRIADS, Triad, Vector
 
 FORMAT_VERSION = 1
@@ -21,6 +22,18 @@ FORMAT_VERSION = 1
 Outcome = Literal["verified", "stored", "failed", "rolled_back"]
 TiltFrom = Literal["gradienter", "accelerometers"]
 HeadingFrom = Literal["compass", "autopilot"]
+
+
+def sigma_texts(gyro_rad_s: float | None, accel_m_s2: float | None, note: str = "") -> list[str]:
+    """Format the sigmas that are known, with a note on the gyros', as all interfaces show them."""
+    parts = []
+    if gyro_rad_s is not None:
+        deg_h = gyro_rad_s / DEG_H
+        # Two digits are enough, and three numbers fit into one STATUSTEXT.
+        parts.append(f"{deg_h:.{1 if deg_h < 10.0 else 0}f} deg/h{note}")
+    if accel_m_s2 is not None:
+        parts.append(f"{accel_m_s2 / MG:.2f} mg")
+    return parts
 
 
 def outcome_word(outcome: str) -> str:

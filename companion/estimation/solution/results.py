@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
-from companion.estimation.records.record import ImuRecord, PlatformTurn, Record
+from companion.estimation.records.record import ImuRecord, PlatformTurn, Record, sigma_texts
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.solve import ImuSolution, Solution
 from companion.messages import message
 from companion.physics.frames import Array, Matrix, vector
-from companion.physics.units import DEG, DEG_H, MG
+from companion.physics.units import DEG
 from companion.samples import TRIADS, Triad, Vector, rows_of
 
 
@@ -107,24 +107,21 @@ def _where_known(matrix: Matrix, known: list[bool]) -> tuple[tuple[float | None,
 
 
 def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
-    """Summarise a result for one STATUSTEXT: the largest sigma over all axes and IMUs."""
+    """Summarise a result for one STATUSTEXT: the largest sigma over all axes of `imus`."""
     if solution is None:
         return "nothing measured"
-    parts: list[str] = []
-    gyros, accels = ([sigma for imu in imus if (sigma := imu.sigma_in_force(triad)) is not None] for triad in TRIADS)
-    if gyros:
-        measured = [imu for imu in solution.imus if imu.gyro_rad_s is not None]
+    known = ([max(sigma) for imu in imus if (sigma := imu.sigma_in_force(triad)) is not None] for triad in TRIADS)
+    gyro, accel = (max(sigmas, default=None) for sigmas in known)
+    warms = False
+    if gyro is not None:
+        names = {imu.name for imu in imus}
+        measured = [imu for imu in solution.imus if imu.name in names and imu.gyro_rad_s is not None]
         worst = max(measured, key=lambda imu: float(imu.gyro_sigma_use_rad_s.max()))
         warms = worst.warm_up_variance[:3].max() > np.diag(worst.covariance)[:3].max()
-        # Without decimals, so that it stays one STATUSTEXT.
-        sigma_deg_h = np.max(gyros) / DEG_H
-        parts.append(f"{sigma_deg_h:.0f} deg/h warming" if warms else f"{sigma_deg_h:.1f} deg/h")
-    if accels:
-        parts.append(f"{np.max(accels) / MG:.2f} mg")
     unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
     kept = any(imu.unchanged for imu in imus) and not any(imu.written for imu in imus)
     begin = "unchanged," if kept else "sigma"
-    result = f"{begin} {', '.join(parts)}"
+    result = f"{begin} {', '.join(sigma_texts(gyro, accel, ' warming' if warms else ''))}"
     return message("biases_not_known", result=result, biases=unknown) if unknown else result
 
 

@@ -39,7 +39,7 @@ class Remedies:
     latitude: str = "set vehicle.latitude_deg or wait for GPS"
     height: str = "set vehicle.height_m or wait for GPS"
     no_heading: str = "no compass"
-    part: str = "name its part (profile), or learn it (companion profile)"
+    part: str = "name its part (profile), or learn it (companion log profile)"
     mounting: str = "mounting = \"{}\" (an autopilot's own IMU: its board orientation), or the gradienter's is wrong"
     any_bias: str = "calibration.any_bias = true accepts it"
 

@@ -104,7 +104,7 @@ class OwnNoise:
         if self._at_rest or self.known[triad] is not None:
             return ""
         if self._too_much[triad]:
-            return " (steady as noise: name its part, or companion profile)"
+            return " (steady as noise: name its part, or companion log profile)"
         left_s = LEARN_S - self._since
         return f" (motion or noise: known in {left_s} s)" if self._since >= _HINT_S and left_s > 0 else ""
 

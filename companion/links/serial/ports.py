@@ -196,7 +196,7 @@ def _number(path: Path, base: int) -> int | None:
 
 SLOW_TIMER_MS: Final = 1
 _GETTY: Final = re.compile(r"a?getty|login|mgetty|getty")
-_MODEM_REMEDY: Final = "sudo companion install-service (its udev rule), or: sudo systemctl disable --now ModemManager"
+_MODEM_REMEDY: Final = "sudo companion service install (its udev rule), or: sudo systemctl disable --now ModemManager"
 _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 
@@ -234,7 +234,7 @@ def port_faults(
         words = message("usb_bridge_delays", port=device, milliseconds=found.latency_timer_ms)
         remedy = (
             f"sudo sh -c 'echo 1 > /sys/bus/usb-serial/devices/{name}/latency_timer'"
-            " (for good: sudo companion install-service)"
+            " (for good: sudo companion service install)"
         )
         faults.append(PortFault(words, remedy, good=not is_fast))
     if _PASSING.fullmatch(port):

@@ -35,10 +35,15 @@ function headline(tone, word, reason) {
 }
 function show(status) {
   headline(status.headline.tone, status.headline.word, status.headline.reason);
+  $("remedy").hidden = !status.headline.remedy;
+  $("remedy").textContent = (status.headline.remedy || "").replaceAll("`", "");
   firstRun(status.setup || null);
   if (status.setup) return;
   $("vehicle").textContent = status.vehicle.summary;
   busy = status.progress !== null;
+  const away = !["disarmed", undefined].includes(status.vehicle.armed);
+  $("head").classList.toggle("armed", status.headline.word === "ARMED");
+  document.body.classList.toggle("aligning", status.stands !== null && status.stands.outcome === null);
   $("progress").hidden = !busy;
   if (busy) document.querySelector("#progress div").style.width = status.progress + "%";
   quality(status);
@@ -61,26 +66,27 @@ function show(status) {
   aloud(status);
   stands(status.stands);
   // Disable only buttons that make no sense: the daemon decides whether an action is allowed, and gives the reason.
-  $("calibrate").disabled = busy;
-  for (const button of document.querySelectorAll("#align button")) button.disabled = busy;
+  $("calibrate").disabled = busy || away;
+  for (const button of document.querySelectorAll("#align button")) button.disabled = busy || away;
   for (const it of document.querySelectorAll(".wants-gradienter")) it.hidden = !status.devices.some(({name}) => name === "gradienter");
   $("cancel").disabled = !busy;
-  $("undo").disabled = busy || status.why_no_undo !== null;
+  $("undo").disabled = busy || away || status.why_no_undo !== null;
   const [step] = status.undoable;
   $("undoes").textContent = step && step.what || "hold 1.5 s";
   const key = JSON.stringify([status.last, status.headline.word === "READY", busy]);
   if (key !== shownRecords) { shownRecords = key; records(); }
 }
-// Sigmas of the active calibration, beside the configured targets.
+// Configured targets that the active calibration has not reached.
 function quality(status) {
-  const rows = [["gyro", "°/h", 1], ["accel", "mg", 2]].flatMap(([triad, unit, digits]) => {
+  const rows = [["gyro", "deg/h", 1], ["accel", "mg", 2]].flatMap(([triad, unit, digits]) => {
     const {wanted, met} = status.arming.quality[triad];
-    return met === null ? [] : [[met, `${+wanted.toFixed(digits)} ${unit} ${met ? "✓" : "✕"}`]];
+    return met === false ? [`${+wanted.toFixed(digits)} ${unit}`] : [];
   });
   const shown = rows.length > 0 && status.headline.tone === "good";
+  const warming = status.last !== null && status.last.when_warm.length > 0;
   $("quality").hidden = !shown;
-  $("quality").textContent = "wanted: " + rows.map(([, words]) => words).join(", ");
-  $("head").classList.toggle("coarse", shown && rows.some(([met]) => !met));
+  $("quality").textContent = `goal ${rows.join(", ")} not met${warming ? ": still warming" : ""}`;
+  $("head").classList.toggle("coarse", shown);
 }
 function axes(names, digits, biases, sigmas, unit, title, held, before) {
   if (!biases) return [];
@@ -128,7 +134,7 @@ function calibration(found, arming) {
   const words = [];
   if (found.calibrated_ago_s !== null) words.push("calibrated " + ago(found.calibrated_ago_s));
   else if (!found.in_force) words.push(utc(found.started_at) + ", before this start");
-  if (found.confirmed_ago_s !== null) words.push("seen right " + ago(found.confirmed_ago_s));
+  if (found.confirmed_ago_s !== null) words.push("confirmed " + ago(found.confirmed_ago_s));
   for (const against of arming.against) words.push(against);
   $("age").textContent = words.join("; ");
   const key = JSON.stringify([found.imus, recordsRead.map(({file}) => file)]);
@@ -155,7 +161,7 @@ function byHand(found) {
 function link(good, name, words, remedy) {
   const row = make("div", undefined, good ? "link" : "link bad"), text = make("div");
   text.append(make("b", name + " "), document.createTextNode(words));
-  if (remedy) text.append(make("p", remedy, "note"));
+  if (remedy) text.append(make("p", remedy.replaceAll("`", ""), "note"));
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
@@ -175,7 +181,7 @@ async function records() {
     head.append(make("b", record.undone_at ? "undone" : record.state), document.createTextNode(` ${utc(record.started_at)}: ${record.reason}`));
     body.append(make("p", `${Math.round(record.duration_s)} s` + (record.pose ? `; pitch ${fixed(record.pose.theta_deg, 2, "°")}, roll `
       + `${fixed(record.pose.gamma_deg, 2, "°")}, heading ${fixed(record.pose.psi_deg, 1, "°")}` : ""), "note"));
-    for (const imu of record.imus) body.append(make("p", figures(imu), "note"));
+    for (const imu of record.imus) body.append(make("p", figures(imu, record.undone_at), "note"));
     for (const warning of record.warnings) body.append(make("p", "warning: " + warning, "note"));
     get.href = "/records/" + file;
     get.download = file;
@@ -184,13 +190,13 @@ async function records() {
     return it;
   }) : [make("p", "none yet", "note")]));
 }
-function figures(imu) {
+function figures(imu, undone) {
   const held = triad => (imu.held_back || []).includes(triad) ? " (held back, not written)" : "";
   const part = (bias, sigma, unit, digits, name, triad) => bias === null ? "" :
     ` ${name[0]}${held(triad)} ${bias.map((value, k) => `${signed(value / unit, digits)} ± ${(sigma[k] / unit).toFixed(digits)}`).join(", ")} ${name[1]};`;
   const written = Object.keys(imu.written).length;
   return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
-    + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written` : "");
+    + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written${undone ? ", then undone" : ""}` : "");
 }
 // The page's server draws the plots, as in reports, and only on request.
 async function temperature() {
@@ -252,7 +258,7 @@ async function act(what, path, body) {
   if (!token) {
     $("ask").hidden = false;
     $("token").focus();
-    say("buttons need the token: companion web-token, on the board, shows it", true);
+    say("buttons need the token: companion page, on the board, shows it", true);
     return;
   }
   say(what + ": asked for");

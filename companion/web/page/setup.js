@@ -17,7 +17,7 @@ function firstRun(found) {
   if (question === null || question.number === asked) return;
   asked = question.number;
   $("question").textContent = question.words;
-  $("hint").textContent = question.hint;
+  $("hint").textContent = question.more && question.more !== question.hint ? `${question.hint} ${question.more}` : question.hint;
   $("words").value = question.now;
   $("choices").replaceChildren(...question.choices.map(words => {
     const button = make("button", words);

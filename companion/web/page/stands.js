@@ -68,17 +68,19 @@ let shownStands = null;
 function stands(found) {
   $("stands").hidden = found === null;
   if (found === null) return;
-  const running = found.outcome === null, [wish, unknown] = found.wish.split(/: (.*)/);
-  document.querySelector("#share div").style.width = 100 * found.share + "%";
+  const running = found.outcome === null, [first, unknown] = found.wish.split(/: (.*)/), [wish, grip] = first.split(/, (.*)/);
+  $("share").style.strokeDasharray = `${100 * found.share} 100`;
   $("result").textContent = running ? "" : found.words;
   const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, found.outcome]);
   if (key === shownStands) return;
   shownStands = key;
-  $("standing").textContent = running ? `${found.kind}: pose ${found.number} of ${found.total}` : `${found.kind}: ${found.outcome}`;
+  $("standing").textContent = running ? `${found.number} of ${found.total}` : `${found.kind}: ${found.outcome}`;
+  $("kind").textContent = found.kind;
   $("stands").dataset.outcome = found.outcome || "";
   $("wish").textContent = wish;
-  $("still").textContent = found.objection || (found.unknown.length ? "still unknown: " + found.unknown.join(", ") : unknown || "");
-  $("still").className = found.objection ? "objection" : "";
+  $("grip").textContent = grip || "";
+  $("still").textContent = found.objection || "";
+  $("unknowns").textContent = found.unknown.length ? "not known yet: " + found.unknown.join(", ") : unknown || "";
   $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
   const left = Math.max(found.total - found.done.length, 0);
   $("done").replaceChildren(...found.done.map((up, k) => {

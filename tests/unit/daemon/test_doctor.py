@@ -119,7 +119,7 @@ def test_modem_manager_is_named_with_what_keeps_it_away(board: CheckedBoard) -> 
     (board.root / "proc/600/fd/7").symlink_to("/dev/ttyUSB1")
     lines = faults(board, "/dev/ttyUSB1")
     assert any("/dev/ttyUSB1: in use by another program (ModemManager, process 600)" in line for line in lines)
-    assert any("sudo companion install-service" in line for line in lines)
+    assert any("sudo companion service install" in line for line in lines)
     assert sum("in use" in line for line in lines) == 1, "one line is enough"
 
 

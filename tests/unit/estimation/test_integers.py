@@ -199,7 +199,7 @@ def test_two_values_or_one_around_zero_are_refused_with_what_to_do(mean: float) 
     refused = window.refused("gyro")
     assert refused is not None
     assert "fc2 x" in refused
-    assert "companion lua" in refused
+    assert "companion autopilot script" in refused
     assert window.refused("accel") is None
     assert abs(errors(found, lsb)[0]) <= sigmas(found)[0] + 1e-9
 

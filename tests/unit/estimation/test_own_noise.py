@@ -204,7 +204,7 @@ def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_
     words = [gate.judge(batch).words for batch in seconds_of(t_s, readings)]
     assert words[9].endswith(" (motion or noise: known in 20 s)")
     assert words[-1].startswith("gyro own moves 0.5")
-    assert words[-1].endswith(" (steady as noise: name its part, or companion profile)")
+    assert words[-1].endswith(" (steady as noise: name its part, or companion log profile)")
     assert "" not in words
     # Its recording tells a profile, and with it, it is still.
     stretches, _, _ = rests(t_s, readings, "own", UNKNOWN)

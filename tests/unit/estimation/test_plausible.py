@@ -111,7 +111,7 @@ def log(tmp_path: Path, turn: Array) -> Path:
 
 
 def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
-    code = companion(["replay", str(path), "--json", *more])
+    code = companion(["log", "replay", str(path), "--json", *more])
     return code, json.loads(capsys.readouterr().out)
 
 

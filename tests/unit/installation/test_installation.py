@@ -1,4 +1,4 @@
-"""`companion install-service` below a folder of its own: what is put where, what is left alone, what goes away."""
+"""`companion service install` below a folder of its own: what is put where, what is left alone, what goes away."""
 
 from __future__ import annotations
 
@@ -98,14 +98,14 @@ def test_what_the_service_could_not_reach_is_named(tmp_path: Path, monkeypatch: 
 
 
 def test_the_command_says_line_by_line_what_it_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["install-service", "--root", str(tmp_path), "--prefix", "/usr", "--executable", EXECUTABLE]
+    words = ["service", "install", "--root", str(tmp_path), "--prefix", "/usr", "--executable", EXECUTABLE]
     assert cli.main([*words, "--json"]) == 0
     told = capsys.readouterr()
     assert f"written    {tmp_path}/usr/lib/systemd/system/companion.service" in told.err.splitlines()
     answer = json.loads(told.out)
     assert answer["state"] == "done"
     assert [step["outcome"] for step in answer["steps"]] == [*["written"] * 5, "absent"]
-    assert cli.main(["uninstall-service", "--root", str(tmp_path), "--prefix", "/usr"]) == 0
+    assert cli.main(["service", "remove", "--root", str(tmp_path), "--prefix", "/usr"]) == 0
     assert capsys.readouterr().out.count("removed    ") == 5
 
 
@@ -113,7 +113,7 @@ def test_without_root_this_machine_is_left_alone(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert cli.main(["install-service"]) == 1
+    assert cli.main(["service", "install"]) == 1
     assert "this needs root: sudo " in capsys.readouterr().err
 
 
@@ -123,10 +123,10 @@ def test_the_service_of_a_debian_package_is_left_to_it(
     (tmp_path / installation.PACKAGED).write_text("apt\n")
     monkeypatch.setattr("sys.prefix", str(tmp_path))
     for command, instead in (
-        ("install-service", "sudo systemctl enable --now companion"),
-        ("uninstall-service", "sudo apt remove companion"),
+        ("install", "sudo systemctl enable --now companion"),
+        ("remove", "sudo apt remove companion"),
     ):
-        assert cli.main([command]) == 1
+        assert cli.main(["service", command]) == 1
         assert capsys.readouterr().err.strip().endswith(f"is a Debian package, and its service came with it: {instead}")
 
 

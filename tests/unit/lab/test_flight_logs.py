@@ -1,4 +1,4 @@
-"""`companion flight` on logs of ArduPilot and PX4, whole ones and others."""
+"""`companion log flight` on logs of ArduPilot and PX4, whole ones and others."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def storage(folder: Path) -> list[str]:
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict[str, Any]]:
-    code = companion(["flight", "--json", *map(str, arguments)])
+    code = companion(["log", "flight", "--json", *map(str, arguments)])
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -70,7 +70,7 @@ def record(values: dict[str, float], before: dict[str, float]) -> Record:
 
 def test_a_log_without_an_arming_says_so(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [each for each in messages(flown, parameters()) if each[0] not in {"ARM", "EV"}]
-    assert companion(["flight", str(dataflash(tmp_path / "1.BIN", rows)), *storage(tmp_path)]) == 0
+    assert companion(["log", "flight", str(dataflash(tmp_path / "1.BIN", rows)), *storage(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "armed" not in said.splitlines()[0]
     assert "no arming in the log, which begins 0 s after start 1 of the autopilot" in said
@@ -202,7 +202,7 @@ def of_px4(flown: Flown, path: Path, began_s: float = 0.0) -> Path:
 
 
 def test_a_simulated_px4_counts_from_1970(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert companion(["flight", str(of_px4(flown, tmp_path / "log.ulg", 1.7e9)), *storage(tmp_path)]) == 0
+    assert companion(["log", "flight", str(of_px4(flown, tmp_path / "log.ulg", 1.7e9)), *storage(tmp_path)]) == 0
     assert ": armed in start 1 of the autopilot\n" in capsys.readouterr().out
 
 
@@ -247,7 +247,7 @@ def test_another_file_is_one_line(
         path.mkdir()
     else:
         path.write_bytes(data)
-    assert companion(["flight", str(path), *storage(tmp_path)]) == 1
+    assert companion(["log", "flight", str(path), *storage(tmp_path)]) == 1
     assert capsys.readouterr().err == f"companion: {path}: {words}\n"
 
 

@@ -104,7 +104,7 @@ def test_a_bomb_is_not_unpacked(
     assert path.stat().st_size < 4 * MB
     request.getfixturevalue("_little_memory")
     for command in ("replay", "profile"):
-        assert companion([command, str(path)]) == 1
+        assert companion(["log", command, str(path)]) == 1
         out, said = capsys.readouterr()
         assert out == ""
         assert said.count("\n") == 1
@@ -179,7 +179,7 @@ def test_a_state_that_would_fill_the_memory_is_one_line(
         + packed(channel(1, messages.IMU.encode() + b"fc") + message(STATES[what]))
     )
     request.getfixturevalue("_little_memory")
-    assert companion([command, str(path)]) == 1
+    assert companion(["log", command, str(path)]) == 1
     said = capsys.readouterr().err
     assert said.startswith(f"companion: {path}: a message on /autopilot/imu/fc cannot be used by this version (")
     assert said.count("\n") == 1

@@ -131,7 +131,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_of_both(tmp_path: Path, nam
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, dict[str, Any], str]:
-    code = companion(["profile", "--json", *map(str, arguments)])
+    code = companion(["log", "profile", "--json", *map(str, arguments)])
     said = capsys.readouterr()
     return code, json.loads(said.out) if said.out else {}, said.err
 
@@ -169,7 +169,7 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
     short.write_text("".join(half_hour.read_text().splitlines(keepends=True)[:600]), encoding="utf-8")
     sigmas = {}
     for wanted in ("mine", str(elsewhere), "adis16405", "ADIS-16405"):
-        assert companion(["-c", str(toml), "replay", str(short), "--json", "--profile", wanted]) == 0
+        assert companion(["-c", str(toml), "log", "replay", str(short), "--json", "--profile", wanted]) == 0
         sigmas[wanted] = json.loads(capsys.readouterr().out)["imus"][0]["gyro_sigma_use_rad_s"]
     assert sigmas["mine"] == sigmas[str(elsewhere)] != sigmas["adis16405"] == sigmas["ADIS-16405"]
     code, answer, _ = run(capsys, "-c", toml, half_hour, "--profile", "mine")
@@ -197,7 +197,7 @@ def test_every_mistake_is_one_line(
         write_csv(path, *adis16405(30 if text == "short" else 120, 20, 1))
     elif text is not None:
         path.write_text(text, encoding="utf-8")
-    assert companion(["profile", str(path), *more]) == code
+    assert companion(["log", "profile", str(path), *more]) == code
     said = capsys.readouterr()
     assert words in said.err
     assert said.err.count("\n") == 1

@@ -44,7 +44,7 @@ def readings(seed: int) -> Floats:
 
 
 def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
-    code = companion(["replay", str(path), "--json", *WHERE, *more])
+    code = companion(["log", "replay", str(path), "--json", *WHERE, *more])
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -88,7 +88,7 @@ def test_what_px4_flies_by_and_its_sensors_are_imus_of_their_own(
             ("sensor_accel", 1): (TIMES + 0.002, raw[:, 3:]),
         },
     )
-    assert companion(["replay", str(path)]) == 2
+    assert companion(["log", "replay", str(path)]) == 2
     said = capsys.readouterr().err
     assert said == f"{path}: found IMUs sensor1, sensor_combined; allowed: one; say which with --imu\n"
     code, record = replay(capsys, path, "--imu", "sensor_combined")
@@ -98,7 +98,7 @@ def test_what_px4_flies_by_and_its_sensors_are_imus_of_their_own(
     assert code == 0
     assert_near(record, 2)
     assert record["imus"][0]["temperature_degc"] == pytest.approx(41.0)
-    assert companion(["replay", str(path), "--imu", "sensor7"]) == 1
+    assert companion(["log", "replay", str(path), "--imu", "sensor7"]) == 1
     assert "no IMU 'sensor7' in these files; there are: sensor1, sensor_combined" in capsys.readouterr().err
 
 
@@ -130,7 +130,7 @@ def test_a_damaged_log_is_one_line_or_what_is_left_of_it(
         for at in rng.integers(7, len(damaged), size=int(rng.integers(0, 40))) if len(damaged) > 7 else ():
             damaged[int(at)] = int(rng.integers(0, 256))
         path.write_bytes(bytes(damaged))
-        code = companion([command, str(path)])
+        code = companion(["log", command, str(path)])
         said = capsys.readouterr()
         # 2: a byte of it makes another instance of a message.
         assert code in {0, 1, 2}
@@ -179,6 +179,6 @@ def test_a_log_without_end_is_one_line(
 ) -> None:
     path = tmp_path / "log"
     path.write_bytes(data)
-    assert companion(["replay", str(path)]) == 1
+    assert companion(["log", "replay", str(path)]) == 1
     said = capsys.readouterr()
     assert said.err == f"companion: {path}: {words}\n"

@@ -41,7 +41,7 @@ def written(path: Path, data: np.ndarray) -> Path:
 
 
 def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
-    code = companion(["replay", str(path), "--json", *more])
+    code = companion(["log", "replay", str(path), "--json", *more])
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -82,7 +82,7 @@ def test_every_mistake_in_the_file_is_one_line_with_its_place(
 ) -> None:
     path = tmp_path / "imu.csv"
     path.write_text(text, encoding="utf-8")
-    assert companion(["replay", str(path)]) == 1
+    assert companion(["log", "replay", str(path)]) == 1
     said = capsys.readouterr()
     assert words in said.err
     assert str(path) in said.err

@@ -104,7 +104,7 @@ KINDS: dict[str, tuple[Callable[[Floats], str], str]] = {
 
 
 def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
-    code = companion(["replay", str(path), "--json", *more])
+    code = companion(["log", "replay", str(path), "--json", *more])
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -147,7 +147,7 @@ def test_a_log_without_times_has_a_rate(
     names = "gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
     path = written(tmp_path, (names + "\n" if named else "") + joined(data[:, 1:].tolist()))
     more = [] if named else ["--columns", names]
-    assert companion(["replay", str(path), *WHERE, *more]) == 1
+    assert companion(["log", "replay", str(path), *WHERE, *more]) == 1
     assert "a log without time: --rate HZ" in capsys.readouterr().err
     code, record = replay(capsys, path, *WHERE, *more, "--rate", "100")
     assert code == 0
@@ -197,7 +197,7 @@ def test_a_unit_that_gravity_contradicts_is_refused(
     read_m_s2: str,
 ) -> None:
     path = written(tmp_path, HEADER.replace("m_s2", units) + "\n" + joined(change(still[0]).tolist()))
-    assert companion([command, str(path)]) == 1
+    assert companion(["log", command, str(path)]) == 1
     said = capsys.readouterr()
     assert f"{path}: ax_{units}, ay_{units}, az_{units} read {read_m_s2}" in said.err
     assert "m/s^2 in all; allowed: gravity, 7 to 12.6: name their right unit" in said.err

@@ -21,7 +21,7 @@ def hour() -> tuple[Floats, Floats]:
 
 
 def run(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
-    code = companion(["replay", str(path), "--json", "--windows", "60", *more])
+    code = companion(["log", "replay", str(path), "--json", "--windows", "60", *more])
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -52,7 +52,7 @@ def test_sigma_keeps_its_word_on_the_part_that_it_is_of(
         # A window that looks like a ramp foretells its end.
         assert 0.85 * plain < each["rms"] < 1.4 * plain
     short = write_csv(tmp_path / "short.csv", hour[0][:6000], hour[1][:6000])
-    assert companion(["replay", str(short), "--windows", "60", "--profile", "adis16405"]) == 0
+    assert companion(["log", "replay", str(short), "--windows", "60", "--profile", "adis16405"]) == 0
     said = capsys.readouterr().out
     # The last sample comes a tenth before the tenth minute is over.
     assert "windows of 60 s: 9, calibrated: 9" in said

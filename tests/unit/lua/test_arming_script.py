@@ -196,7 +196,7 @@ SET_UP = ("set EK3_SRC1_YAW 6", "set EK3_SRC2_YAW 1", "set EK3_SRC3_YAW 0", "set
 
 @pytest.fixture
 def flown(script: Script) -> Script:
-    """Script after `companion autopilot-setup`, with the stream present, armed."""
+    """Script after `companion autopilot params`, with the stream present, armed."""
     for each in (*SET_UP, "fly healthy 1", "fly armed 1", "run 2000"):
         script(each)
     return script

@@ -74,9 +74,9 @@ def test_an_installed_wheel_needs_nothing_of_the_checkout(wheel: Path, tmp_path:
     ).stdout  # fmt: skip
     assert where.startswith(str(packages))
     assert run("--version") == f"companion {companion.__version__}\n"
-    assert run("lua") == (PROJECT / "companion/lua/companion_arming.lua").read_text()
+    assert run("autopilot", "script") == (PROJECT / "companion/lua/companion_arming.lua").read_text()
     root = tmp_path / "root"
-    run("install-service", "--root", str(root), "--prefix", "/usr")
+    run("service", "install", "--root", str(root), "--prefix", "/usr")
     unit = (root / "usr/lib/systemd/system/companion.service").read_text()
     assert f"\nExecStart={home}/bin/companion -c " in unit
 

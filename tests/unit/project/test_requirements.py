@@ -46,7 +46,7 @@ def wanted(name: str) -> list[Requirement]:
         return [Requirement(line) for line in lines_of((FOLDER / f"{name}.in").read_text(encoding="utf-8"))]
     declared = [*RUNTIME, *EXTRAS.get(name, ())]
     for each in list(declared):
-        if (own := Requirement(each)).name == "companion":
+        if (own := Requirement(each)).name == "mavlink-imu-calibration":
             declared.remove(each)
             declared += [word for extra in own.extras for word in EXTRAS[extra]]
     return [Requirement(each) for each in declared]

@@ -118,13 +118,13 @@ def daemon(config: Path) -> Iterator[_Daemon]:
 
 COMMANDS = [
     ["status"],
-    ["calibrate", "--wait"],
+    ["calibrate"],
     ["cancel"],
     ["undo"],
     ["history"],
-    ["temperature"],
-    ["align", "--show"],
-    ["autopilot-setup"],
+    ["autopilot", "temperature"],
+    ["align", "show"],
+    ["autopilot", "params"],
 ]
 
 
@@ -138,8 +138,9 @@ def test_what_the_daemon_says(
     words: list[str],
     form: list[str],
 ) -> None:
-    under_way = [replies[f"{words[0]} under way"]] if f"{words[0]} under way" in replies else []
-    daemon.replies = poisoned([*under_way, replies[words[0]]])
+    name = {"params": "autopilot-setup", "temperature": "temperature"}.get(words[-1], words[0])
+    under_way = [replies[f"{name} under way"]] if f"{name} under way" in replies else []
+    daemon.replies = poisoned([*under_way, replies[name]])
     main(["-c", str(config), *form, *words])
     out, said = capsys.readouterr()
     assert "owned" in clean(out + said)
@@ -247,8 +248,8 @@ def test_what_is_heard_on_the_ground(
 @pytest.mark.parametrize(
     "words",
     [
-        ["replay", f"/nowhere/{EVIL}{BYTE}"],
-        ["profile", f"/nowhere/{EVIL}{BYTE}"],
+        ["log", "replay", f"/nowhere/{EVIL}{BYTE}"],
+        ["log", "profile", f"/nowhere/{EVIL}{BYTE}"],
         ["report", "--storage", f"/nowhere/{EVIL}{BYTE}"],
         ["history", "-c", f"/nowhere/{EVIL}{BYTE}"],
         ["status", EVIL],

@@ -78,22 +78,27 @@ def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
     found = Page(_calibration(tmp_path))
     axes = (row for row in found.rows if row[:1] in (["x"], ["y"], ["z"]))
     for imu in one.imus:
-        for unit, columns in (
-            (DEG_H, (imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, imu.gyro_sigma_stat_rad_s)),
-            (MG, (imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2)),
-        ):
+        triads = (
+            (DEG_H, imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, imu.gyro_sigma_stat_rad_s),
+            (MG, imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2),
+        )
+        for axis in range(3):
+            for cell, (unit, biases, sigmas, _) in zip(next(axes)[1:], triads, strict=True):
+                assert biases is not None
+                assert sigmas is not None
+                bias, sigma = map(float, cell.split(" ± "))
+                assert bias == pytest.approx(biases[axis] / unit, rel=0.02)
+                assert sigma == pytest.approx(sigmas[axis] / unit, rel=0.06)
+        for unit, _, _, noise in triads:
             for axis in range(3):
-                shown = [float(cell.strip("±")) for cell in next(axes)[1:4]]
-                for column, values in enumerate(columns):
-                    assert values is not None
-                    assert shown[column] == pytest.approx(values[axis] / unit, rel=0.06 if column else 0.02)
+                assert noise is not None
+                assert float(next(axes)[1]) == pytest.approx(noise[axis] / unit, rel=0.06)
     for parameter, written in one.imus[0].written.items():
         at = next(k for k, row in enumerate(found.rows) if row and row[0].startswith(f"{parameter}: "))
-        before, after, _ = found.rows[at + 1]
-        assert before == ("beforeunknown" if written.before is None else f"before{written.before:.6g}")
-        assert after == f"after{written.after:.6g}"
+        before = "unknown" if written.before is None else f"{written.before:.6g}"
+        assert found.rows[at + 1][0].startswith(f"{before} → {written.after:.6g}")
         assert f"{parameter}: {written.outcome}" in found.text.replace(" :", ":")
-    assert "before unknown" in found.text
+    assert "unknown" in found.text
     assert one.pose is not None
     angles = {row[0]: row[1].removesuffix(" deg").split(" ± ") for row in found.rows if row and " deg" in row[-1]}
     for words, *figures in (
@@ -224,8 +229,8 @@ def test_what_was_held_back_is_not_shown_as_in_force(tmp_path: Path) -> None:
     )
     RecordStore(tmp_path).save(record(imus=(imu, gyros_alone)))
     found = Page(_calibration(tmp_path))
-    assert found.text.count("Held back: measured, not written.") == 1
-    assert found.text.count("Not determined: not asked for") == 1
+    assert found.text.count("Held back: accelerometer measured, not written.") == 1
+    assert found.text.count("Accelerometer not determined: not requested") == 1
 
 
 _floats = st.floats(allow_nan=False, allow_infinity=False)

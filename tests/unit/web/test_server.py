@@ -419,7 +419,7 @@ def test_beyond_the_board_the_token_is_the_kept_one_and_never_handed_out(tmp_pat
         viewer.writer.close()
         wrong = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers | {"X_Companion_Token": "2" * 12})
         assert wrong.status == 403
-        assert "companion web-token" in wrong.json["reason"]
+        assert "companion page" in wrong.json["reason"]
         right = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers | {"X_Companion_Token": kept})
         assert right.status == 200
 
@@ -447,19 +447,19 @@ def test_a_token_that_somebody_chose_has_twelve_characters(
         f'[web]\nbind = "192.168.4.1:8191"\n[storage]\ndirectory = "{tmp_path}"\n'
     )
     path.write_text("eleven - chars\n")
-    assert companion(["web-token", "-c", str(toml)]) == 1
+    assert companion(["page", "-c", str(toml)]) == 1
     assert capsys.readouterr().err == (
         f"companion: {path}: found a token of 11 characters; allowed: at least 12; remove the file, and a good one is"
         " made\n"
     )
     path.write_text("twelve - chars!\n")
-    assert companion(["web-token", "-c", str(toml)]) == 0
+    assert companion(["page", "-c", str(toml)]) == 0
     out = capsys.readouterr().out
     assert out.startswith("token: twelve - chars!\n")
     assert out.endswith("#token=twelve%20-%20chars%21\n")  # no picture into a pipe
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "80")
-    assert companion(["web-token", "-c", str(toml)]) == 0
+    assert companion(["page", "-c", str(toml)]) == 0
     shown = capsys.readouterr().out.splitlines()[3:]
     assert [found.text for found in zxingcpp.read_barcodes(seen(shown), try_invert=False)] == [out.split()[-1]]
     assert len(shown) <= 24, "a terminal's height"
@@ -467,7 +467,7 @@ def test_a_token_that_somebody_chose_has_twelve_characters(
     wide = len(re.sub(r"\x1b\[[\d;]*m", "", shown[0]))
     for columns, words in ((wide, "camera read this"), (wide - 1, f"make this window {wide} columns wide")):
         monkeypatch.setenv("COLUMNS", str(columns))
-        assert companion(["web-token", "-c", str(toml)]) == 0
+        assert companion(["page", "-c", str(toml)]) == 0
         assert words in (told := capsys.readouterr().out)
         assert ("█" in told) == (columns == wide)
 
