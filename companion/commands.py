@@ -269,5 +269,5 @@ ALL: Final = {
 """Class of each command, by the name of the command."""
 
 
-def asked_by(interface: Interface) -> dict[str, type[Command]]:
+def commands_for(interface: Interface) -> dict[str, type[Command]]:
     return {name: kind for name, kind in ALL.items() if interface in kind.by}

@@ -66,7 +66,7 @@ GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
 FIRST_S: Final = 0.1  # Time span assigned to the first reading
-BADLY: Final = 1.5
+POORLY_KNOWN_RATIO: Final = 1.5
 """Ratio of heading sigma to compass sigma above which the heading counts as poorly known."""
 REFUSED_S: Final = 20.0
 """Time, s, in which all compass readings are rejected, after which the companion stops sending the heading."""
@@ -162,7 +162,7 @@ class HeadingAid:
         self._last_s, self._refused_since_s = t_s, None
         # The first reading sets a poorly known heading; after that the time constant applies. A heading that the
         # compass corrects has the compass sigma plus gyro drift since then: it is not poorly known.
-        badly_rad = BADLY * compass_sigma_rad
+        badly_rad = POORLY_KNOWN_RATIO * compass_sigma_rad
         trust = 1.0 - (badly_rad / sigma_rad) ** 2 if sigma_rad > badly_rad else 0.0
         return max(trust, min(1.0, since_s / TAU_S))
 

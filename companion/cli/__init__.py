@@ -90,7 +90,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import client, desk, ground, local, profile
+    from companion.cli import client, ground, local, logs, profile
 
     # -c and --json may precede or follow the subcommand. SUPPRESS: the later parser must not reset them to defaults.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -104,7 +104,7 @@ def _parser() -> Parser:
     autopilot = commands.group("autopilot", "arming script, parameters and temperature curves of the autopilot")
     local.add_commands(commands, autopilot)
     client.add_commands(commands, autopilot, log)
-    desk.add_commands(log)
+    logs.add_commands(log)
     profile.add_commands(log)
     ground.add_ground(commands)
     ground.add_fleet(commands)

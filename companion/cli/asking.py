@@ -22,7 +22,7 @@ EVERY_S: Final = 0.5
 SHOWN_S: Final = 1.0  # Time after which an open web page surely displays the last state
 
 
-class Asking:
+class Interview:
     """Asks questions on stdout (`error`: on stderr) and reads answers from stdin; `yes`: use the present answers."""
 
     def __init__(self, *, yes: bool, error: bool) -> None:
@@ -99,7 +99,7 @@ async def _read(descriptor: int) -> bytes:
     return os.read(descriptor, _MOST_BYTES)
 
 
-class PageAsking(Asking):
+class PageInterview(Interview):
     """Asks questions on a web page, which `async with` opens. Its token is the one in the daemon's folder `storage`."""
 
     def __init__(self, bind: str, storage: Path) -> None:

@@ -208,8 +208,8 @@ async def align(options: argparse.Namespace) -> int:
     wanted = request_of(options, commands.Align)
     answer = {"alignment": None, **await request(options, wanted, CANCEL)}
     alignment, state = answer["alignment"], answer["state"]
-    lines = [_heading(answer), *(stands_lines(alignment) if alignment else [])]
-    lines += sides_lines(answer.get("accelerometers", ()))
+    lines = [_heading(answer), *(pose_lines(alignment) if alignment else [])]
+    lines += six_position_lines(answer.get("accelerometers", ()))
     good = state in ("done", "active") or (wanted["action"] == "show" and state != "refused")
     return _conclude(options, answer, lines, good=good)
 
@@ -249,7 +249,7 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
 
 
-def sides_lines(imus: Sequence[Object]) -> list[str]:
+def six_position_lines(imus: Sequence[Object]) -> list[str]:
     lines = []
     for imu in imus:
         lines.append(f"{imu['name']}: calibrated in six positions, {imu['measured_at'][:19]} UTC; its output has left")
@@ -282,7 +282,7 @@ def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float]
     return [_figure_line(words, "mg", whole, sigma, "+.3f"), _figure_line("  change", "mg", left, None, "+.3f")]
 
 
-def stands_lines(record: Object) -> list[str]:
+def pose_lines(record: Object) -> list[str]:
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} poses{slope}"]
     zero: list[str] = []

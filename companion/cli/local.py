@@ -187,14 +187,14 @@ async def explain(options: argparse.Namespace) -> int:
 
 
 async def page(options: argparse.Namespace) -> int:
-    from companion.web.access import is_loopback, kept_token, page_url, split_address
+    from companion.web.access import is_loopback, page_url, split_address, stored_token
 
     config = load_config(options)
     if config.web is None:
         raise CompanionError('there is no page: the configuration needs [web] with bind = "127.0.0.1:8191"')
     host, port = split_address(config.web.bind)
     url = page_url(host, port)
-    token = None if is_loopback(host) else kept_token(config.storage.path)
+    token = None if is_loopback(host) else stored_token(config.storage.path)
     if options.json:
         print_json({"url": url, "token": token})
     else:

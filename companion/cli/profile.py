@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from companion.cli.desk import add_table_options, log_lines
+from companion.cli.logs import add_table_options, log_lines
 from companion.cli.terminal import Commands, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.formats import Object, utc_now

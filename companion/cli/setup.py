@@ -15,7 +15,7 @@ from typing import Any, Final, get_args
 import msgspec
 
 from companion import config
-from companion.cli.asking import Asking, PageAsking
+from companion.cli.asking import Interview, PageInterview
 from companion.cli.show import failures, finding_lines, problems
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
@@ -46,10 +46,10 @@ COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below o
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
     if options.page is None:
-        session = _Session(options, Asking(yes=options.yes, error=options.json))
+        session = _Session(options, Interview(yes=options.yes, error=options.json))
         await session.run()
     else:
-        async with PageAsking(_bind(options), _storage(options)) as asking:
+        async with PageInterview(_bind(options), _storage(options)) as asking:
             session = _Session(options, asking, goes_on=goes_on)
             await session.run()
             then = "the companion starts, and its own page follows" if goes_on else "this page closes"
@@ -76,7 +76,7 @@ def _storage(options: argparse.Namespace) -> Path:
 
 
 class _Session:
-    def __init__(self, options: argparse.Namespace, asking: Asking, *, goes_on: bool = False) -> None:
+    def __init__(self, options: argparse.Namespace, asking: Interview, *, goes_on: bool = False) -> None:
         self.asking, self._goes_on = asking, goes_on
         self._so_far = "nothing was written"
         self._measured: set[str] = set()  # Keys that the guided test has answered
@@ -433,7 +433,7 @@ async def _daemon_status(config: Config) -> Object | None:
     return found
 
 
-async def _ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
+async def _ask_autopilot(asking: Interview, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
     """Ask the autopilot for its IMUs, and offer to configure missing ones; return the type of each IMU by its name.
 
     Nothing is written to the autopilot. `by_default`: default answer to the offer.

@@ -91,14 +91,14 @@ def attitude_rate_hz(config: Config) -> float:
     return wanted if baud is None else min(wanted, LINE_SHARE * baud / BITS_PER_BYTE / VISION_BYTES)
 
 
-def cannot_work(config: Config) -> list[str]:
+def ineffective_settings(config: Config) -> list[str]:
     """List the settings that can have no effect, to report them at start."""
     if config.push.attitude == "off" or config.compass is not None:
         return []
     return [f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known']
 
 
-def doubtful(config: Config) -> list[str]:
+def doubtful_settings(config: Config) -> list[str]:
     found, gradienter = [], config.gradienter
     if config.mavlink.signing_mode == "off" and config.mavlink.signing_key_file is not None:
         found.append('mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked')

@@ -20,14 +20,14 @@ import numpy as np
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.stands.alignment import ActiveAlignment
+from companion.daemon.poses.alignment import ActiveAlignment
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import Point, PowerUp, by_power_up, kept
 from companion.estimation.solution import prior
-from companion.estimation.solution.curve import Along, Curve, settling
-from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.curve import Curve, WindowDrift, settling
+from companion.estimation.solution.doubt import Inconsistency
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.results import points
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
@@ -100,7 +100,7 @@ class BiasMemory:
         mean, variance = curve.change((degc, 0.0), (now_degc, 0.0))
         return vector(mean - self._taken_off(name, triad, degc, now_degc)), vector(variance)
 
-    def _along(self, name: str, triad: Triad, warming: Warming | None) -> Along | None:
+    def _along(self, name: str, triad: Triad, warming: Warming | None) -> WindowDrift | None:
         curve, path = self.curve(name, triad), None if warming is None else warming.path
         if curve is None or path is None:
             return None
@@ -202,7 +202,9 @@ class BiasMemory:
 
     # --- after a calibration
 
-    def measured(self, solution: Solution, doubts: Sequence[Doubt], started_at: str, unix_s: float) -> dict[str, Point]:
+    def measured(
+        self, solution: Solution, doubts: Sequence[Inconsistency], started_at: str, unix_s: float
+    ) -> dict[str, Point]:
         """Return a history point for each IMU, from a solution that uses the readings alone and no earlier biases."""
         return points(
             dataclasses.replace(solution, imus=tuple(map(self._at_mean, solution.imus))),

@@ -108,13 +108,13 @@ class Job:
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
 
     async def pause(self, seconds: float) -> None:
-        """Wait for `seconds` or until `look_again` is called; raise JobCancelledError once the job is cancelled."""
+        """Wait for `seconds` or until `wake_up` is called; raise JobCancelledError once the job is cancelled."""
         self.check_cancelled()
         self._nudge.clear()
         if await comes(self._nudge, seconds):
             self.check_cancelled()
 
-    def look_again(self) -> None:
+    def wake_up(self) -> None:
         self._nudge.set()
 
     def finish(self, result: JobResult) -> None:

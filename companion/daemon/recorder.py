@@ -31,7 +31,7 @@ from companion.estimation.means.windows import Window
 from companion.estimation.records.record import to_json
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
-from companion.estimation.solution.truth import Otherwise
+from companion.estimation.solution.truth import FallbackPose
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
 from companion.messages import message
@@ -142,7 +142,7 @@ class Recorder(Subsystem):
         )
         self.tape.put(messages.MEASURED, _now_s(), messages.encode(measured))
 
-    def _on_solved(self, where: Whereabouts, otherwise: Otherwise, what: What, expectation: Expectation) -> None:
+    def _on_solved(self, where: Whereabouts, otherwise: FallbackPose, what: What, expectation: Expectation) -> None:
         used = self._alignment.used
         solved = Solved(
             where=where,

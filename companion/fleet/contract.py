@@ -1,6 +1,6 @@
 """Parser of the MQTT payloads that aircraft send to the fleet (docs/fleet/asyncapi.yaml): from bytes to table rows.
 
-The columns in fleet/schema.py define the allowed values. Invalid bytes raise `NotTakenError` and nothing else.
+The columns in fleet/schema.py define the allowed values. Invalid bytes raise `InvalidPayloadError` and nothing else.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Row = dict[str, Any]
 Rows = dict[str, list[Row]]
 
 
-class NotTakenError(Exception):
+class InvalidPayloadError(Exception):
     """Error: a payload breaks docs/fleet/asyncapi.yaml; the text is one line with the reason."""
 
 
@@ -102,12 +102,12 @@ def _fitting(column: sa.Column[Any], value: object) -> Any:
         allowed = f"a text of up to {most} characters" if most else "a text"
         if isinstance(value, str) and len(value) <= (most or MOST_BYTES):
             return value
-    raise NotTakenError(f"{column.name}: found {str(value)[:40]}; allowed: {allowed}")
+    raise InvalidPayloadError(f"{column.name}: found {str(value)[:40]}; allowed: {allowed}")
 
 
 def _calibration(told: _Object) -> Rows:
     if told.get("state") not in _STATES:
-        raise NotTakenError(f"state: found {str(told.get('state'))[:40]}; allowed: {', '.join(_STATES)}")
+        raise InvalidPayloadError(f"state: found {str(told.get('state'))[:40]}; allowed: {', '.join(_STATES)}")
     biases: list[Row] = []
     held: list[str] = []
     written: set[str] = set()
@@ -130,7 +130,7 @@ def _calibration(told: _Object) -> Rows:
         x_deg, y_deg = msgspec.convert(zero.get("offset_deg"), tuple[float, float])
         zeros = dict(zip(zeros, (zero.get("measured_at"), x_deg, y_deg, zero.get("sigma_deg")), strict=True))
         if None in zeros.values():
-            raise NotTakenError("alignment: wanted: measured_at, offset_deg and sigma_deg")
+            raise InvalidPayloadError("alignment: wanted: measured_at, offset_deg and sigma_deg")
     found = {
         **told,
         **zeros,
@@ -205,9 +205,9 @@ def moment(words: str) -> datetime.datetime:
         found = datetime.datetime.fromisoformat(words)
         found = found.replace(tzinfo=datetime.UTC) if found.tzinfo is None else found.astimezone(datetime.UTC)
     except (ValueError, OverflowError):
-        raise NotTakenError(f"found {words[:40]!r}; allowed: a time such as 2026-11-23T06:12:00.000Z") from None
+        raise InvalidPayloadError(f"found {words[:40]!r}; allowed: a time such as 2026-11-23T06:12:00.000Z") from None
     if not _EARLIEST <= found < _LATEST:
-        raise NotTakenError(f"found {words[:40]!r}; allowed: a time from {_EARLIEST.year} to {_LATEST.year - 1}")
+        raise InvalidPayloadError(f"found {words[:40]!r}; allowed: a time from {_EARLIEST.year} to {_LATEST.year - 1}")
     return found
 
 
@@ -225,7 +225,7 @@ def read_hello(aircraft: str, payload: bytes) -> Hello:
 def read_item(aircraft: str, payload: bytes) -> ReceivedItem:
     """Parse an item except its body; raise NotTakenError if its key is invalid or names a different aircraft."""
     if len(payload) > MOST_BYTES:
-        raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
+        raise InvalidPayloadError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
     return _decode(aircraft, payload, ReceivedItem)
 
 
@@ -245,7 +245,7 @@ def rows_of(item: ReceivedItem) -> tuple[Row, Rows]:
         body = msgspec.json.decode(item.body, type=_Object)
         rows = KINDS[kind](body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise NotTakenError(f"{str(item.kind)[:64]}: {error}") from None
+        raise InvalidPayloadError(f"{str(item.kind)[:64]}: {error}") from None
     for row in rows.get("events", ()):
         row["at"] = columns["at"]
     columns["same"] = _same(item, rows, body)
@@ -275,9 +275,9 @@ def _decode(aircraft: str, payload: bytes, kind: type[_Keyed]) -> _Keyed:
     try:
         told = msgspec.json.decode(payload, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise NotTakenError(str(error)) from None
+        raise InvalidPayloadError(str(error)) from None
     if told.aircraft != aircraft:
-        raise NotTakenError(f"says that it is {told.aircraft}, on the topic of {aircraft}")
+        raise InvalidPayloadError(f"says that it is {told.aircraft}, on the topic of {aircraft}")
     return told
 
 

@@ -79,7 +79,7 @@ class Server:
         # One thread: rendering is bound by the processor, so 20 pages at once would each take 20 times as long.
         self._thread = ThreadPoolExecutor(1, "fleet-pages")
         self._app = Starlette(
-            routes=[Route("/{path:path}", self._page)], middleware=[Middleware(_Door, password=password)]
+            routes=[Route("/{path:path}", self._page)], middleware=[Middleware(_PasswordFilter, password=password)]
         )
         self._reconnection = Reconnection("page", worth_s=10.0, first_s=1.0, cap_s=30.0)
 
@@ -121,7 +121,7 @@ class Server:
         return Response(found, headers=again, media_type="text/html")
 
 
-class _Door:
+class _PasswordFilter:
     """HTTP filter: admits requests with the password or, if none is set, requests addressed to this computer."""
 
     def __init__(self, app: ASGIApp, password: str | None) -> None:
@@ -131,7 +131,7 @@ class _Door:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers, app = Headers(scope=scope), self._app
         if self._password is None:
-            if (refused := self._access.refuses_host(headers)) is not None:
+            if (refused := self._access.host_refusal(headers)) is not None:
                 app = _text(421, refused)
         elif not _knows(headers.get("authorization", ""), self._password):
             if "authorization" in headers:

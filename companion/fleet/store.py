@@ -19,7 +19,7 @@ from companion.fleet import schema
 from companion.fleet.contract import (
     KINDS,
     Hello,
-    NotTakenError,
+    InvalidPayloadError,
     ReceivedItem,
     Row,
     Rows,
@@ -156,14 +156,14 @@ class Store:
                     hellos[to[0], hello.epoch] = hello, message.retained
                     continue
                 item = read_item(to[0], message.payload)
-            except NotTakenError as error:
+            except InvalidPayloadError as error:
                 outcome.rejected.append((message, str(error)))
                 continue
             outcome.confirmed.setdefault((item.aircraft, item.epoch), []).append(item.sequence)
             heard.add(item.aircraft)
             try:
                 columns, made = rows_of(item)
-            except NotTakenError as error:
+            except InvalidPayloadError as error:
                 outcome.rejected.append((message, str(error)))
                 columns, made = _REJECTED, {}
             told.append({**item.key, **_raw(item, message), **columns, "received_at": now})
@@ -223,7 +223,7 @@ class Store:
         for hello, retained in hellos:
             row = rows.setdefault(hello.aircraft, {**nothing, "aircraft": hello.aircraft})
             row |= {"name": hello.name, "epoch": hello.epoch, "first": hello.first, "last": hello.last}
-            with contextlib.suppress(NotTakenError):
+            with contextlib.suppress(InvalidPayloadError):
                 row["hello_at"] = moment(hello.at)
             if not retained:  # a retained hello does not show that the aircraft is connected now
                 row["heard_at"] = now
@@ -260,7 +260,7 @@ class Store:
         outcome = BatchResult({}, {}, [(message, reason)])
         to = addressed(message.topic)
         item = None
-        with contextlib.suppress(NotTakenError):
+        with contextlib.suppress(InvalidPayloadError):
             item = read_item(to[0], message.payload) if to is not None and to[1] == "item" else None
         with self._link_errors(), self._engine.begin() as connection:
             self._keep_aside(connection, outcome.rejected, now)
@@ -286,7 +286,7 @@ class Store:
                         columns, made = rows_of(read_item(row.aircraft, message.payload))
                         connection.execute(update.values(columns))
                         self._put_made(connection, made)
-                except (NotTakenError, *OF_THE_ITEM) as error:
+                except (InvalidPayloadError, *OF_THE_ITEM) as error:
                     connection.execute(update.values(_REJECTED))
                     reason = _refusal(error) if isinstance(error, sa.exc.SQLAlchemyError) else str(error)
                     refused.append((message, reason))

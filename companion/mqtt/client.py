@@ -54,7 +54,7 @@ class Incoming(NamedTuple):
     """True if the broker had stored the message; with MQTT 5 also if it was published as retained just now."""
 
 
-class Parcel(msgspec.Struct, eq=False):
+class OutgoingMessage(msgspec.Struct, eq=False):
     """Message to send; telemetry is sent once (QoS 0), all else at least once (QoS 1)."""
 
     topic: str
@@ -81,10 +81,10 @@ class Outbox:
     """
 
     def __init__(self) -> None:
-        self._kept: dict[str, Parcel] = {}
-        self._unsent: dict[str, Parcel] = {}
-        self._answers: deque[Parcel] = deque()
-        self._telemetry: dict[str, Parcel] = {}
+        self._kept: dict[str, OutgoingMessage] = {}
+        self._unsent: dict[str, OutgoingMessage] = {}
+        self._answers: deque[OutgoingMessage] = deque()
+        self._telemetry: dict[str, OutgoingMessage] = {}
         self._filled = asyncio.Event()
         self.emptied = asyncio.Event()
         self.emptied.set()
@@ -97,7 +97,7 @@ class Outbox:
     def keep(self, topic: str, payload: bytes, *, again: bool = False) -> None:
         """Queue a retained payload; an empty one deletes the topic. Skip the topic's present payload unless `again`."""
         if again or self.kept(topic) != payload:
-            self._kept[topic] = self._unsent[topic] = Parcel(topic, payload, retain=True)
+            self._kept[topic] = self._unsent[topic] = OutgoingMessage(topic, payload, retain=True)
             self._notify()
 
     def kept(self, topic: str) -> bytes | None:
@@ -110,12 +110,12 @@ class Outbox:
             if oldest is None and droppable:
                 return
             del self._answers[oldest or 0]
-        self._answers.append(Parcel(topic, payload, droppable=droppable))
+        self._answers.append(OutgoingMessage(topic, payload, droppable=droppable))
         self._notify()
 
     def send_telemetry(self, topic: str, payload: bytes) -> None:
         if self._open:
-            self._telemetry[topic] = Parcel(topic, payload, qos=0)
+            self._telemetry[topic] = OutgoingMessage(topic, payload, qos=0)
             self._notify()
 
     def opened(self) -> None:
@@ -129,7 +129,7 @@ class Outbox:
         self._telemetry.clear()
         self._notify()
 
-    async def next(self) -> Parcel:
+    async def next(self) -> OutgoingMessage:
         """Wait for the next message to send and return it; it stays in the outbox until `sent` is called."""
         while not len(self):
             self._filled.clear()
@@ -138,7 +138,7 @@ class Outbox:
             parcel for some in (self._unsent.values(), self._answers, self._telemetry.values()) for parcel in some
         )
 
-    def sent(self, parcel: Parcel) -> None:
+    def sent(self, parcel: OutgoingMessage) -> None:
         """Remove a message that was sent or given up; a newer message of its topic stays in the outbox."""
         for latest in (self._unsent, self._telemetry):
             if latest.get(parcel.topic) is parcel:

@@ -16,7 +16,7 @@ from typing import Final
 
 import msgspec
 
-from companion.commands import MAX_SHOWN, Interface, asked_by, shown
+from companion.commands import MAX_SHOWN, Interface, commands_for, shown
 from companion.errors import CalibrationRefusedError, CompanionError, DaemonUnreachableError
 from companion.formats import Object
 from companion.messages import message
@@ -39,7 +39,7 @@ MAX_NUMBER: Final = 2**53
 MAX_PENDING: Final = 8  # Most requests executed at the same time, such as cancels during a write
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
-KNOWN: Final = asked_by(Interface.MQTT)
+KNOWN: Final = commands_for(Interface.MQTT)
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 

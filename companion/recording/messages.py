@@ -17,7 +17,7 @@ from companion.autopilot.parameters.change import FirmwareName
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
-from companion.estimation.solution.truth import Otherwise
+from companion.estimation.solution.truth import FallbackPose
 from companion.estimation.turning.turn import Turn
 
 FORMAT_VERSION: Final = "4"
@@ -79,7 +79,7 @@ class Solved(msgspec.Struct, frozen=True, kw_only=True):
     where: Whereabouts
     what: str
     alignment: tuple[float, float, float] | None  # zero of the gradienter: offset x and y, and sigma, in degrees
-    otherwise: Otherwise
+    otherwise: FallbackPose
     expectation: Expectation
 
 

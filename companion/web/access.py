@@ -53,7 +53,7 @@ def new_token() -> str:
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(_GROUP)) for _ in range(_GROUPS))
 
 
-def kept_token(directory: Path) -> str:
+def stored_token(directory: Path) -> str:
     """Read the web page's token from the storage folder; if there is none, create a file that only its owner can read.
 
     Raises:
@@ -89,7 +89,7 @@ class Access:
         name = socket.gethostname().lower().partition(".")[0]
         self._names = {"localhost", *(name + ending for ending in _OWN_ENDINGS if name)}
 
-    def refuses_host(self, headers: Mapping[str, str]) -> str | None:
+    def host_refusal(self, headers: Mapping[str, str]) -> str | None:
         """Return the reason to refuse a request whose Host header names another host than this board; None: accept."""
         host = headers.get("host", "")
         match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^:\[\]/@\s]+)(?::\d{1,5})?", host.lower())
@@ -99,7 +99,7 @@ class Access:
                 return None
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
-    def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
+    def stranger_refusal(self, headers: Mapping[str, str]) -> str | None:
         """Return the reason to refuse a request that another web site's page has sent; None: accept."""
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "asked by another site"
@@ -108,7 +108,7 @@ class Access:
             return "asked by another site"
         return None
 
-    def refuses_token(self, headers: Mapping[str, str]) -> str | None:
+    def token_refusal(self, headers: Mapping[str, str]) -> str | None:
         """Return the reason to refuse an action without the right token in its headers; None: accept."""
         given = _bare(headers.get(TOKEN_HEADER, ""))
         if not given:

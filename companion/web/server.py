@@ -23,12 +23,12 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from companion import __version__
-from companion.commands import Interface, asked_by
+from companion.commands import Interface, commands_for
 from companion.errors import CompanionError, StorageError
 from companion.formats import Object, parse_request
 from companion.links.system.connection import Reconnection
 from companion.summary import rows
-from companion.web.access import TOKEN_HEADER, Access, is_loopback, kept_token, new_token, page_url, split_address
+from companion.web.access import TOKEN_HEADER, Access, is_loopback, new_token, page_url, split_address, stored_token
 from companion.web.listener import MAX_BODY_BYTES, Connection, listening
 
 logger = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ MAX_STRANGERS: Final = 4
 MAX_BEHIND: Final = 20
 """Maximum number of events that wait for a slow viewer (10 s). A slower viewer is disconnected, and reconnects."""
 AGAIN_S: Final = 0.5  # Pause before the status is requested again after a failure
-ACTIONS: Final = asked_by(Interface.PAGE)
+ACTIONS: Final = commands_for(Interface.PAGE)
 _PARTS: Final = Path(__file__).with_name("page")
 _STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
 _SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
@@ -91,7 +91,7 @@ class Page:
     async def _serve(self) -> str:
         try:
             if not self.local:
-                self.access.token = kept_token(self._directory)
+                self.access.token = stored_token(self._directory)
             async with listening(self.app, self._host, self._port, *_security_headers(self._html)) as self._port:
                 self._reconnection.up(self.url)
                 await self._show_forever()
@@ -125,7 +125,7 @@ class Page:
         self._refuse_stranger(request)
         peer, token = _peer(request), request.query_params.get("token", "")
         # The token is in the query: a browser's EventSource cannot set headers.
-        has_token = self.access.refuses_token({TOKEN_HEADER: token}) is None
+        has_token = self.access.token_refusal({TOKEN_HEADER: token}) is None
         viewer = Viewer(request.state.connection, peer, has_token=has_token)
         if (why := self._no_room_for(viewer)) is not None:
             if token:
@@ -159,7 +159,7 @@ class Page:
 
     async def _act(self, request: Request) -> Response:
         self._refuse_stranger(request)
-        if (why := self.access.refuses_token(request.headers)) is not None:
+        if (why := self.access.token_refusal(request.headers)) is not None:
             if request.headers.get(TOKEN_HEADER):
                 await self._delay_guess(_peer(request))
             raise HTTPException(403, why)
@@ -198,7 +198,7 @@ class Page:
         return records
 
     def _refuse_stranger(self, request: Request) -> None:
-        if (why := self.access.refuses_stranger(request.headers)) is not None:
+        if (why := self.access.stranger_refusal(request.headers)) is not None:
             raise HTTPException(403, why)
 
     async def _delay_guess(self, peer: str) -> None:
@@ -282,7 +282,7 @@ class _OwnNames:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         app = self._app
-        if (why := self._access.refuses_host(Headers(scope=scope))) is not None:
+        if (why := self._access.host_refusal(Headers(scope=scope))) is not None:
             app = _json({"reason": why}, 421)
         await app(scope, receive, send)
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.alignment.align import turned
-from companion.estimation.alignment.align_model import Ground, StandMeans
+from companion.estimation.alignment.align_model import Ground, PoseMeans
 from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.estimation.collector.intake import Settings
 from companion.estimation.collector.rolling import RollingCollector
@@ -80,10 +80,10 @@ class _Stood:
     def face(self) -> Face:
         return (np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
 
-    def on_spot(self, turned: Counted, before: StandMeans | None) -> StandMeans:
+    def on_spot(self, turned: Counted, before: PoseMeans | None) -> PoseMeans:
         heading_rad = turned.angle_rad + (0.0 if before is None else before.heading_rad)
         is_turned, imus = before is not None, (self.window,)
-        return StandMeans(imus, None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
+        return PoseMeans(imus, None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
 
 
 class _Spot:
@@ -93,9 +93,9 @@ class _Spot:
         self.stood: list[_Stood] = []
         self.counter = TurnCounter()
 
-    def chosen(self, headings: int) -> list[StandMeans]:
+    def chosen(self, headings: int) -> list[PoseMeans]:
         """Return the stands that `align turn` asks for: first heading, half a turn, first heading; or all quarters."""
-        found: list[StandMeans] = []
+        found: list[PoseMeans] = []
         counter = copy.deepcopy(self.counter)  # which lets go of what was before a stand
         chosen = self.stood[::2] if headings == 2 else self.stood
         for before, now in zip([None, *chosen], chosen, strict=False):

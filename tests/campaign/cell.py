@@ -253,7 +253,7 @@ class _Course:
             job = stage.service.calibrating.manager.job
             if job is not None and not job.finished.done():
                 return f"the {job.kind} still runs: {job.words}"
-            if stage.service.offsets.ledger.pending:
+            if stage.service.offsets.journal.pending:
                 return "old values are still to be put back"
             return ""
 

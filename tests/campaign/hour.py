@@ -157,7 +157,7 @@ async def _to_rest(stage: Stage) -> None:
     manager = stage.service.calibrating.manager
     await asyncio.sleep(5.0)
     await stage.until(
-        lambda: (manager.job is None or manager.job.finished.done()) and not stage.service.offsets.ledger.pending,
+        lambda: (manager.job is None or manager.job.finished.done()) and not stage.service.offsets.journal.pending,
         240.0,
     )
 

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.cli.client import stands_lines
+from companion.cli.client import pose_lines
 from companion.cli.show import status_lines
 from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.daemon.stands.alignment import ByHand
+from companion.daemon.poses.alignment import ByHand
 from companion.estimation.machine import What
 from companion.estimation.records.align_record import FacesRecord
 from companion.estimation.records.record import Record
@@ -69,7 +69,7 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         # What is told is what was written, the whole; and beside it what of that is new.
         assert imu.whole_bias_mg is not None
         np.testing.assert_allclose(imu.whole_bias_mg, true_mg, atol=0.15)
-        (bias, change) = [line for line in stands_lines(msgspec.to_builtins(record)) if " mg   " in line]
+        (bias, change) = [line for line in pose_lines(msgspec.to_builtins(record)) if " mg   " in line]
         assert f"x {imu.whole_bias_mg[0]:+.3f} +- " in bias
         told_mg = [float(value) for value in re.findall(r"[xyz] ([-+][\d.]+)", change)]
         np.testing.assert_allclose(told_mg, true_mg - np.array(list(offsets.values())) / MG, atol=0.2)

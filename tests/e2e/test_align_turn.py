@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.cli.client import stands_lines
+from companion.cli.client import pose_lines
 from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.job import Job
@@ -138,7 +138,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             assert record.board is not None
             assert max(record.board.sigma_deg) < 0.03
             # With all sides known it is no bias that a level base would show.
-            (line,) = [words for words in stands_lines(msgspec.to_builtins(record)) if "when level" in words]
+            (line,) = [words for words in pose_lines(msgspec.to_builtins(record)) if "when level" in words]
             assert line.startswith("  slant when level ")
             up = mounting_matrix(*board_deg).T @ np.array([0.0, 0.0, -1.0])
             true_deg = np.degrees([np.arctan2(-up[1], -up[2]), np.arcsin(up[0])])

@@ -13,7 +13,7 @@ import pytest
 
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.daemon.stands.measuring import Measuring
+from companion.daemon.poses.measuring import Measuring
 from companion.estimation.machine import What
 from companion.estimation.means.windows import Window
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
@@ -37,7 +37,7 @@ async def test_a_write_interrupted_on_another_aircraft_is_named_and_nothing_of_i
     ChangeLog(tmp_path).journal.write(ChangeSet(7, changes))
 
     async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025)).running() as rig:
-        await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+        await rig.until(lambda: not rig.service.offsets.journal.pending, 60.0)
         await asyncio.sleep(2.0)
         assert rig.double.writes == []
         assert any("Interrupted write on system 7" in text for text in rig.ground.texts())
@@ -55,10 +55,10 @@ async def test_an_interrupted_write_waits_while_armed_without_trying(
     async with rig.running():
         await asyncio.sleep(15.0)
         assert rig.double.writes == []
-        assert rig.service.offsets.ledger.pending
+        assert rig.service.offsets.journal.pending
         assert not any("trying again" in words for words in caplog.messages)
         rig.double.disarm()
-        await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
+        await rig.until(lambda: not rig.service.offsets.journal.pending, 20.0)
         assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
 
 

@@ -172,7 +172,7 @@ async def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot
         rig.double.reboot(down_s=1.0)
         result = await job.finished
         assert result.outcome == "failed", result
-        await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+        await rig.until(lambda: not rig.service.offsets.journal.pending, 60.0)
         after = imu_parameters(rig)
         differ = {name for name in before if after[name] != before[name]}
         if gyr_cal:
@@ -205,7 +205,7 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
         (folder / "journal.json").write_bytes(journal)
         left = {name: coarse if "GYR" in name and "OFFS" in name else value for name, value in left.items()}
         async with make(folder, auxiliary=True, parameters=left).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.journal.pending, 60.0)
             assert imu_parameters(rig) == before
             assert not (folder / "journal.json").exists()
 

@@ -156,7 +156,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int]:
         rig.autopilot.disarm()
         await asyncio.sleep(15.0)
         job = rig.service.calibrating.manager.job
-        await rig.until(lambda: (job is None or job.finished.done()) and not rig.service.offsets.ledger.pending, 240.0)
+        await rig.until(lambda: (job is None or job.finished.done()) and not rig.service.offsets.journal.pending, 240.0)
     assert judge.faults == [], f"seed {seed}"
     return judge.writes, conflicts
 

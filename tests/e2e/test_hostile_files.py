@@ -44,8 +44,8 @@ async def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
         (said,) = [words for words in caplog.messages if path.name in words]
         assert said in rig.service.status()["warnings"]
         assert said.startswith(f"{path}: cannot be {reason}: ")
-        assert rig.service.offsets.ledger.fault is None
-        assert not rig.service.offsets.ledger.pending
+        assert rig.service.offsets.journal.fault is None
+        assert not rig.service.offsets.journal.pending
         if name == "undo-1.json":
             answer = rig.service.calibrating.manager.start_undo("test")
             assert isinstance(answer, Refusal)
@@ -65,7 +65,7 @@ async def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to
     ChangeLog(tmp_path).journal.write(found)
 
     async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
-        await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
+        await rig.until(lambda: not rig.service.offsets.journal.pending, 20.0)
         ours = name.startswith("INS")
         assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
         assert len(rig.double.writes) == int(ours)

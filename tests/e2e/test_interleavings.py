@@ -181,7 +181,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         double.disarm()
         await asyncio.sleep(2.0)  # what is still on the wire, and the autopilot's reboot, if it is in one
         await rig.until(
-            lambda: (manager.job is None or manager.job.finished.done()) and not rig.service.offsets.ledger.pending,
+            lambda: (manager.job is None or manager.job.finished.done()) and not rig.service.offsets.journal.pending,
             240.0,
         )
         records = rig.service.calibrating.store.history()[::-1]

@@ -39,7 +39,7 @@ async def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_a
         assert failed.reason.endswith("the rest follows once disarmed")
         assert "calibration, 11 parameters: old values not restored yet" in await told(rig)
         rig.double.disarm()
-        await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
+        await rig.until(lambda: not rig.service.offsets.journal.pending, 30.0)
         assert values(rig.double) == before
         assert rig.service.status()["undoable"] == []
         assert " old values restored, 20" in await told(rig)

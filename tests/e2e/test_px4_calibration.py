@@ -117,7 +117,7 @@ async def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: 
     for name in before:
         again.px4.set_parameter(name, rig.px4.parameter(name))
     async with again.running():
-        await again.until(lambda: not again.service.offsets.ledger.pending, 40.0)
+        await again.until(lambda: not again.service.offsets.journal.pending, 40.0)
         await asyncio.sleep(1.5)
         assert values(again) == before
         assert in_use_as_stored(again)
@@ -133,7 +133,7 @@ async def test_a_reboot_at_any_phase_leaves_the_old_values_or_the_new_ones_in_us
         await rig.until(lambda: len(rig.px4.writes) >= writes, 60.0)
         rig.px4.reboot()
         result = await job.finished
-        await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+        await rig.until(lambda: not rig.service.offsets.journal.pending, 60.0)
         await asyncio.sleep(3.0)
         if result.outcome == "done":
             assert writes == 0

@@ -11,7 +11,7 @@ import pytest
 
 from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.parameters.change import Change
-from companion.daemon.offsets.reboot import RebootOwed, owed_in
+from companion.daemon.offsets.reboot import RequiredReboot, owed_in
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig, inline
 
@@ -71,14 +71,14 @@ async def test_a_restart_that_nobody_saw_shows_in_the_time_since_boot(
     same_board: bool,
     owed: bool,
 ) -> None:
-    def known(boot_s: float | None, host: str) -> RebootOwed:
+    def known(boot_s: float | None, host: str) -> RequiredReboot:
         monkeypatch.setenv("COMPANION_BOOT_ID", host)
         now_s = asyncio.get_running_loop().time()
         boot = SimpleNamespace(latest=None if boot_s is None else (boot_s, now_s))
         vehicle = SimpleNamespace(kind=PX4(), system_id=1, boots=0, boot=boot)
         config = SimpleNamespace(storage=SimpleNamespace(path=tmp_path))
         core: Any = SimpleNamespace(config=config, vehicle=vehicle, offload=inline)
-        made = RebootOwed(core)
+        made = RequiredReboot(core)
         made.load()
         return made
 

@@ -134,7 +134,7 @@ def test_a_power_cut_at_any_moment_of_an_undo_costs_no_step_and_takes_back_no_se
     async def go_on(cut: Cut) -> int:
         async with Rig(cut.folder, parameters=cut.parameters).running() as rig:
             await rig.ready()
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
+            await rig.until(lambda: not rig.service.offsets.journal.pending, 30.0)
             left = steps(rig)
             assert left in (list(STEPS[1:]), list(STEPS[2:]))
             assert read(rig) == wanted[4 - len(left)]
@@ -189,7 +189,7 @@ async def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
         assert "old values restored" not in failed.reason
         assert read(rig) == wanted[0]
         assert step_file.read_bytes() == kept
-        assert not rig.service.offsets.ledger.pending
+        assert not rig.service.offsets.journal.pending
         mended(rig)
         if restart:
             await rig.restart()

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net, SlotMemory
+from companion.autopilot.firmware.base import Firmware, HeadingFallback, HeadingSetting, SlotMemory
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
@@ -246,7 +246,7 @@ class ArduPilot(Firmware):
     heading_watched = (_HEADING_SCRIPT,)
     heading_risks = ("ArduPilot does not arm while the companion's heading is missing (VisOdom: not healthy)",)
 
-    def heading_net(self, found: Mapping[str, float]) -> Net:
+    def heading_net(self, found: Mapping[str, float]) -> HeadingFallback:
         fallbacks = found.get("EK3_SRC2_YAW"), found.get("EK3_SRC3_YAW")
         if fallbacks != (_COMPASS, _GYROS) or not found.get("EK3_SRC3_VELXY"):
             return "none"

@@ -90,7 +90,7 @@ class Firmware:
     heading_watched: tuple[str, ...] = ()  # further parameters that affect the use of our heading
     heading_risks: tuple[str, ...] = ()
 
-    def heading_net(self, found: Mapping[str, float]) -> Net:
+    def heading_net(self, found: Mapping[str, float]) -> HeadingFallback:
         return "none"
 
     def takes_only_our_heading(self, found: Mapping[str, float]) -> bool:
@@ -205,10 +205,10 @@ class HeadingSetting:
         return float(int(found[self.parameter]) | int(value)) if self.bits else value
 
 
-Net = Literal["script", "command", "autopilot", "none"]
+HeadingFallback = Literal["script", "command", "autopilot", "none"]
 """Party that switches the autopilot to another heading source when our heading ends; "command" means the companion."""
 
-NETS: Final[dict[Net, str]] = {
+HEADING_FALLBACKS: Final[dict[HeadingFallback, str]] = {
     "script": "if the companion's heading ends in flight, the script switches to gyros and GNSS within a second",
     "command": "if the companion's heading ends, it selects gyros and GNSS, unless its board fails (autopilot script)",
     "autopilot": "if the companion's heading ends, the autopilot returns to its magnetometer",

@@ -23,7 +23,7 @@ from companion.messages import message
 from companion.samples import Triad
 
 FIRMWARES: Final[tuple[Firmware, ...]] = (ArduPilot(), PX4())
-UNHEARD: Final = Firmware()
+NO_FIRMWARE_YET: Final = Firmware()
 OTHER: Final = OtherFirmware()
 
 CALIBRATION: Final[Mapping[str, Mapping[str, Range]]] = {str(one.name): one.ranges for one in FIRMWARES}
@@ -33,7 +33,7 @@ or accepted from a file."""
 
 def firmware_named(name: FirmwareName | None) -> Firmware:
     """Return the firmware with this name; None: no heartbeat of the autopilot yet."""
-    return UNHEARD if name is None else next((one for one in FIRMWARES if one.name == name), OTHER)
+    return NO_FIRMWARE_YET if name is None else next((one for one in FIRMWARES if one.name == name), OTHER)
 
 
 def firmware_with(mav_autopilot: int) -> Firmware:

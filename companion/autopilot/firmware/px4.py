@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import NO_IMU, Firmware, HeadingSetting, Net, SlotMemory
+from companion.autopilot.firmware.base import NO_IMU, Firmware, HeadingFallback, HeadingSetting, SlotMemory
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
@@ -191,7 +191,7 @@ class PX4(Firmware):
         "EKF2 believes the companion's heading beside its magnetometer, and resets to it where the two disagree",
     )
 
-    def heading_net(self, found: Mapping[str, float]) -> Net:
+    def heading_net(self, found: Mapping[str, float]) -> HeadingFallback:
         return "none" if self.missing_compass(found) else "autopilot"
 
     def missing_compass(self, found: Mapping[str, float]) -> str | None:

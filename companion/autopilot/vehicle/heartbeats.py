@@ -124,7 +124,7 @@ def version_text(packed: int) -> str:
     return f"{major}.{minor}.{patch}{suffix}"
 
 
-class Latch:
+class AutopilotChooser:
     """Chooses the autopilot to work with, by its heartbeats."""
 
     def __init__(self, system_id: int | None) -> None:

@@ -16,15 +16,15 @@ from typing import Any, Final, Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.base import Firmware
-from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_with
+from companion.autopilot.firmware.firmwares import FIRMWARES, NO_FIRMWARE_YET, OTHER, firmware_with
 from companion.autopilot.parameters.change import FirmwareName
 from companion.autopilot.vehicle.commands import Commands, StandingRequests
 from companion.autopilot.vehicle.disarmed import DisarmedCheck
 from companion.autopilot.vehicle.heartbeats import (
     ArmingWatch,
     ArmState,
+    AutopilotChooser,
     BootClock,
-    Latch,
     is_aircraft,
     unique_id,
     version_text,
@@ -69,7 +69,7 @@ class Vehicle:
     ) -> None:
         self.system_id: int | None = None
         self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
-        self.kind: Firmware = UNHEARD
+        self.kind: Firmware = NO_FIRMWARE_YET
         self.version: str | None = None  # Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come
         self.capabilities: int | None = None  # MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come
         self.uid: str | None = None  # id of the board; None until AUTOPILOT_VERSION has come
@@ -82,7 +82,7 @@ class Vehicle:
         self.boot = BootClock()
         self._boot_heard = asyncio.Event()
         self._link = link
-        self._latch = Latch(system_id)
+        self._latch = AutopilotChooser(system_id)
         self._heartbeat_s: float | None = None
         self._heartbeat_link_id: int | None = None
         self._arming = ArmingWatch()

@@ -39,7 +39,7 @@ from companion.estimation.records.validity import (
     worst_axis,
     worth_writing,
 )
-from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.doubt import Inconsistency
 from companion.estimation.solution.solve import Solution
 from companion.physics.frames import vector
 from companion.samples import TRIADS, Triad, rows_of
@@ -187,7 +187,7 @@ class ActiveCalibration:
             for imu in job.record.imus:
                 self._take(imu, asyncio.get_running_loop().time(), job.held_back)
 
-    def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
+    def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Inconsistency]) -> None:
         corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s
         # For an IMU without telemetry "stored" is the best possible outcome, so it counts as seen.
         for triad in TRIADS:

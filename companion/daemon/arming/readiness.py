@@ -21,7 +21,7 @@ from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
-from companion.daemon.offsets.reboot import RebootOwed
+from companion.daemon.offsets.reboot import RequiredReboot
 from companion.estimation.machine import State
 from companion.estimation.records.record import sigma_texts
 from companion.estimation.records.validity import Why
@@ -63,7 +63,7 @@ ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 class Readiness:
     """Arm gate: its answer to arming requests, with the reason; `run` updates it."""
 
-    def __init__(self, core: Core, owed: RebootOwed, in_force: ActiveCalibration, automatic: Automatic) -> None:
+    def __init__(self, core: Core, owed: RequiredReboot, in_force: ActiveCalibration, automatic: Automatic) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
         self._min_still_s = core.config.calibration.min_still_s

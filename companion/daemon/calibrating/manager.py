@@ -21,8 +21,8 @@ from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Tune, Weight
 from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
 from companion.daemon.job import Job, JobCancelledError
-from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.stands.alignment import ByHand
+from companion.daemon.offsets.journal import WriteJournal
+from companion.daemon.poses.alignment import ByHand
 from companion.errors import CompanionError, StorageError
 from companion.estimation.machine import Event, State, What
 from companion.estimation.records.record import Record
@@ -61,9 +61,9 @@ REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = 
 """Kind of refusal for each unmet condition; conditions without an entry have the kind "other"."""
 
 
-def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple[Precondition, str]]:
-    if ledger.fault is not None:
-        yield Precondition.STORAGE, ledger.fault
+def blocked(vehicle: Vehicle, journal: WriteJournal, job: Job | None) -> Iterator[tuple[Precondition, str]]:
+    if journal.fault is not None:
+        yield Precondition.STORAGE, journal.fault
     if vehicle.conflict is not None:
         yield Precondition.ONE_AUTOPILOT, vehicle.conflict
     if job is not None and job.is_running:
@@ -74,9 +74,9 @@ def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple
         age_s = vehicle.heartbeat_age_s
         words = "no autopilot found yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: power? cable?"
         yield Precondition.ARM_STATE_KNOWN, words
-    if (why := ledger.why_yield()) is not None:
+    if (why := journal.why_yield()) is not None:
         yield Precondition.ONE_COMPANION, why
-    if ledger.pending:
+    if journal.pending:
         yield Precondition.RESTORED, "restoring old values first"
 
 
@@ -125,14 +125,14 @@ class CalibrationManager:
         return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
 
     def blocking_reason(self, among: Collection[Precondition] = tuple(Precondition)) -> tuple[Precondition, str] | None:
-        unmet = blocked(self._vehicle, self._recovery.ledger, self.running)
+        unmet = blocked(self._vehicle, self._recovery.journal, self.running)
         return next((found for found in unmet if found[0] in among), None)
 
     @property
     def mav_state(self) -> int:
         if self._machine.state.busy:
             return mavlink.MAV_STATE_CALIBRATING
-        if self._recovery.ledger.fault is not None:
+        if self._recovery.journal.fault is not None:
             return mavlink.MAV_STATE_CRITICAL
         return mavlink.MAV_STATE_ACTIVE if self._vehicle.arm_state is ArmState.ARMED else mavlink.MAV_STATE_STANDBY
 

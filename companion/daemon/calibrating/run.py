@@ -35,12 +35,12 @@ from companion.daemon.offsets.plan import (
     without,
 )
 from companion.daemon.offsets.subsystem import WATCHING, Offsets
-from companion.daemon.stands.measuring import Estimator, Measuring
+from companion.daemon.poses.measuring import Estimator, Measuring
 from companion.estimation.machine import Event, What
 from companion.estimation.means.windows import Window
 from companion.estimation.records.history import Point
 from companion.estimation.records.record import AlignmentUsed, ImuRecord, Record
-from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.doubt import Inconsistency
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn
@@ -94,7 +94,7 @@ class CalibrationRun(Job):
         """Active alignment of the gradienter; None: zero and sigma come from the configuration."""
         self.calibrations: dict[str, ImuCalibration] = {}
         """Offsets and scales that the autopilot applied to each of its IMUs during the measurement."""
-        self.held_back: dict[Key, Doubt] = {}
+        self.held_back: dict[Key, Inconsistency] = {}
         """Triads (gyros or accelerometers of an IMU) not written, as their biases contradict earlier ones."""
         self._forget()
 

@@ -23,11 +23,11 @@ from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
 from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.subsystem import Offsets
-from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition, ByHand
-from companion.daemon.stands.measuring import Estimator, Measuring
-from companion.daemon.stands.session import PoseSession, PoseTask
-from companion.daemon.stands.tasks import SidesTask, TurnTask, ZeroTask
-from companion.daemon.stands.writes import AlignmentWrites
+from companion.daemon.poses.alignment import ActiveAlignment, ActiveSixPosition, ByHand
+from companion.daemon.poses.measuring import Estimator, Measuring
+from companion.daemon.poses.session import PoseSession, PoseTask
+from companion.daemon.poses.tasks import SixPositionTask, TurnTask, ZeroTask
+from companion.daemon.poses.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
 from companion.estimation.machine import Event, What
@@ -220,7 +220,7 @@ class Calibrating(Subsystem):
     async def _align_by(self, request: AlignmentRequest, job: Job) -> str:
         task: PoseTask
         if request.action == "faces":
-            task = SidesTask(request, self._imus, self.faces)
+            task = SixPositionTask(request, self._imus, self.faces)
         elif request.action == "turn":
             task = TurnTask(self._core, request, self._imus, self.faces)
         else:
@@ -264,7 +264,7 @@ class Calibrating(Subsystem):
     # --- bias curves over temperature, written as the autopilot's temperature calibration
 
     def _why_no_curve_undo(self) -> str | None:
-        steps = self._offsets.ledger.steps(self._core.vehicle.system_id)
+        steps = self._offsets.journal.steps(self._core.vehicle.system_id)
         after = [step.origin.what or "a write" for step in steps]
         if BY_TEMPERATURE not in after:
             return "no curve was written that could be undone"
@@ -334,7 +334,7 @@ class Calibrating(Subsystem):
 
     def _wrote_curve(self, thermal: Thermal) -> bool:
         ours: dict[str, float | None] = {}
-        for step in reversed(self._offsets.ledger.steps(self._core.vehicle.system_id)):
+        for step in reversed(self._offsets.journal.steps(self._core.vehicle.system_id)):
             if step.origin.what == BY_TEMPERATURE:
                 ours |= {one.parameter: one.after for one in step.changes}
         found = [(ours[name], value) for name, value in thermal.values.items() if name in ours]

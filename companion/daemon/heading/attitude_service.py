@@ -11,7 +11,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.estimator import Attitude
-from companion.autopilot.firmware.base import Firmware, Net
+from companion.autopilot.firmware.base import Firmware, HeadingFallback
 from companion.autopilot.telemetry.attitude_messages import (
     TimesyncResponder,
     attitude_messages,
@@ -25,7 +25,7 @@ from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, RepeatedRead
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier, carrying_imu, without_truncation
+from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, AttitudeCarrier, carrying_imu, without_truncation
 from companion.daemon.heading.health import Difference, Health
 from companion.daemon.heading.resume import Resume
 from companion.formats import Object
@@ -69,7 +69,7 @@ class Fallback:
 
     def __init__(self, core: Core) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
-        self.net: Net | None = None
+        self.net: HeadingFallback | None = None
         self._selected = False
         self.reading = RepeatedRead(core.vehicle, self._read, 0.0)
         self._pushed_since_s = math.inf
@@ -157,7 +157,7 @@ class AttitudeService:
         config, link, vehicle = core.config, core.link, core.vehicle
         self.turns = 0
         self._config, self._vehicle, self._say = config, vehicle, core.say
-        self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
+        self.carrier = AttitudeCarrier(core, carrying_imu(config), in_force, calibrating.alignment)
         self.difference = Difference(vehicle, self.carrier)
         self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
         self.resume = Resume(core, self.carrier, self.difference, calibrating, self._autopilot_imu)

@@ -20,7 +20,7 @@ from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.core import Core
-from companion.daemon.stands.alignment import ActiveAlignment
+from companion.daemon.poses.alignment import ActiveAlignment
 from companion.errors import CalibrationRefusedError
 from companion.estimation.means.pose import CompassModel, GradienterModel, vehicle_heading_rad
 from companion.estimation.means.windows import Window
@@ -94,7 +94,7 @@ def without_truncation(sample: ImuSample, step_rad_s: float) -> ImuSample:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class StandingAttitude:
+class MeasuredAttitude:
     """Attitude of the motionless aircraft at the end of a measuring window."""
 
     t_s: float
@@ -107,7 +107,7 @@ class StandingAttitude:
 
 def standing_attitude(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
-) -> StandingAttitude:
+) -> MeasuredAttitude:
     """Estimate the motionless aircraft's attitude; raise CalibrationRefusedError if readings disagree. Blocking."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
@@ -115,10 +115,10 @@ def standing_attitude(
     covariance = turn.T @ truth.attitude_covariance_rad2 @ turn
     if truth.heading_rad is None:
         covariance[2, 2] += HEADING_UNKNOWN_RAD**2
-    return StandingAttitude(window.end_s, turn, covariance, truth.heading_rad is not None, local)
+    return MeasuredAttitude(window.end_s, turn, covariance, truth.heading_rad is not None, local)
 
 
-class Carrier:
+class AttitudeCarrier:
     """Estimates the attitude from one IMU, between alignments and in flight."""
 
     def __init__(self, core: Core, imu: Imu, in_force: ActiveCalibration, alignment: ActiveAlignment) -> None:
@@ -238,15 +238,15 @@ class Carrier:
             self.estimator.settle(settings)
             self.align_wanted = True
 
-    def resume(self, settings: AttitudeSettings, stand: StandingAttitude) -> None:
+    def resume(self, settings: AttitudeSettings, stand: MeasuredAttitude) -> None:
         self.estimator, self._local = AttitudeEstimator(settings), stand.local
         self._align(stand)
 
-    async def _stand(self, now_s: float) -> StandingAttitude | None:
+    async def _stand(self, now_s: float) -> MeasuredAttitude | None:
         try:
             window = await self._core.window(since_s=now_s - STOOD_S)
             where = models.whereabouts(self._config, self._vehicle)
-            stand: StandingAttitude = await self._offload(
+            stand: MeasuredAttitude = await self._offload(
                 standing_attitude, window, where, self._alignment.model(), self._compass
             )
         except CalibrationRefusedError as error:
@@ -254,7 +254,7 @@ class Carrier:
             return None
         return stand
 
-    def _disagrees(self, stand: StandingAttitude) -> bool:
+    def _disagrees(self, stand: MeasuredAttitude) -> bool:
         now = self.now()
         if now is None:
             return True
@@ -269,7 +269,7 @@ class Carrier:
             return True
         return stand.heading_known and abs(down) > max(HEADING_FLOOR_RAD, DISAGREES_SIGMAS * heading_sigma)
 
-    def _align(self, stand: StandingAttitude) -> None:
+    def _align(self, stand: MeasuredAttitude) -> None:
         assert self.estimator is not None
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]

@@ -24,7 +24,7 @@ from companion.attitude.quaternion import (
     shortest_arc,
 )
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
-from companion.daemon.heading.carrier import Carrier
+from companion.daemon.heading.carrier import AttitudeCarrier
 from companion.physics.frames import vector
 from companion.physics.units import DEG
 
@@ -52,8 +52,8 @@ FORGETS_PER_S: Final = 0.02
 HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
-STRAYS_RAD: Final = math.radians(5.0)
-FADES_S: Final = 4.0
+DRIFT_LIMIT_RAD: Final = math.radians(5.0)
+DRIFT_FADE_S: Final = 4.0
 """Time constant of the fading sum of heading drift. Drift up to 1.25 deg/s is undetected: the compass corrects it."""
 STRAYS_SIGMAS: Final = 3.0  # Allowed drift in sigmas of the heading: the compass may correct a poorly known heading
 SCALES: Final = 0.01
@@ -82,7 +82,7 @@ class HeadingDriftMonitor:
             self._sigma_rad = max(self._sigma_rad, sigma_rad)
             return
         passed_s = t_s - before[0]
-        kept = 1.0 - passed_s / FADES_S if 0.0 < passed_s < FADES_S else 0.0
+        kept = 1.0 - passed_s / DRIFT_FADE_S if 0.0 < passed_s < DRIFT_FADE_S else 0.0
         self.strayed_rad *= kept
         self._turned_rad *= kept
         self._apart_rad *= kept
@@ -94,14 +94,14 @@ class HeadingDriftMonitor:
             self._turned_rad += abs(by_gyros)
             self._apart_rad = max(self._apart_rad, late_s * max(abs(rate_rad_s), abs(heading / passed_s)))
         apart = LATE_S * abs(rate_rad_s) + self._apart_rad
-        allowed = max(STRAYS_RAD, STRAYS_SIGMAS * self._sigma_rad) + SCALES * self._turned_rad + apart
+        allowed = max(DRIFT_LIMIT_RAD, STRAYS_SIGMAS * self._sigma_rad) + SCALES * self._turned_rad + apart
         self.is_too_far = abs(self.strayed_rad) > allowed
 
 
 class Difference:
     """Difference between the companion's attitude and the one in the autopilot's ATTITUDE messages."""
 
-    def __init__(self, vehicle: Vehicle, carrier: Carrier) -> None:
+    def __init__(self, vehicle: Vehicle, carrier: AttitudeCarrier) -> None:
         self._carrier = carrier
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
@@ -224,7 +224,7 @@ class Health:
     """
 
     def __init__(
-        self, carrier: Carrier, difference: Difference, vehicle: Vehicle, own_agrees: Callable[[float], bool]
+        self, carrier: AttitudeCarrier, difference: Difference, vehicle: Vehicle, own_agrees: Callable[[float], bool]
     ) -> None:
         self._carrier, self._difference, self._vehicle, self._own_agrees = carrier, difference, vehicle, own_agrees
         self.pushing = False

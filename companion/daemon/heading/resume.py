@@ -20,7 +20,7 @@ from companion.configured import models
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.heading.carrier import Carrier, StandingAttitude, settings_of
+from companion.daemon.heading.carrier import AttitudeCarrier, MeasuredAttitude, settings_of
 from companion.daemon.heading.health import HEADING_UNKNOWN, THEIR_TILT_DEG, Difference, disagreements
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
@@ -38,7 +38,12 @@ class Resume:
     """Resumes the attitude estimate in flight; call `step` several times a second until `pending` is false."""
 
     def __init__(
-        self, core: Core, carrier: Carrier, difference: Difference, calibrating: Calibrating, imu: AutopilotImu | None
+        self,
+        core: Core,
+        carrier: AttitudeCarrier,
+        difference: Difference,
+        calibrating: Calibrating,
+        imu: AutopilotImu | None,
     ) -> None:
         self._core, self._carrier, self._difference, self._imu = core, carrier, difference, imu
         self._store, self._memory = calibrating.store, calibrating.memory
@@ -88,7 +93,7 @@ class Resume:
         if settings is None:
             return "no calibration is active"
         covariance = np.diag([(THEIR_TILT_DEG * DEG) ** 2] * 2 + [HEADING_UNKNOWN_RAD**2])
-        stand = StandingAttitude(theirs[0], to_matrix(theirs[1]).T, covariance, heading_known=False, local=local)
+        stand = MeasuredAttitude(theirs[0], to_matrix(theirs[1]).T, covariance, heading_known=False, local=local)
         self._carrier.resume(settings, stand)
         return None
 

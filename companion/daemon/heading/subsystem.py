@@ -7,14 +7,14 @@ import math
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from companion.autopilot.firmware.base import NETS
+from companion.autopilot.firmware.base import HEADING_FALLBACKS
 from companion.commands import AutopilotSetup
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.stands.alignment import ActiveAlignment
+from companion.daemon.poses.alignment import ActiveAlignment
 from companion.estimation.means.pose import up_in_vehicle, vehicle_heading_rad
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.formats import Object
@@ -65,7 +65,7 @@ class Heading(Subsystem):
         if not concerned:
             reason = f"not wanted; for push.attitude: set {todo}; {REBOOT}"
         elif missing is not None:
-            reason = f"this autopilot has no compass in use ({missing}): {NETS['none']}"
+            reason = f"this autopilot has no compass in use ({missing}): {HEADING_FALLBACKS['none']}"
         elif changes:
             reason = f"set {todo}; {REBOOT}"
         elif not sends:
@@ -76,7 +76,7 @@ class Heading(Subsystem):
             "kind": "result",
             "state": "not applied" if changes or missing is not None else "applied",
             "reason": reason,
-            "net": {"kind": net, "words": NETS[net]} if concerned else None,
+            "net": {"kind": net, "words": HEADING_FALLBACKS[net]} if concerned else None,
             "firmware": firmware.name,
             "parameters": [
                 {

@@ -21,7 +21,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, VehicleTimer
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.offsets.plan import ImuPlan, Plan
-from companion.daemon.offsets.px4_writes import OnTheWay, Px4Writes
+from companion.daemon.offsets.px4_writes import Px4Writes, UnderFarOffset
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import MIN_BATCHES
 from companion.estimation.means.warming import Warming
@@ -55,7 +55,7 @@ TOLERANCE_SIGMAS: Final = 2.0
 """Allowed difference from the expected output in addition to noise, in sigmas of the bias (its sigma_use)."""
 
 
-async def watch_effect(
+async def verify_effect(
     core: Core, px4: Px4Writes, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
 ) -> tuple[Verdicts | None, str]:
     """Wait until the aircraft is motionless after a write, then judge the step; if it is nearly visible, go on longer.
@@ -114,9 +114,9 @@ def _in_the_way(core: Core, looked_s: float) -> str:
 
 def _judge(core: Core, px4: Px4Writes, target: ImuPlan, before: Window, after: Window) -> list[EffectVerdict]:
     first, second = (next(imu for imu in window.imus if imu.name == target.name) for window in (before, after))
-    profile, on_the_way = core.profiles.of(target.name), px4.on_the_way[target.calibration.instance]
+    profile, under_far_offset = core.profiles.of(target.name), px4.under_far_offset[target.calibration.instance]
     apart_s = (after.start_s + after.end_s - before.start_s - before.end_s) / 2.0
-    return judge_vectors(target, first, second, profile, on_the_way, apart_s=apart_s)
+    return judge_vectors(target, first, second, profile, under_far_offset, apart_s=apart_s)
 
 
 def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
@@ -136,7 +136,7 @@ def judge_vectors(
     first: ImuWindow,
     second: ImuWindow,
     profile: str | NoiseProfile | None,
-    on_the_way: OnTheWay,
+    under_far_offset: UnderFarOffset,
     *,
     apart_s: float = 0.0,
 ) -> list[EffectVerdict]:
@@ -169,15 +169,15 @@ def judge_vectors(
             before=before,
             before_sigma=sigma,
             after=after,
-            after_sigma=vector(np.hypot(np.hypot(_no_calmer(sigma_after, sigma, spans_s), drift), warmed)),
+            after_sigma=vector(np.hypot(np.hypot(_limited_from_below(sigma_after, sigma, spans_s), drift), warmed)),
             expected_step=step,
             truth=vector(np.subtract(before, excess)),
             tolerance=TOLERANCE_SIGMAS * max(use),
             orientation=target.calibration.orientation,
         )
         verdict = judge(observation)
-        if verdict.ok and triad in on_the_way:
-            (far, far_sigma), step_from_there = on_the_way[triad]
+        if verdict.ok and triad in under_far_offset:
+            (far, far_sigma), step_from_there = under_far_offset[triad]
             verdict = judge(
                 dataclasses.replace(
                     observation,
@@ -214,7 +214,7 @@ def _as_at_end(
     )
 
 
-def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
+def _limited_from_below(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
     """Raise the sigmas of the mean after a write to at least those expected from the noise before the write.
 
     A write does not change the noise, but the scatter in a few seconds can by chance be a tenth of the true scatter. If

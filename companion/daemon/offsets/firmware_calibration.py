@@ -28,7 +28,7 @@ from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.gyro_calibration import GyroOutcome
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter, kind_of
 from companion.daemon.core import Core
-from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.journal import WriteJournal
 from companion.daemon.offsets.plan import Plan, WriteLog
 from companion.errors import AutopilotError, CompanionError
 from companion.estimation.records.record import WrittenParameter
@@ -51,10 +51,10 @@ SETTLE_ALONE_S: Final = 150.0
 class FirmwareCalibration:
     """Write of offsets with the firmware's own gyro calibration in between, if the EKF needs it."""
 
-    def __init__(self, core: Core, writer: ParameterWriter, ledger: Ledger) -> None:
+    def __init__(self, core: Core, writer: ParameterWriter, journal: WriteJournal) -> None:
         self._vehicle, self._parameters = core.vehicle, core.parameters
         self._on_deck = core.config.vehicle.platform == "deck"
-        self._writer, self._ledger, self._ekf = writer, ledger, EkfWatch(core.vehicle)
+        self._writer, self._journal, self._ekf = writer, journal, EkfWatch(core.vehicle)
 
     async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> dict[str, float] | None:
         """Read the values that the firmware's gyro calibration would overwrite; return None if we do not start it.
@@ -86,13 +86,13 @@ class FirmwareCalibration:
         now = {name: wanted.get(name, value) for name, value in before.items()}
         try:
             ours = [change for change in changes if change.parameter not in before]
-            await self._ledger.update_pending(ChangeSet.of(system_id, ours, before))
+            await self._journal.update_pending(ChangeSet.of(system_id, ours, before))
             outcome, warning, coarse = await gyro_calibration.calibrate(self._parameters, now, go_on)
             go_on(message("write_in_progress", count=len(plan.gyros), what="fine gyro offsets"))
             fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
             others = gyro_calibration.changed(before, coarse).items()
             collateral = tuple(Change(name, old, new) for name, (old, new) in others if name not in wanted)
-            await self._ledger.update_pending(ChangeSet.of(system_id, (*changes, *collateral)))
+            await self._journal.update_pending(ChangeSet.of(system_id, (*changes, *collateral)))
         except CompanionError as error:
             await self._restore(changes, before, boots, error)
             raise

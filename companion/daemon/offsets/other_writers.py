@@ -124,7 +124,7 @@ class OtherCompanions:
             known.is_new, known.boot_ms, known.latest_s = is_new, boot_ms, t_s
 
 
-class Rivalry:
+class FirmwareCalibrationWarnings:
     """Warns about autopilot calibrations that overwrite our offsets; the setting `push.stop_rivals` disables these."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:

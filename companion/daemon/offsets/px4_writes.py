@@ -29,7 +29,7 @@ from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleTimer
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
-from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.journal import WriteJournal
 from companion.daemon.offsets.plan import ImuPlan
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.messages import message
@@ -80,7 +80,7 @@ class ExpectedStep:
 
 Mean = tuple[Array, Array]
 """Mean of an IMU output and its sigma, each x y z in vehicle FRD, in rad/s or m/s^2."""
-OnTheWay = Mapping[Triad, tuple[Mean, Array]]
+UnderFarOffset = Mapping[Triad, tuple[Mean, Array]]
 """Mean output (integer messages) under a temporary large offset, and expected step to the new offsets, by triad."""
 
 
@@ -88,12 +88,18 @@ class Px4Writes:
     """Observer of the telemetry while temporary large offsets are written to PX4; learns which IMU each one moves."""
 
     def __init__(
-        self, link: MavlinkLink, vehicle: Vehicle, writer: ParameterWriter, ledger: Ledger, memory: SlotMemory, say: Say
+        self,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        writer: ParameterWriter,
+        journal: WriteJournal,
+        memory: SlotMemory,
+        say: Say,
     ) -> None:
-        self._link, self._vehicle, self._writer, self._ledger = link, vehicle, writer, ledger
+        self._link, self._vehicle, self._writer, self._journal = link, vehicle, writer, journal
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
-        self.on_the_way: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
+        self.under_far_offset: defaultdict[int, dict[Triad, tuple[Mean, Array]]] = defaultdict(dict)
         """Mean outputs under the latest write's temporary large offsets, by IMU, of outputs that moved as expected."""
         self._learned = False  # True: this write has found the true parameter slot of a sensor
         self._boots = 0
@@ -102,7 +108,7 @@ class Px4Writes:
         self._unheard: set[int] = set()
 
     @contextlib.asynccontextmanager
-    async def standing_by(
+    async def observing(
         self, targets: Sequence[ImuPlan], before: Mapping[str, Vector]
     ) -> AsyncIterator[FarProbe | None]:
         """Observe telemetry during a write; yield the check of temporary large offsets, or None if there are none.
@@ -110,7 +116,7 @@ class Px4Writes:
         `before`: accelerometer outputs before the write, by IMU name.
         """
         self._learned, self._steps = False, {}
-        self.on_the_way.clear()
+        self.under_far_offset.clear()
         for target in targets:
             self._steps |= far_steps(target.calibration, target.all, before.get(target.name, (0.0, 0.0, 0.0)))
         try:
@@ -132,7 +138,7 @@ class Px4Writes:
             if calibration.far_axis is not None and written.intersection(names):
                 self._memory.brought_into_use(names, accel_offset_with(calibration, target.all), self._vehicle.boots)
 
-    async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
+    async def apply_stored_offsets(self, imus: Sequence[AutopilotImu]) -> bool:
         """Make PX4 apply stored offsets that it possibly ignores, without changing them; return whether there were any.
 
         After an AutopilotError, `Recovery` restores any changed values. After a StorageError nothing was written.
@@ -146,11 +152,11 @@ class Px4Writes:
             return False
         logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
         try:
-            async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
+            async with self._journal.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
                 with changing(unsure):
-                    async with self.standing_by(targets, {}) as probe:
+                    async with self.observing(targets, {}) as probe:
                         await self._writer.apply(changes, probe)
-                await self._ledger.undone()
+                await self._journal.undone()
         except WriteFailedError as error:
             if error.kind != "wrong slot, orientation or scale" or error.left_changed:
                 raise
@@ -188,7 +194,7 @@ class Px4Writes:
             return None
         moved, still = self._moves(step, from_s, loop.time())
         if step.instance in moved and (now := self._mean(step.instance, step.sensor, from_s, loop.time())):
-            self.on_the_way[step.instance][step.sensor] = now, step.rest
+            self.under_far_offset[step.instance][step.sensor] = now, step.rest
         return self._conclude(step, moved, still)
 
     def _conclude(self, step: ExpectedStep, moved: list[int], still: list[int]) -> str | None:

@@ -102,7 +102,7 @@ def owed_in(directory: Path) -> StateFile[_Owed]:
     return StateFile(directory / "reboot-owed.json", _Owed)
 
 
-class RebootOwed:
+class RequiredReboot:
     """Reminder, also on disk, that PX4 must be restarted before flight; `run` deletes it after the restart."""
 
     def __init__(self, core: Core) -> None:

@@ -1,7 +1,7 @@
 """Writes to the autopilot: saved in a journal, read back, and checked in the telemetry; a failure restores old values.
 
-Calibrations, alignments and temperature curves write through `Offsets`. An undo, and `Px4Writes.make_sure`, write
-directly, but inside a transaction of the journal.
+Calibrations, alignments and temperature curves write through `Offsets`. An undo, and `Px4Writes.apply_stored_offsets`,
+write directly, but inside a transaction of the journal.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import GoOn, Job, JobCancelledError
-from companion.daemon.offsets.effect import UNWATCHED, in_short, watch_effect
+from companion.daemon.offsets.effect import UNWATCHED, in_short, verify_effect
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
-from companion.daemon.offsets.ledger import Ledger, Recovery
-from companion.daemon.offsets.other_writers import OtherCompanions, Rivalry
+from companion.daemon.offsets.journal import Recovery, WriteJournal
+from companion.daemon.offsets.other_writers import FirmwareCalibrationWarnings, OtherCompanions
 from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.px4_writes import Px4Writes
-from companion.daemon.offsets.reboot import BACK_WITHIN_S, NotRebootedError, RebootOwed, harm_of_reboot, reboot
+from companion.daemon.offsets.reboot import BACK_WITHIN_S, NotRebootedError, RequiredReboot, harm_of_reboot, reboot
 from companion.errors import (
     AutopilotError,
     AutopilotRebootedError,
@@ -63,33 +63,37 @@ class Offsets(Subsystem):
     def __init__(self, core: Core, devices: Devices) -> None:
         vehicle, imus = core.vehicle, devices.imus
         self._core, self._vehicle, self._machine, self._imus = core, vehicle, core.machine, imus
-        self.slots, self.rivalry, self.owed = devices.slots, Rivalry(core, imus), RebootOwed(core)
+        self.slots, self.rivalry, self.owed = (
+            devices.slots,
+            FirmwareCalibrationWarnings(core, imus),
+            RequiredReboot(core),
+        )
         self.companions = OtherCompanions(core.link, core.say, lambda: core.wanted.push)
-        self.ledger = Ledger(ChangeLog(core.config.storage.path), core.offload, self.companions.why_not)
+        self.journal = WriteJournal(ChangeLog(core.config.storage.path), core.offload, self.companions.why_not)
         self.writer = ParameterWriter(core.parameters, vehicle)
-        self._px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
-        self._firmware = FirmwareCalibration(core, self.writer, self.ledger)
-        self.recovery = Recovery(core, self.writer, self.ledger, imus, self.owed)
+        self._px4 = Px4Writes(core.link, vehicle, self.writer, self.journal, devices.slots, core.say)
+        self._firmware = FirmwareCalibration(core, self.writer, self.journal)
+        self.recovery = Recovery(core, self.writer, self.journal, imus, self.owed)
 
     def load(self) -> None:
         self.owed.load()
-        self.ledger.load()
-        if self.ledger.fault is not None:
+        self.journal.load()
+        if self.journal.fault is not None:
             # Keep running and report the fault: a daemon that has ended is harder to diagnose in the field.
-            logger.error("%s", self.ledger.fault)
+            logger.error("%s", self.journal.fault)
 
     def status(self) -> Object:
         others = [] if (words := self.companions.warning) is None else [words]
         return {
-            "fault": self.ledger.fault,
-            "putting_back": self.ledger.pending,
+            "fault": self.journal.fault,
+            "putting_back": self.journal.pending,
             "why_no_undo": self.recovery.why_no_undo(),
             "undoable": self.undoable(),
-            "warnings": [*self.ledger.unusable, *others, *self.rivalry.warnings],
+            "warnings": [*self.journal.unusable, *others, *self.rivalry.warnings],
         }
 
     def undoable(self) -> list[Object]:
-        return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
+        return [step.shown() for step in self.journal.steps(self._vehicle.system_id)]
 
     def tasks(self) -> Sequence[Task]:
         return [
@@ -103,7 +107,7 @@ class Offsets(Subsystem):
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()
-        return held and not (self._core.wanted.push and await self._px4.make_sure(list(self._imus.values())))
+        return held and not (self._core.wanted.push and await self._px4.apply_stored_offsets(list(self._imus.values())))
 
     # --- any write
 
@@ -131,13 +135,13 @@ class Offsets(Subsystem):
         `verify`; the text has the cause and the outcome of the roll-back.
         """
         system_id = self._vehicle.system_id
-        async with self.ledger.transaction(ChangeSet.of(system_id, changes, origin=origin)):
+        async with self.journal.transaction(ChangeSet.of(system_id, changes, origin=origin)):
             with changing(imus):
                 made = await apply()
             self._machine.on(Event.WRITTEN)
             try:
                 await verify()
-                await self.ledger.done(ChangeSet.of(system_id, made, origin=origin))
+                await self.journal.done(ChangeSet.of(system_id, made, origin=origin))
             except JobCancelledError as cancelled:
                 raise JobCancelledError(await self._roll_back(made, imus, str(cancelled), note)) from None
             except CompanionError as error:
@@ -163,7 +167,7 @@ class Offsets(Subsystem):
         if left:
             return f"{message('old_values_not_back', reason=reason, parameters=', '.join(left))}: {outlook}"
         with contextlib.suppress(StorageError):
-            await self.ledger.undone()
+            await self.journal.undone()
         return message("old_values_back", reason=reason)
 
     async def _wait_disarmed(self) -> None:
@@ -205,7 +209,7 @@ class Offsets(Subsystem):
                     )
                 else:
                     outputs = {imu.name: imu.accel_m_s2 for imu in before.imus}
-                    async with self._px4.standing_by(plan.targets, outputs) as probe:
+                    async with self._px4.observing(plan.targets, outputs) as probe:
                         plan.note(log, await self.writer.apply(plan.changes, probe))
             except WriteFailedError as error:
                 plan.note(log, error.written)
@@ -223,7 +227,7 @@ class Offsets(Subsystem):
         return plan
 
     async def _problems(self, plan: Plan, before: Window, log: WriteLog, go_on: GoOn) -> list[str]:
-        verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, plan.boots)
+        verdicts, unseen = await verify_effect(self._core, self._px4, plan, before, go_on, plan.boots)
         # Check for another writer first: its changes would explain a wrong effect.
         problems: list[str] = []
         try:
@@ -305,7 +309,7 @@ class Offsets(Subsystem):
             ]
             if changed:
                 raise AutopilotError(message("wrong_after_restart", problems=f"{', '.join(changed)} replaced"))
-            verdicts, unseen = await watch_effect(self._core, self._px4, plan, before, go_on, self._vehicle.boots)
+            verdicts, unseen = await verify_effect(self._core, self._px4, plan, before, go_on, self._vehicle.boots)
         except NotRebootedError as error:
             return str(error)
         except JobCancelledError as cancelled:

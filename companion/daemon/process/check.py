@@ -15,7 +15,7 @@ import msgspec
 
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.config.sections import UNKNOWN, Config, Imu
-from companion.configured.models import SerialDevice, baud_of, cannot_work, doubtful, serial_devices
+from companion.configured.models import SerialDevice, baud_of, doubtful_settings, ineffective_settings, serial_devices
 from companion.daemon.interfaces.control import process_behind
 from companion.daemon.process.service import Service
 from companion.errors import CalibrationRefusedError, DaemonDeniedError, DaemonUnreachableError
@@ -169,8 +169,8 @@ async def run_check(
         # Start a daemon that writes nothing, and use its status after some seconds.
         service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(lambda listened_s: listened_s < seconds)
-    findings += [CheckLine("configuration", good=False, words=words) for words in cannot_work(config)]
-    findings += [CheckLine("warning", good=True, words=words) for words in doubtful(config)]
+    findings += [CheckLine("configuration", good=False, words=words) for words in ineffective_settings(config)]
+    findings += [CheckLine("warning", good=True, words=words) for words in doubtful_settings(config)]
     vehicle = status["vehicle"]
     findings.append(_autopilot(config, vehicle))
     if (signing := vehicle["signing"]) is not None:

@@ -96,7 +96,7 @@ class Service:
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Run until cancelled; call `on_ready` when the control socket answers. Raises CompanionError on failure."""
-        for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
+        for words in (*models.ineffective_settings(self.config), *models.doubtful_settings(self.config)):
             logger.warning("%s", words)
         control = self.config.control
         async with ControlServer(control.path, self.faces.answer, group=control.group_name):

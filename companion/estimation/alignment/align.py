@@ -39,9 +39,9 @@ from companion.estimation.alignment.align_model import (
     Ground,
     LeastSquares,
     Model,
+    PoseMeans,
     Priors,
     ResidualLabel,
-    StandMeans,
     fit,
 )
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
@@ -123,7 +123,7 @@ class Alignment:
 
 
 def align(
-    law: Law, vehicle_from_sensor: Matrix, stands: Sequence[StandMeans], ground: Ground, priors: Priors | None = None
+    law: Law, vehicle_from_sensor: Matrix, stands: Sequence[PoseMeans], ground: Ground, priors: Priors | None = None
 ) -> Alignment:
     """Estimate all errors from at least one pose; `vehicle_from_sensor` is the gradienter's mounting.
 
@@ -164,7 +164,7 @@ def align(
     )
 
 
-def turned(stands: Sequence[StandMeans], ground: Ground) -> Alignment:
+def turned(stands: Sequence[PoseMeans], ground: Ground) -> Alignment:
     """Estimate biases of the level aircraft, and the ground's slope, from 2 or 4 headings at one place, by IMUs alone.
 
     Raises:
@@ -210,7 +210,7 @@ def widened_by(chi_square: float, freedom: int) -> float:
     return ratio if ratio > chi_square_ratio(freedom, _NINETY_NINE) else 1.0
 
 
-def _first_attitude(law: Law, mounting: Matrix, stand: StandMeans) -> Matrix:
+def _first_attitude(law: Law, mounting: Matrix, stand: PoseMeans) -> Matrix:
     if stand.tilt_deg is not None:
         up = mounting @ up_in_sensor(law, *stand.tilt_deg)
     else:

@@ -104,7 +104,7 @@ def fit(
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class StandMeans:
+class PoseMeans:
     """Means over the time without motion in one pose.
 
     `tilt_deg`: gradienter readings minus the configured offset; None if out of range or without a gradienter.
@@ -166,7 +166,7 @@ class Model:
     def __init__(
         self,
         mounting: tuple[Law, Matrix],
-        stands: Sequence[StandMeans],
+        stands: Sequence[PoseMeans],
         ground: Ground,
         priors: Priors,
         attitudes: Sequence[Matrix],

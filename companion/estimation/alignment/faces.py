@@ -26,7 +26,7 @@ import numpy as np
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import ImuAlignment, widened_by
 from companion.estimation.alignment.align_model import LEVEL, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, fit, response
-from companion.estimation.alignment.poses import Wish
+from companion.estimation.alignment.poses import PoseRequest
 from companion.physics.frames import Array, Floats, Matrix, roll_pitch_from_up, vector
 from companion.physics.units import MG
 
@@ -182,7 +182,7 @@ def _fit(
     return found.values[:FIGURES], covariance, chi_square, bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all())
 
 
-def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
+def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> PoseRequest | None:
     """Return the next pose to ask for; None once bias and scale of all axes are precise enough and checked.
 
     `vehicle_from_sensor` (3, 3): mounting of the accelerometers that `found` describes.
@@ -207,7 +207,7 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
         why = "one pose does not fit; the next one shows which" if found.in_doubt else "one more pose needed as a check"
     side, up = sides[best]
     unknown = tuple(_figure(sigma, which) for which in worst_first)
-    return Wish(f"{side}: {why}", vector(vehicle_from_sensor @ up), unknown=unknown)
+    return PoseRequest(f"{side}: {why}", vector(vehicle_from_sensor @ up), unknown=unknown)
 
 
 def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:

@@ -58,7 +58,7 @@ class AlignmentRequest(NamedTuple):
         return self.on_spot + (TILTS if self.action == "tilts" else 0)
 
 
-class Wish(NamedTuple):
+class PoseRequest(NamedTuple):
     """Pose to request next. `up`: unit vector pointing up, in the aircraft's axes (forward, right, down).
 
     `words`: text; spoken up to its first colon. `unknown`: texts on values not yet precise enough, worst first.
@@ -83,20 +83,20 @@ class HeldPose(NamedTuple):
     counted: bool = False
 
 
-def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> Wish:
+def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> PoseRequest:
     if not poses:
-        return Wish("stand the aircraft on a firm, marked spot")
+        return PoseRequest("stand the aircraft on a firm, marked spot")
     if len(poses) >= request.on_spot:
         done = [_side(poses[0].up, pose.up) for pose in poses[request.on_spot :]]
         up = next((up for side, up in _TILTED.items() if side not in done), LEVEL)
         if done:
-            return Wish(f"tilt it to another side, prop it up: not {' or '.join(done)} again", up)
-        return Wish("tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", up)
+            return PoseRequest(f"tilt it to another side, prop it up: not {' or '.join(done)} again", up)
+        return PoseRequest("tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", up)
     turn_deg = asked_turn_deg(request, poses)
     words = "turn it by 180 degrees, onto its marks" if len(poses) == 1 else "turn it the same way to its first marks"
     if request.on_spot >= HEADINGS:
         words = f"turn it by {turn_deg:.0f} degrees on its spot"
-    return Wish(words, turn_deg=turn_deg)
+    return PoseRequest(words, turn_deg=turn_deg)
 
 
 def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> float:

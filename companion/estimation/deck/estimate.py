@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.config.sections import AllanModel
 from companion.errors import CalibrationRefusedError
-from companion.estimation.deck.smoother import Believed, Found, Passage, smooth
+from companion.estimation.deck.smoother import Believed, Found, IntegratedSecond, smooth
 from companion.estimation.deck.waves import Level, compare
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import drifting
@@ -56,7 +56,7 @@ TriadVariances = tuple[float, float]
 
 DeckFound = tuple[Window, Sequence[TriadVariances]]
 """Estimate of a window on a deck: the window, and for each IMU the variances of gyros and of accelerometers."""
-ImuSecond = tuple[Batch, Passage]
+ImuSecond = tuple[Batch, IntegratedSecond]
 """One second of one IMU: its batch, in the sensor's axes, and its integrated motion, in the vehicle's axes."""
 
 

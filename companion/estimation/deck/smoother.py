@@ -78,7 +78,7 @@ class Found:
 
 
 class _Stretch:
-    def __init__(self, passages: Sequence[Passage]) -> None:
+    def __init__(self, passages: Sequence[IntegratedSecond]) -> None:
         columns = zip(*passages, strict=True)
         self.spans, self.turn, self.turned, self.velocity, self.by_bias, _ = map(np.array, columns)
 
@@ -106,7 +106,9 @@ class _Stretch:
         return np.asarray(np.einsum("nij,nj->ni", attitudes[:-1], felt) / self.spans[:, None])
 
 
-def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
+def smooth(
+    passages: Sequence[IntegratedSecond], headings_rad: Floats, compass_forward: Array, believed: Believed
+) -> Found:
     """Estimate biases and attitudes from the integrated motion of at least ten consecutive seconds without a gap.
 
     `headings_rad` (n,): compass heading in the middle of each second, NaN if missing. `compass_forward` (3,): forward
@@ -249,7 +251,7 @@ def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
     return float(covariance[2] @ (rows[:, :3].T @ rows[:, 3])), math.sqrt(covariance[2, 2])
 
 
-class Passage(NamedTuple):
+class IntegratedSecond(NamedTuple):
     """Integrated motion of an IMU over one second. The "start axes" are the body's axes (FRD) at its beginning.
 
     `turn` (3, 3): rotation from the body's axes at the end to the start axes, by the gyros. `turned` (3, 3): integral
@@ -266,7 +268,7 @@ class Passage(NamedTuple):
     white2: float
 
 
-def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
+def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> IntegratedSecond:
     """Integrate n + 1 samples of one second by trapezoids; the first sample is the last one of the second before.
 
     Times (n + 1,) ascend, n is at least 1; rates and forces are (n + 1, 3) in the body's axes. Rates are integrated as
@@ -282,7 +284,7 @@ def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passag
     felt = np.einsum("nij,nj->ni", whole, forces_m_s2)
     by_bias = skew(felt) @ turned
     bends = np.diff(rates_rad_s, 2, axis=0)
-    return Passage(
+    return IntegratedSecond(
         span_s=float(times_s[-1] - times_s[0]),
         turn=turns[-1],
         turned=turned[-1],

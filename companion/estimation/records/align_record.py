@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from companion.estimation.alignment.align import DETERMINED, Figures, ImuAlignment
-from companion.estimation.alignment.align_model import PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, StandMeans
+from companion.estimation.alignment.align_model import PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, PoseMeans
 from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, FacesEstimate, Mounting
 from companion.estimation.records.record import WrittenParameter
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, vector
@@ -199,7 +199,7 @@ class TurnRecord(SpotRecord, frozen=True, kw_only=True):
 HandRecord = AlignmentRecord | FacesRecord | TurnRecord
 
 
-def stand_record(stand: StandMeans, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
+def stand_record(stand: PoseMeans, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
     roll, pitch = roll_pitch_from_up(-attitude[:, 2])
     tilt = stand.tilt_deg
     return StandRecord(

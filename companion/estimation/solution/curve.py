@@ -89,7 +89,7 @@ class Warm(msgspec.Struct, frozen=True, kw_only=True):
     variance: Vector
 
 
-class Along(msgspec.Struct, frozen=True, kw_only=True):
+class WindowDrift(msgspec.Struct, frozen=True, kw_only=True):
     """Predicted bias change of one triad within a window, in vehicle axes (FRD), rad/s or m/s^2; slopes are per second.
 
     `shift` is the bias at the window's end minus its mean over the window. `warm` is None if the temperature at the end
@@ -151,7 +151,7 @@ class Curve:
         variance = float(x @ self.covariance @ x) * self.of_changes + (self.per_kelvin * outside_k) ** 2
         return x @ self.coefficients, variance
 
-    def along(self, path: Path, tau_s: tuple[float, float] | None, model: AllanModel) -> Along:
+    def along(self, path: Path, tau_s: tuple[float, float] | None, model: AllanModel) -> WindowDrift:
         """Predict the bias change within a window; `tau_s`: time constant of the board and one sigma; None: unknown."""
         start, (middle_degc, k_s), end = path.states
         shift, shift_variance = self.moves(zip(_END_LESS_MEAN, path.states, strict=True))
@@ -166,7 +166,7 @@ class Curve:
             wander = in_run_variance(model, _WARM_AFTER * tau_s[0])
             variance = variance + wander + np.square(self._per_k(degc)) * of_degc
             warm = Warm(degc=degc, change=vector(change), variance=vector(variance))
-        return Along(
+        return WindowDrift(
             shift=vector(shift),
             shift_variance=vector(shift_variance + by_end),
             slope=vector(slope / path.span_s),

@@ -22,9 +22,9 @@ from companion.samples import TRIADS, Triad
 
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
-TELLS: Final = 9.0
+LEAST_GAIN: Final = 9.0
 """Least decrease of chi-square by which one explanation beats another: three sigmas."""
-AGREES: Final = 11.34
+CHI_SQUARE_99: Final = 11.34
 """Chi-square of three axes that chance exceeds once in a hundred. A prediction with more is not used in the estimate,
 because it may belong to another sensor. A warning needs a larger difference."""
 _OF_ALL: Final[dict[Cause, str]] = {
@@ -69,7 +69,7 @@ class Witness:
         if not self.expected.weighs:
             return False
         covariance = np.diag(self.own_variance) + self.common
-        return float(self.difference @ np.linalg.solve(covariance, self.difference)) < AGREES
+        return float(self.difference @ np.linalg.solve(covariance, self.difference)) < CHI_SQUARE_99
 
     def along(self, up: Array) -> tuple[float, float]:
         variance = np.square(up) @ self.own_variance + up @ self.common @ up
@@ -84,7 +84,7 @@ class Witness:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
+class Inconsistency:
     """Contradiction to earlier calibrations: probable cause, IMUs concerned, and one line of text for a pilot."""
 
     triad: Triad
@@ -103,7 +103,7 @@ class Doubt:
 
 def contradictions(
     earlier: Sequence[Witness], today: Sequence[Witness], imus: int, up: Array, by_reading: Matrix | None
-) -> list[Doubt]:
+) -> list[Inconsistency]:
     """List all contradictions between measured biases and their predictions.
 
     Predictions from this power-up (`today`) are more exact. Predictions from `earlier` power-ups count only if today's
@@ -115,7 +115,7 @@ def contradictions(
         "gyro": [("turn", np.eye(3))],
         "accel": [gravity] if by_reading is None else [("gradienter", by_reading), gravity],
     }
-    found: list[Doubt] = []
+    found: list[Inconsistency] = []
     for triad in TRIADS:
         of_today = [witness for witness in today if witness.triad == triad]
         doubts = _doubts(of_today, causes[triad], today=True)
@@ -125,7 +125,9 @@ def contradictions(
     return found
 
 
-def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool) -> list[Doubt]:
+def _doubts(
+    witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool
+) -> list[Inconsistency]:
     """Explain all contradictions by one cause common to all IMUs if it fits; else explain each contradiction alone."""
     against = [witness for witness in witnesses if witness.contradicts]
     others = [witness for witness in witnesses if not witness.contradicts]
@@ -133,11 +135,11 @@ def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]]
         shift, size = _common(against, directions)
         gains = [witness.gain(shift) for witness in others]
         named = {witness.name for witness in against}
-        named |= {witness.name for witness, gain in zip(others, gains, strict=True) if gain > TELLS}
-        explains = all(witness.is_explained(shift) for witness in against) and min(gains, default=0.0) >= -TELLS
+        named |= {witness.name for witness, gain in zip(others, gains, strict=True) if gain > LEAST_GAIN}
+        explains = all(witness.is_explained(shift) for witness in against) and min(gains, default=0.0) >= -LEAST_GAIN
         if explains and len(named) > 1:
             names = tuple(witness.name for witness in witnesses if witness.name in named)
-            return [Doubt(against[0].triad, cause, names, _of_all(cause, size, ", ".join(names), against))]
+            return [Inconsistency(against[0].triad, cause, names, _of_all(cause, size, ", ".join(names), against))]
     return [_alone(witness, others, causes, today=today) for witness in against]
 
 
@@ -151,7 +153,7 @@ def _common(witnesses: Sequence[Witness], directions: Matrix) -> tuple[Array, Ar
 
 def _alone(
     witness: Witness, others: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool
-) -> Doubt:
+) -> Inconsistency:
     triad, name, expected = witness.triad, witness.name, witness.expected
     unit, words, digits = UNITS[triad]
     axis = int(np.argmax(np.abs(witness.difference) / witness.sigma))
@@ -159,14 +161,14 @@ def _alone(
     if not today:
         before = f"{expected.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:.{digits}f})"
 
-    def doubt(found: Cause, suspicion: str) -> Doubt:
+    def doubt(found: Cause, suspicion: str) -> Inconsistency:
         axis_of, by = f"{triad} {name}: {'xyz'[axis]}", f"{witness.difference[axis] / unit:+.{digits}f} {words}"
         line = message("imu_differs", axis=axis_of, difference=by, before=before, suspicion=suspicion)
-        return Doubt(triad, found, (name,), line)
+        return Inconsistency(triad, found, (name,), line)
 
     for cause, directions in causes:
         shift, size = _common([witness], directions)
-        if witness.is_explained(shift) and not any(other.gain(shift) < -TELLS for other in others):
+        if witness.is_explained(shift) and not any(other.gain(shift) < -LEAST_GAIN for other in others):
             also = {
                 "gradienter": f"the gradienter has moved by {math.hypot(*size) / DEG:.2f} deg",
                 "gravity": "height or latitude are wrong",

@@ -29,7 +29,7 @@ from companion.estimation.alignment.align_model import Priors
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
 from companion.estimation.records.history import WEIGHS_FROM, Point, believed
 from companion.estimation.records.record import Effective
-from companion.estimation.solution.curve import CATALOGUE_PER_K, Along, Curve, PowerUpNodes, fit, in_run_variance
+from companion.estimation.solution.curve import CATALOGUE_PER_K, Curve, PowerUpNodes, WindowDrift, fit, in_run_variance
 from companion.messages import message
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.statistics import student_quantile
@@ -137,7 +137,7 @@ class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     earlier: dict[Triad, Prediction | None] = {}
     today: dict[Triad, Prediction | None] = {}
-    along: dict[Triad, Along | None] = {}  # Prediction by the curve for a window in which the temperature changed
+    along: dict[Triad, WindowDrift | None] = {}  # Prediction by the curve for a window in which the temperature changed
     effect: PoseEffect | None = None
 
 

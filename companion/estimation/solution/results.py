@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import ImuRecord, PlatformTurn, Record, sigma_texts
-from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.doubt import Inconsistency
 from companion.estimation.solution.solve import ImuSolution, Solution
 from companion.messages import message
 from companion.physics.frames import Array, Matrix, vector
@@ -127,7 +127,7 @@ def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
 
 def points(
     solution: Solution,
-    doubts: Iterable[Doubt],
+    doubts: Iterable[Inconsistency],
     *,
     started_at: str,
     unix_s: float,

@@ -26,7 +26,7 @@ from companion.estimation.means.warming import Warming
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, SiteRecord, WhenWarm
 from companion.estimation.solution.site import LocalEarth, Remedies
-from companion.estimation.solution.truth import NOTHING, Otherwise, Truth, truth_of
+from companion.estimation.solution.truth import NOTHING, FallbackPose, Truth, truth_of
 from companion.estimation.stillness.plausible import implausible
 from companion.estimation.turning.turn import Turn
 from companion.messages import message
@@ -35,7 +35,7 @@ from companion.physics.units import DEG
 from companion.samples import Triad
 
 if TYPE_CHECKING:
-    from companion.estimation.solution.doubt import Doubt
+    from companion.estimation.solution.doubt import Inconsistency
 
 Pair = tuple[Array | None, Array | None]
 """Biases of gyro and accelerometer, (3,) each, in rad/s and m/s^2; None: unknown."""
@@ -142,10 +142,10 @@ class Solution:
     magnetic: Magnetic | None = None
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
-    doubts: tuple[Doubt, ...] = ()  # Contradictions to earlier calibrations
+    doubts: tuple[Inconsistency, ...] = ()  # Contradictions to earlier calibrations
 
     @property
-    def doubted(self) -> dict[tuple[str, Triad], Doubt]:
+    def doubted(self) -> dict[tuple[str, Triad], Inconsistency]:
         """Contradictions by IMU and triad; one that is common to all IMUs is listed for every IMU."""
         return {
             (name, doubt.triad): doubt
@@ -170,7 +170,7 @@ def solve(
     platform: Platform = "ground",
     *,
     any_bias: bool = False,
-    otherwise: Otherwise = NOTHING,
+    otherwise: FallbackPose = NOTHING,
 ) -> Solution:
     """Estimate the biases of every IMU from one motionless window; `any_bias` allows implausibly large ones.
 

@@ -48,14 +48,14 @@ class OwnHeading(msgspec.Struct, frozen=True):
     sigma_deg: float
 
 
-class Otherwise(msgspec.Struct, frozen=True, kw_only=True):
+class FallbackPose(msgspec.Struct, frozen=True, kw_only=True):
     """Fallbacks for a missing gradienter (tilt sensor) or compass."""
 
     sides: dict[str, Sides] = {}  # Six-position calibrations of the accelerometers, by IMU
     heading: OwnHeading | None = None
 
 
-NOTHING: Final = Otherwise()
+NOTHING: Final = FallbackPose()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +106,7 @@ def truth_of(
     compass: CompassModel | None,
     local: LocalEarth,
     warnings: list[str],
-    otherwise: Otherwise = NOTHING,
+    otherwise: FallbackPose = NOTHING,
 ) -> Truth:
     """Estimate the attitude from all sensors except the gyros; add lines to `warnings` on fallbacks and doubts.
 
@@ -174,7 +174,7 @@ def _up_by_gradienter(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, 
 
 
 def _up_by_sides(
-    imus: Sequence[ImuWindow], otherwise: Otherwise, local: LocalEarth, warnings: list[str]
+    imus: Sequence[ImuWindow], otherwise: FallbackPose, local: LocalEarth, warnings: list[str]
 ) -> tuple[Array, Matrix] | None:
     """Estimate the up vector and its covariance by the first IMU with a six-position calibration that fits gravity.
 

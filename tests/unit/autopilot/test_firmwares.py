@@ -9,7 +9,14 @@ from typing import get_args
 import pytest
 
 from companion.autopilot.firmware.base import Firmware
-from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_named, firmware_with, port_needs
+from companion.autopilot.firmware.firmwares import (
+    FIRMWARES,
+    NO_FIRMWARE_YET,
+    OTHER,
+    firmware_named,
+    firmware_with,
+    port_needs,
+)
 from companion.autopilot.parameters.change import FirmwareName
 from companion.errors import AutopilotError
 
@@ -33,10 +40,10 @@ def test_every_name_has_an_object_and_every_heartbeat_one() -> None:
     assert {firmware_named(name).name for name in get_args(FirmwareName)} == set(get_args(FirmwareName))
     assert [firmware_with(one.mav_autopilot or 0) for one in FIRMWARES] == list(FIRMWARES)
     assert firmware_with(99) is OTHER
-    assert firmware_named(None) is UNHEARD
+    assert firmware_named(None) is NO_FIRMWARE_YET
 
 
-@pytest.mark.parametrize("firmware", [UNHEARD, OTHER])
+@pytest.mark.parametrize("firmware", [NO_FIRMWARE_YET, OTHER])
 def test_an_unknown_one_has_nothing_to_measure_or_to_write(firmware: Firmware) -> None:
     assert (firmware.imu_messages, firmware.ranges, firmware.rivals) == ({}, {}, ())
     assert not firmware.gyro_calibration_resets_ekf

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from companion import cli, config
-from companion.cli.client import stands_lines
+from companion.cli.client import pose_lines
 from companion.estimation.records.align_record import AlignmentRecord, GradienterSettings
 
 CONFIG = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "a"\nsource = "autopilot"\n[control]\nsocket = "{}"\n'
@@ -58,7 +58,7 @@ def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypat
 
 
 def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:
-    lines = stands_lines(msgspec.to_builtins(RECORD))
+    lines = pose_lines(msgspec.to_builtins(RECORD))
     assert "    offset_deg = [0.1200, -0.0300]" in lines
     assert "    sigma_deg = 0.0125" in lines
     # 0.0125 deg of g.

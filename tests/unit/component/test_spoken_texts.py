@@ -13,7 +13,7 @@ from companion.component.statustext import Severity, as_lines, to_ascii
 from companion.messages import catalogue
 from tests.support.messages import FILLED, ROOT, template_of
 
-UNHEARD = re.compile(r"\b(sigma|deg|mg|K|imu|accel|GNSS|EKF2?)\b|[=_%/]")
+NO_FIRMWARE_YET = re.compile(r"\b(sigma|deg|mg|K|imu|accel|GNSS|EKF2?)\b|[=_%/]")
 """Abbreviations and names that nobody understands by ear."""
 
 
@@ -60,7 +60,7 @@ def unheard(severity: Severity, template: str) -> str | None:
     line = as_lines(severity, to_ascii(filled))[0][1]
     if len(line.split()) < 2:
         return f"{line!r} tells nothing by itself"
-    return f"{line!r} is nothing to hear" if UNHEARD.search(line) else None
+    return f"{line!r} is nothing to hear" if NO_FIRMWARE_YET.search(line) else None
 
 
 def test_every_text_that_is_spoken_is_a_line_to_be_heard() -> None:

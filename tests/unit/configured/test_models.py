@@ -63,10 +63,10 @@ def test_a_compass_is_known_better_while_it_is_level(
 
 
 def test_a_doubtful_law_is_named_with_the_right_one() -> None:
-    assert models.doubtful(config("hmr3300")) == []
+    assert models.doubtful_settings(config("hmr3300")) == []
     # Nobody but the user can know the law of those.
-    assert models.doubtful(config("inclinometer_xy", "slope")) == []
-    (words,) = models.doubtful(config("hmr3300", "axis"))
+    assert models.doubtful_settings(config("inclinometer_xy", "slope")) == []
+    (words,) = models.doubtful_settings(config("hmr3300", "axis"))
     assert 'found "axis"' in words
     assert '"euler"' in words
-    assert models.doubtful(parse(AUTOPILOT, "test")) == []
+    assert models.doubtful_settings(parse(AUTOPILOT, "test")) == []

@@ -10,10 +10,10 @@ import pytest
 
 from companion.autopilot.firmware.ardupilot import ArduPilotParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, whole_accelerometer
-from companion.cli.client import sides_lines
+from companion.cli.client import six_position_lines
 from companion.config import parse
 from companion.daemon.core import Core
-from companion.daemon.stands.alignment import ActiveSixPosition
+from companion.daemon.poses.alignment import ActiveSixPosition
 from companion.estimation.alignment.faces import BIAS, SCALE
 from companion.estimation.records.align_record import Determined, FacesImuRecord, FacesRecord, Running
 from companion.physics.frames import rotation_matrix, vector
@@ -148,7 +148,7 @@ def test_what_is_in_force_is_shown_with_its_sigma(tmp_path: Path) -> None:
     assert shown["name"] == "fc"
     assert shown["bias_left_mg"] == pytest.approx(BIAS_MG)
     assert shown["scale_left"] == pytest.approx(ERROR)
-    (first, bias, scale) = sides_lines([shown])
+    (first, bias, scale) = six_position_lines([shown])
     assert first == "fc: calibrated in six positions, 2026-01-01T00:00:00 UTC; its output has left"
     assert "x +3.000 +- 0.030" in bias
     assert "x +0.4000 +- 0.0040" in scale

@@ -1,4 +1,4 @@
-"""`Ledger.transaction`: what becomes of a write, by how its block ends; compared with what lies on the disk."""
+"""`WriteJournal.transaction`: what becomes of a write, by how its block ends; compared with what lies on the disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
-from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.journal import WriteJournal
 from companion.errors import AutopilotError, StorageError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.state import StateFile
@@ -30,7 +30,7 @@ class TornDown(BaseException):
     """None of those that anybody expects."""
 
 
-Block = Callable[[Ledger], Awaitable[None]]
+Block = Callable[[WriteJournal], Awaitable[None]]
 
 
 def on_disk(folder: Path, name: str = "journal.json") -> ChangeSet | None:
@@ -39,23 +39,23 @@ def on_disk(folder: Path, name: str = "journal.json") -> ChangeSet | None:
 
 
 def raises(error: BaseException) -> Block:
-    async def block(ledger: Ledger) -> None:
+    async def block(journal: WriteJournal) -> None:
         raise error
 
     return block
 
 
-async def wordless(ledger: Ledger) -> None:
+async def wordless(journal: WriteJournal) -> None:
     """Ignore the end of the transaction."""
 
 
-async def done_and_then(ledger: Ledger) -> None:
-    await ledger.done(OLD)
+async def done_and_then(journal: WriteJournal) -> None:
+    await journal.done(OLD)
     raise AutopilotError("after the end")
 
 
-async def undone_and_then(ledger: Ledger) -> None:
-    await ledger.undone()
+async def undone_and_then(journal: WriteJournal) -> None:
+    await journal.undone()
     raise WriteFailedError("no answer", "after the end", {}, NAMES[:1])
 
 
@@ -73,16 +73,16 @@ class LedgerDisk:
         return function(*arguments)
 
 
-def opened(folder: Path, disk: LedgerDisk | None = None) -> Ledger:
-    ledger = Ledger(ChangeLog(folder), (disk or LedgerDisk()).offload)
-    ledger.load()
-    return ledger
+def opened(folder: Path, disk: LedgerDisk | None = None) -> WriteJournal:
+    journal = WriteJournal(ChangeLog(folder), (disk or LedgerDisk()).offload)
+    journal.load()
+    return journal
 
 
-async def end_of(ledger: Ledger, block: Block) -> BaseException | None:
+async def end_of(journal: WriteJournal, block: Block) -> BaseException | None:
     async def write() -> None:
-        async with ledger.transaction(OLD):
-            await block(ledger)
+        async with journal.transaction(OLD):
+            await block(journal)
 
     (found,) = await asyncio.gather(write(), return_exceptions=True)
     return found
@@ -109,37 +109,37 @@ async def end_of(ledger: Ledger, block: Block) -> BaseException | None:
 )  # fmt: skip
 def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(tmp_path: Path, block: Block, over: bool) -> None:
     async def main() -> None:
-        ledger = opened(tmp_path)
-        await end_of(ledger, block)
-        assert ledger.pending is not over
+        journal = opened(tmp_path)
+        await end_of(journal, block)
+        assert journal.pending is not over
         assert on_disk(tmp_path) == (None if over else OLD)
         if not over:
-            assert await asyncio.wait_for(ledger.interrupted(), 30.0) == OLD
-            await ledger.undone()
-            assert not ledger.pending
+            assert await asyncio.wait_for(journal.interrupted(), 30.0) == OLD
+            await journal.undone()
+            assert not journal.pending
             assert on_disk(tmp_path) is None
-        assert await end_of(ledger, raises(ALL_BACK)) is ALL_BACK  # the next one may write
+        assert await end_of(journal, raises(ALL_BACK)) is ALL_BACK  # the next one may write
 
     asyncio.run(main())
 
 
 @pytest.mark.parametrize(
     ("block", "kept"),
-    [(raises(ALL_BACK), True), (raises(NOTHING), True), (Ledger.undone, False), (raises(HALF_BACK), False)],
+    [(raises(ALL_BACK), True), (raises(NOTHING), True), (WriteJournal.undone, False), (raises(HALF_BACK), False)],
     ids=["old values restored", "nothing written", "undone", "left changed"],
 )
 def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
     tmp_path: Path, block: Block, kept: bool
 ) -> None:
     async def main() -> None:
-        ledger = opened(tmp_path)
-        await end_of(ledger, lambda ledger: ledger.done(OLD))
-        await end_of(ledger, block)
-        if ledger.pending:  # the recovery brings the undo to its end
-            assert ledger.is_undoable(OLD)
-            await ledger.undone()
+        journal = opened(tmp_path)
+        await end_of(journal, lambda journal: journal.done(OLD))
+        await end_of(journal, block)
+        if journal.pending:  # the recovery brings the undo to its end
+            assert journal.is_undoable(OLD)
+            await journal.undone()
         steps = (OLD,) if kept else ()
-        assert ledger.steps(1) == opened(tmp_path).steps(1) == steps
+        assert journal.steps(1) == opened(tmp_path).steps(1) == steps
         assert (tmp_path / "undo-1.json").exists() is kept
         assert on_disk(tmp_path) is None
 
@@ -148,17 +148,17 @@ def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
 
 def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: Path) -> None:
     async def main() -> None:
-        ledger = opened(tmp_path)
-        async with ledger.transaction(OLD):
+        journal = opened(tmp_path)
+        async with journal.transaction(OLD):
             assert on_disk(tmp_path) == OLD
-            assert not ledger.pending
-            await ledger.update_pending(WIDER)
+            assert not journal.pending
+            await journal.update_pending(WIDER)
             assert on_disk(tmp_path) == WIDER
-            await ledger.done(WIDER)
-        assert not ledger.pending
+            await journal.done(WIDER)
+        assert not journal.pending
         assert on_disk(tmp_path) is None
         assert ChangeLog(tmp_path).undo_of(1).read() == Undoable(1, (WIDER,))
-        assert ledger.steps(1) == (WIDER,)
+        assert journal.steps(1) == (WIDER,)
 
     asyncio.run(main())
 
@@ -166,15 +166,15 @@ def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: 
 def test_nothing_is_written_whose_old_values_cannot_be_kept(tmp_path: Path) -> None:
     async def main() -> None:
         disk, called = LedgerDisk(), []
-        ledger = opened(tmp_path, disk)
+        journal = opened(tmp_path, disk)
         disk.refuses = {"write"}
 
-        async def block(ledger: Ledger) -> None:
-            called.append(ledger)
+        async def block(journal: WriteJournal) -> None:
+            called.append(journal)
 
-        assert isinstance(await end_of(ledger, block), StorageError)
+        assert isinstance(await end_of(journal, block), StorageError)
         assert not called
-        assert not ledger.pending
+        assert not journal.pending
 
     asyncio.run(main())
 
@@ -185,18 +185,18 @@ def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_
 ) -> None:
     async def main() -> None:
         disk = LedgerDisk()
-        ledger = opened(tmp_path, disk)
+        journal = opened(tmp_path, disk)
 
-        async def block(ledger: Ledger) -> None:
+        async def block(journal: WriteJournal) -> None:
             disk.refuses = {refused}
-            await ledger.done(OLD)
+            await journal.done(OLD)
 
-        assert isinstance(await end_of(ledger, block), StorageError)
-        assert ledger.pending
+        assert isinstance(await end_of(journal, block), StorageError)
+        assert journal.pending
         assert on_disk(tmp_path) == OLD
         disk.refuses = set()
-        await ledger.undone()
-        assert not ledger.undoable
+        await journal.undone()
+        assert not journal.undoable
         assert not opened(tmp_path).undoable
 
     asyncio.run(main())
@@ -204,14 +204,14 @@ def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_
 
 def test_a_second_write_does_not_take_the_place_of_one_that_is_open_or_was_interrupted(tmp_path: Path) -> None:
     async def main() -> None:
-        ledger = opened(tmp_path)
-        async with ledger.transaction(OLD):
+        journal = opened(tmp_path)
+        async with journal.transaction(OLD):
             with pytest.raises(AutopilotError, match="restoring old values"):
-                async with ledger.transaction(WIDER):
+                async with journal.transaction(WIDER):
                     raise AssertionError("written over")
-            assert not ledger.pending
+            assert not journal.pending
             assert on_disk(tmp_path) == OLD
-        assert "restoring old values" in str(await end_of(ledger, wordless)), "interrupted"
+        assert "restoring old values" in str(await end_of(journal, wordless)), "interrupted"
         assert on_disk(tmp_path) == OLD
         again = opened(tmp_path)
         assert await asyncio.wait_for(again.interrupted(), 30.0) == OLD, "of a daemon that died"

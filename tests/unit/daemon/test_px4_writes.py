@@ -19,7 +19,7 @@ from companion.autopilot.parameters.change import WriteFailedError
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.journal import WriteJournal
 from companion.daemon.offsets.plan import ImuPlan
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.links.mavlink.link import MavlinkLink
@@ -45,7 +45,7 @@ class Px4WriteStage(NamedTuple):
     async def write(self, *instances: int) -> list[ImuCalibration]:
         found = [await self.read(instance) for instance in instances]
         targets = [planned(each) for each in found]
-        async with self.writes.standing_by(targets, {}) as probe:
+        async with self.writes.observing(targets, {}) as probe:
             await self.writer.apply([change for target in targets for change in target.changes], probe)
         return found
 
@@ -65,9 +65,9 @@ async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Px4WriteStage]
     async def inline(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
 
-    ledger = Ledger(ChangeLog(folder), inline)
-    ledger.load()
-    writes = Px4Writes(link, vehicle, writer, ledger, memory, lambda *what: None)
+    journal = WriteJournal(ChangeLog(folder), inline)
+    journal.load()
+    writes = Px4Writes(link, vehicle, writer, journal, memory, lambda *what: None)
     async with flying_on(link, px4):
         await vehicle.found.wait()
         await asyncio.sleep(1.0)
@@ -82,7 +82,7 @@ def test_the_right_slot_is_seen_to_act_and_remembered(tmp_path: Path) -> None:
             assert [stage.memory.known("gyro", device) for device in (ICM, BMI)] == [1, 2]
             assert [stage.memory.known("accel", device) for device in (ICM, BMI)] == [1, 2]
             for found in (one, two):
-                far = stage.writes.on_the_way[found.instance]
+                far = stage.writes.under_far_offset[found.instance]
                 raw_gyro, raw_accel = stage.px4.raw[found.instance - 1]
                 np.testing.assert_allclose(far["gyro"][0][0], raw_gyro - [0.0, 0.0, 0.022], atol=3e-3)
                 np.testing.assert_allclose(far["accel"][0][0], raw_accel - [0.0, 0.0, 0.09], atol=0.03)
@@ -193,7 +193,7 @@ def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
     async def main() -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
-            async with stage.writes.standing_by([planned(found)], {}) as probe:
+            async with stage.writes.observing([planned(found)], {}) as probe:
                 assert probe is not None
                 verify = probe("CAL_GYRO0_ZOFF")
                 stage.client.vehicle.boots += 1
@@ -210,7 +210,7 @@ def test_old_values_that_are_back_are_in_use(tmp_path: Path) -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
             target = planned(found)
-            async with stage.writes.standing_by([target], {}) as probe:
+            async with stage.writes.observing([target], {}) as probe:
                 await stage.writer.apply(target.changes, probe)
             await asyncio.sleep(2.0)
             await stage.writer.undo(target.changes)
@@ -240,9 +240,9 @@ def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
                 return value
 
             px4.on_set = turn
-            async with stage.writes.standing_by([target], {}) as probe:
+            async with stage.writes.observing([target], {}) as probe:
                 await stage.writer.apply(target.changes, probe)
             assert stage.memory.known("gyro", ICM) is None
-            assert stage.writes.on_the_way[found.instance] == {}
+            assert stage.writes.under_far_offset[found.instance] == {}
 
     run_virtual(main())

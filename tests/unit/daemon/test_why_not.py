@@ -17,11 +17,11 @@ def found(**what: Any) -> tuple[Precondition, str] | None:
         arm_state=what.get("arm_state", ArmState.DISARMED),
         heartbeat_age_s=what.get("age_s", 0.2),
     )
-    ledger: Any = SimpleNamespace(
+    journal: Any = SimpleNamespace(
         fault=what.get("fault"), pending=what.get("pending", False), why_yield=lambda: what.get("second")
     )
     job: Any = what.get("job")
-    return next(blocked(vehicle, ledger, job), None)
+    return next(blocked(vehicle, journal, job), None)
 
 
 RUNNING = SimpleNamespace(kind="calibration", words="hold still 3 s more", is_running=True)

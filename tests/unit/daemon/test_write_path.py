@@ -12,7 +12,7 @@ import pytest
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.daemon.job import JobCancelledError
-from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.journal import WriteJournal
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.machine import Machine, State
@@ -41,13 +41,13 @@ class WritePathAircraft:
 
     def __init__(self, folder: Path) -> None:
         self.disk_is_full = False
-        self.ledger = Ledger(ChangeLog(folder), self._offload)
-        self.ledger.load()
+        self.journal = WriteJournal(ChangeLog(folder), self._offload)
+        self.journal.load()
         self.writer, self.machine = Writer(), Machine()
         self.machine.state = State.WRITING
         vehicle = SimpleNamespace(system_id=1, arm_state=ArmState.DISARMED)
         path: Any = Offsets.__new__(Offsets)
-        path._vehicle, path._machine, path.writer, path.ledger = vehicle, self.machine, self.writer, self.ledger
+        path._vehicle, path._machine, path.writer, path.journal = vehicle, self.machine, self.writer, self.journal
         self.path: Offsets = path
 
     async def _offload(self, function: Any, *arguments: Any) -> Any:
@@ -57,7 +57,7 @@ class WritePathAircraft:
 
     async def commit(self, verdict: Exception | None = None, *, full: bool = False) -> None:
         async def apply() -> list[Change]:
-            assert self.ledger._open is not None, "old values on disk before the first write"
+            assert self.journal._open is not None, "old values on disk before the first write"
             return MADE
 
         async def verify() -> None:
@@ -73,7 +73,7 @@ def test_a_verified_write_can_be_undone_with_all_that_it_changed(tmp_path: Path)
     async def main() -> None:
         aircraft = WritePathAircraft(tmp_path)
         await aircraft.commit()
-        (step,) = aircraft.ledger.steps(1)
+        (step,) = aircraft.journal.steps(1)
         assert step.names == [change.parameter for change in MADE]
         assert not aircraft.writer.restored
 
@@ -98,8 +98,8 @@ def test_a_write_that_must_not_stay_is_restored_at_once(
         with pytest.raises(raised, match=r"; old values restored$"):
             await aircraft.commit(verdict, full=full)
         assert aircraft.writer.restored == MADE
-        assert aircraft.ledger.steps(1) == ()
-        assert aircraft.ledger.pending is full, "a disk that cannot forget the write leaves it to the recovery"
+        assert aircraft.journal.steps(1) == ()
+        assert aircraft.journal.pending is full, "a disk that cannot forget the write leaves it to the recovery"
 
     run_virtual(main())
 
@@ -110,6 +110,6 @@ def test_values_that_could_not_be_restored_are_named_and_left_to_the_recovery(tm
         aircraft.writer.fails = WriteFailedError("armed in the middle", "armed", {}, ("INS_GYROFFS_X",))
         with pytest.raises(AutopilotError, match="old values NOT restored in INS_GYROFFS_X: restored once disarmed"):
             await aircraft.commit(AutopilotError("not followed"))
-        assert aircraft.ledger.pending
+        assert aircraft.journal.pending
 
     run_virtual(main())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, align, in_words
-from companion.estimation.alignment.align_model import Ground, Priors, StandMeans
+from companion.estimation.alignment.align_model import Ground, PoseMeans, Priors
 from companion.physics.frames import rotation_matrix
 from companion.physics.gradienter import Law
 from companion.physics.units import DEG, DEG_H, MG
@@ -53,7 +53,7 @@ class World:
     def noise(self, sigma: float, size: int) -> Floats:
         return np.zeros(size) if self.rng is None else self.rng.normal(0.0, sigma, size)
 
-    def stand(self, body: Floats, *, on_spot: bool = True, in_range: bool = True) -> StandMeans:
+    def stand(self, body: Floats, *, on_spot: bool = True, in_range: bool = True) -> PoseMeans:
         roll, pitch, heading = angles_of(body)
         aircraft = VirtualAircraft(Pose(pitch / DEG, roll / DEG, heading / DEG), SITE)
         truth = aircraft.truth_at(0.0)
@@ -64,7 +64,7 @@ class World:
         rate = truth.rate_rad_s + self.gyro_bias + self.noise(self.gyro_deg_h * DEG_H, 3)
         # Where the nose points up a heading says nothing.
         heading_sigma = self.heading_deg if abs(pitch) < 70 * DEG else 90.0
-        return StandMeans(
+        return PoseMeans(
             imus=(imu_means(rate, self.gyro_deg_h * DEG_H, force, self.accel_ug * UG),),
             tilt_deg=(float(x), float(y)) if in_range else None,
             tilt_sigma_deg=(self.reading_deg, self.reading_deg),
@@ -73,7 +73,7 @@ class World:
             on_spot=on_spot,
         )
 
-    def align(self, stands: list[StandMeans], priors: Priors | None = None) -> Alignment:
+    def align(self, stands: list[PoseMeans], priors: Priors | None = None) -> Alignment:
         return align(self.law, rotation_matrix(self.mounting_deg), stands, GROUND, priors)
 
 
@@ -172,7 +172,7 @@ def test_everything_is_found_from_headings_and_tilts(law: Law, mounting_deg: tup
 
 def placed(
     world: World, headings_deg: list[float], slope_deg: tuple[float, float], placement_deg: float
-) -> list[StandMeans]:
+) -> list[PoseMeans]:
     """Stands on one spot, each missing it a little."""
     stands = []
     for body in on_spot(headings_deg, slope_deg):
@@ -260,7 +260,7 @@ def test_a_wrong_law_and_a_wrong_mounting_are_noticed() -> None:
 def test_readings_that_cannot_belong_together_are_refused() -> None:
     world = World("axis")
     stand = world.stand(attitude(0.0, 0.0))
-    broken = StandMeans(stand.imus, (80.0, 80.0), stand.tilt_sigma_deg, 0.0, 0.1, on_spot=True)
+    broken = PoseMeans(stand.imus, (80.0, 80.0), stand.tilt_sigma_deg, 0.0, 0.1, on_spot=True)
     with pytest.raises(CalibrationRefusedError, match="belong together"):
         align("axis", np.eye(3), [broken], GROUND)
 
@@ -278,9 +278,7 @@ def test_without_a_north_the_horizontal_part_of_the_earths_rate_stays_open() -> 
         north_deg = seed * 6.0
         stands = [world.stand(body) for body in on_spot([north_deg, north_deg + 180.0, north_deg], (0.0, 0.0))]
         shifted = [
-            StandMeans(
-                s.imus, s.tilt_deg, s.tilt_sigma_deg, s.heading_rad - math.radians(north_deg), 0.05, on_spot=True
-            )
+            PoseMeans(s.imus, s.tilt_deg, s.tilt_sigma_deg, s.heading_rad - math.radians(north_deg), 0.05, on_spot=True)
             for s in stands
         ]
         imu = align("slope", np.eye(3), shifted, open_ground).imus[0]

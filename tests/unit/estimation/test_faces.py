@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Face, FacesEstimate, faces, missing, seen_before
-from companion.estimation.alignment.poses import Wish
+from companion.estimation.alignment.poses import PoseRequest
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import MG
 from sim.aircraft import Pose, VirtualAircraft
@@ -154,7 +154,7 @@ def test_it_says_which_stand_is_missing_until_nothing_is(mounting: str) -> None:
     sensor = Sensor(8)
     obeyed: list[str] = []
     stands: list[Face] = []
-    wish: Wish | None = Wish("level: ")
+    wish: PoseRequest | None = PoseRequest("level: ")
     while wish is not None:
         side = wish.words.partition(":")[0]
         assert side not in obeyed

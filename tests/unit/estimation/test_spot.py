@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.estimation.alignment.align import Alignment, Complaint, in_words, turned
-from companion.estimation.alignment.align_model import Ground, StandMeans
+from companion.estimation.alignment.align_model import Ground, PoseMeans
 from companion.estimation.alignment.faces import Sides, faces, mounting
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
@@ -58,7 +58,7 @@ def model(aircraft: VirtualAircraft, board_deg: tuple[float, float, float] = BOA
 
 def on_spot(
     slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, counted: float = 1.0
-) -> list[StandMeans]:
+) -> list[PoseMeans]:
     """Stands without noise; headings counted by a gyro whose scale is `counted`."""
     aircraft = VirtualAircraft(Pose(slope_deg[0], slope_deg[1], 70.0), SITE)
     hands, imu, stands, t_s = Hands(aircraft), model(aircraft), [], 0.0
@@ -69,11 +69,11 @@ def on_spot(
         means = imu_means(read[:3], 5.0 * DEG_H, read[3:], SIGMA)
         sigma_rad = (0.15 if k else 0.01) * DEG
         turned_rad = heading * counted * DEG
-        stands.append(StandMeans((means,), None, (1.0, 1.0), turned_rad, sigma_rad, on_spot=True, counted=k > 0))
+        stands.append(PoseMeans((means,), None, (1.0, 1.0), turned_rad, sigma_rad, on_spot=True, counted=k > 0))
     return stands
 
 
-def solved(stands: list[StandMeans]) -> Alignment:
+def solved(stands: list[PoseMeans]) -> Alignment:
     across = 7.292115e-5 * math.cos(47.0 * DEG)
     rate = np.array([0.0, 0.0, -7.292115e-5 * math.sin(47.0 * DEG)])
     return turned(stands, Ground(G, 3e-4, rate, np.diag([across**2 / 2.0, across**2 / 2.0, 1e-18])))

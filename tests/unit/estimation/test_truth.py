@@ -16,7 +16,7 @@ from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
-from companion.estimation.solution.truth import Otherwise, OwnHeading, aged_m_s2
+from companion.estimation.solution.truth import FallbackPose, OwnHeading, aged_m_s2
 from companion.physics.frames import rotation_matrix, vector
 from companion.physics.units import DEG_H, MG
 from sim.aircraft import Pose, VirtualAircraft
@@ -75,7 +75,7 @@ class Wandering(Sensor):
         widened[BIAS] = np.hypot(widened[BIAS], aged_m_s2)
         sides = Sides(known.figures, widened, TURN)
         window = still(TURN @ read, np.asarray(truth.rate_rad_s) + GYRO_BIAS, self.stat, self.use)
-        return Later(pose, solve(window, LOCAL, None, None, What.BOTH, otherwise=Otherwise(sides={"fc": sides})))
+        return Later(pose, solve(window, LOCAL, None, None, What.BOTH, otherwise=FallbackPose(sides={"fc": sides})))
 
 
 def still(accel_m_s2: Floats, gyro_rad_s: Floats, stat: Floats, use: Floats) -> Window:
@@ -154,8 +154,8 @@ def test_the_autopilots_heading_takes_the_earths_rate_out_within_its_sigma(off_d
     heading_deg = 70.0
     truth = VirtualAircraft(Pose(3.0, -2.0, heading_deg), SITE).truth_at(0.0)
     window = still(truth.force_m_s2, np.asarray(truth.rate_rad_s) + GYRO_BIAS, np.full(3, 1e-4), np.full(3, 1e-3))
-    own = Otherwise(heading=OwnHeading(heading_deg + off_deg, 10.0))
-    found, without = (solve(window, LOCAL, None, None, What.GYROS, otherwise=each) for each in (own, Otherwise()))
+    own = FallbackPose(heading=OwnHeading(heading_deg + off_deg, 10.0))
+    found, without = (solve(window, LOCAL, None, None, What.GYROS, otherwise=each) for each in (own, FallbackPose()))
     (imu,), (blind,) = found.imus, without.imus
     assert imu.gyro_rad_s is not None
     assert (np.abs(imu.gyro_rad_s - GYRO_BIAS) < 2.0 * imu.gyro_sigma_use_rad_s).all()
@@ -167,4 +167,4 @@ def test_the_autopilots_heading_takes_the_earths_rate_out_within_its_sigma(off_d
 def test_on_a_deck_a_yaw_is_no_heading() -> None:
     window = still(np.array([0.0, 0.0, -9.8]), GYRO_BIAS, np.full(3, 1e-4), np.full(3, 1e-3))
     with pytest.raises(CalibrationRefusedError, match="no compass on a deck: gyros not calibrated"):
-        solve(window, LOCAL, None, None, What.GYROS, "deck", otherwise=Otherwise(heading=OwnHeading(10.0, 10.0)))
+        solve(window, LOCAL, None, None, What.GYROS, "deck", otherwise=FallbackPose(heading=OwnHeading(10.0, 10.0)))

@@ -19,7 +19,7 @@ from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import SIGNING_FILE, BiasStore, RecordStore, alignment_in, faces_in, signing_time_in
 from companion.storage.state import MOST_ASIDE, MOST_BYTES, BoundedList, StateFile, sealed
-from companion.web.access import kept_token
+from companion.web.access import stored_token
 
 # A read of a FIFO that nobody writes to never ends.
 pytestmark = pytest.mark.timeout(60)
@@ -95,7 +95,7 @@ def test_others_that_are_read_are_refused_at_once(tmp_path: Path, what: str) -> 
         read_profile(tmp_path / profile)
     if what not in ("NaN", "another type"):  # a token is any short text
         with pytest.raises(StorageError):
-            kept_token(tmp_path)
+            stored_token(tmp_path)
     assert os.path.lexists(record)  # of records, each is named and stays
 
 

@@ -428,14 +428,14 @@ def test_beyond_the_board_the_token_is_the_kept_one_and_never_handed_out(tmp_pat
 
 
 def test_the_kept_token_stays_and_a_useless_one_is_refused(tmp_path: Path) -> None:
-    first = access.kept_token(tmp_path)
+    first = access.stored_token(tmp_path)
     assert re.fullmatch(r"([2-9a-hjkmnp-z]{4}-){2}[2-9a-hjkmnp-z]{4}", first)
-    assert access.kept_token(tmp_path) == first
+    assert access.stored_token(tmp_path) == first
     assert access.new_token() != access.new_token()
     for useless in (b"", b"short\n", b"\xff\xfe\n"):
         (tmp_path / "web-token").write_bytes(useless)
         with pytest.raises(StorageError, match="web-token"):
-            access.kept_token(tmp_path)
+            access.stored_token(tmp_path)
 
 
 def test_a_token_that_somebody_chose_has_twelve_characters(

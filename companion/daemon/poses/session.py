@@ -24,11 +24,11 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offsets.plan import WriteLog
-from companion.daemon.stands.measuring import POLL_S, Measuring
-from companion.daemon.stands.writes import AlignmentWrites
+from companion.daemon.poses.measuring import POLL_S, Measuring
+from companion.daemon.poses.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import Mounting
-from companion.estimation.alignment.poses import AlignmentRequest, HeldPose, Wish, leaned_deg
+from companion.estimation.alignment.poses import AlignmentRequest, HeldPose, PoseRequest, leaned_deg
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import HandRecord, completed
@@ -70,7 +70,7 @@ class SessionState:
     # State of the present pose
     number: int = 1
     total: int = 1
-    wish: Wish = dataclasses.field(default_factory=lambda: Wish(""))
+    wish: PoseRequest = dataclasses.field(default_factory=lambda: PoseRequest(""))
     words: str = ""
     objection: str = ""  # Fault of the latest pose, if it was not the requested one
     share: float = 0.0
@@ -85,7 +85,7 @@ class SessionState:
     turned_deg: float = math.nan
     stop_said: bool = False
 
-    def begin_pose(self, wish: Wish, total: int, now_s: float) -> None:
+    def begin_pose(self, wish: PoseRequest, total: int, now_s: float) -> None:
         self.number, self.wish = len(self.poses) + 1, wish
         self.total = max(total, self.number)
         self.since_s, self.moved = (self.windows[-1].end_s, False) if self.windows else (now_s, True)
@@ -128,7 +128,7 @@ class PoseTask(abc.ABC):
     """Text on a bias or scale still unknown after the last pose; then nothing is written or saved."""
 
     @abc.abstractmethod
-    def wish(self, state: SessionState) -> Wish | None:
+    def wish(self, state: SessionState) -> PoseRequest | None:
         """Return the next pose to request; None: there are enough poses."""
 
     @abc.abstractmethod
@@ -225,7 +225,7 @@ class PoseSession:
 
     # --- one pose
 
-    async def _measure(self, state: SessionState, task: PoseTask, wish: Wish) -> None:
+    async def _measure(self, state: SessionState, task: PoseTask, wish: PoseRequest) -> None:
         loop, job = asyncio.get_running_loop(), state.job
         state.begin_pose(wish, task.total, loop.time())
         if state.number > 1:

@@ -21,7 +21,7 @@ from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
-from companion.daemon.offsets.reboot import RebootOwed
+from companion.daemon.offsets.reboot import RequiredReboot
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object, utc_now
@@ -34,7 +34,7 @@ RETRY_S: Final = 3.0
 POLL_S: Final = 0.2
 
 
-class Ledger:
+class WriteJournal:
     """Write journal and undo steps of one storage folder."""
 
     def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
@@ -162,34 +162,34 @@ class Recovery:
         self,
         core: Core,
         writer: ParameterWriter,
-        ledger: Ledger,
+        journal: WriteJournal,
         imus: Mapping[str, AutopilotImu],
-        owed: RebootOwed,
+        owed: RequiredReboot,
     ) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
-        self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
+        self._writer, self.journal, self._imus, self._owed = writer, journal, imus, owed
         self._offload, self._interruptions = core.offload, interruptions_in(core.config.storage.path)
         self.on_recovered: Callable[..., Awaitable[object]] | None = None
         """Callback after a recovery: changes of the write, text for people, and whether this used up an undo step."""
 
     def interruptions(self) -> list[Object]:
         """List interrupted writes, the latest first; reads the disk and blocks."""
-        pending = [] if self.ledger.orphaned is None else [Interruption.of(self.ledger.orphaned)]
+        pending = [] if self.journal.orphaned is None else [Interruption.of(self.journal.orphaned)]
         return [msgspec.to_builtins(each) for each in (*pending, *reversed(self._interruptions.read()))]
 
     def why_no_undo(self) -> str | None:
-        if self.ledger.steps(self._vehicle.system_id):
+        if self.journal.steps(self._vehicle.system_id):
             return None
-        where = "; the undo file was damaged" if self.ledger.unusable else ""
-        if elsewhere := self.ledger.undoable:
+        where = "; the undo file was damaged" if self.journal.unusable else ""
+        if elsewhere := self.journal.undoable:
             where = f" here, only on system {', '.join(map(str, elsewhere))}"
         return message("nothing_to_undo_found", where=where)
 
     async def run(self) -> None:
-        if self.ledger.lost_write:
+        if self.journal.lost_write:
             self._say(Severity.WARNING, message("interrupted_write_lost"), Weight.RESULT)
         while True:
-            open_set = await self.ledger.interrupted()
+            open_set = await self.journal.interrupted()
             try:
                 await self._recover(open_set)
             except (AutopilotError, StorageError) as error:
@@ -205,7 +205,7 @@ class Recovery:
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
             await self._keep(open_set, words)
-            await self.ledger.unchanged()
+            await self.journal.unchanged()
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
@@ -222,9 +222,9 @@ class Recovery:
             found += "; " + message("changed_by_others", values=", ".join(foreign))
         words = message("interrupted_write_ended", result=found)
         if self.on_recovered is not None:
-            await self.on_recovered(open_set, words, undone=self.ledger.is_undoable(open_set))
+            await self.on_recovered(open_set, words, undone=self.journal.is_undoable(open_set))
         await self._keep(open_set, found)
-        await self.ledger.undone()
+        await self.journal.undone()
         logger.warning("%s", words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
@@ -243,7 +243,7 @@ class Recovery:
         """
         if (why := self.why_no_undo()) is not None:
             raise AutopilotError(why)
-        step = self.ledger.steps(self._vehicle.system_id)[0]
+        step = self.journal.steps(self._vehicle.system_id)[0]
         name = step.origin.what or "last write"
         ours, foreign = await self._sort(step)
         if foreign and not force:
@@ -253,11 +253,11 @@ class Recovery:
         if foreign:
             logger.warning("%s", message("changed_by_others", values="; ".join(foreign)))
         try:
-            async with self.ledger.transaction(step):
+            async with self.journal.transaction(step):
                 with changing(self._imus.values()):
                     written = await self._writer.undo(ours)
                 await self._owed.after(ours)
-                await self.ledger.undone()
+                await self.journal.undone()
         except (WriteFailedError, NothingWrittenError) as error:
             # The error's own text would mislead: the writer's "old values" are those from before the undo.
             cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)

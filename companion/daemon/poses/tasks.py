@@ -14,17 +14,17 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.plan import WriteLog
-from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
-from companion.daemon.stands.session import ARMED, PoseTask, SessionState
+from companion.daemon.poses.alignment import ActiveAlignment, ActiveSixPosition
+from companion.daemon.poses.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
-from companion.estimation.alignment.align_model import Ground, StandMeans
+from companion.estimation.alignment.align_model import Ground, PoseMeans
 from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, mounting, seen_before
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
     AlignmentRequest,
     HeldPose,
-    Wish,
+    PoseRequest,
     asked_turn_deg,
     objection,
     wanted_pose,
@@ -37,7 +37,7 @@ from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
 
-LEAST_STANDS: Final = 3
+LEAST_POSES: Final = 3
 READING_SIGMA_DEG: Final = 0.005
 """Noise of one mean of a gradienter, one sigma (docs/reference/method.md section 3.4, table)."""
 SLOPE_WARNING_DEG: Final = 1.5
@@ -45,23 +45,23 @@ OFFSET_WARNING_SIGMAS: Final = 4.0
 EXPECTED: Final = 12  # Usual number of poses in a six-position alignment
 MOST: Final = 24
 """Maximum number of poses in a six-position alignment."""
-_FIRST: Final = Wish("any side down, propped up, hands off")
-LOOSE_M_S2: Final = 0.5 * MG
+_FIRST: Final = PoseRequest("any side down, propped up, hands off")
+TURN_LIMITED_M_S2: Final = 0.5 * MG
 """Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""
 
 
-class SpotTask(PoseTask):
+class SamePlaceTask(PoseTask):
     """Base class of alignments in which the aircraft turns at one place; `result` is the estimate."""
 
     result: Alignment
-    stands: Sequence[StandMeans] = ()
+    stands: Sequence[PoseMeans] = ()
     zero_deg: tuple[float, float] = (0.0, 0.0)
 
     def __init__(self, core: Core, request: AlignmentRequest) -> None:
         self._core, self.request = core, request
         self.total = self.fit_from = request.total
 
-    def wish(self, state: SessionState) -> Wish | None:
+    def wish(self, state: SessionState) -> PoseRequest | None:
         return wanted_pose(self.request, state.poses) if len(state.poses) < self.total else None
 
     def _counted(self, state: SessionState, now: Window, up: Array, first_sigma_deg: float) -> HeldPose:
@@ -92,7 +92,7 @@ class SpotTask(PoseTask):
             noise_deg = (1.0, 1.0) if tilt is None else (tilt.x_sigma_deg, tilt.y_sigma_deg)
             x_sigma_deg, y_sigma_deg = (math.hypot(READING_SIGMA_DEG, each) for each in noise_deg)
             stands.append(
-                StandMeans(
+                PoseMeans(
                     imus=tuple(imus[name] for name in names),
                     tilt_deg=None if tilt is None else (tilt.x_deg - self.zero_deg[0], tilt.y_deg - self.zero_deg[1]),
                     tilt_sigma_deg=(x_sigma_deg, y_sigma_deg),
@@ -110,7 +110,7 @@ class SpotTask(PoseTask):
             raise CalibrationRefusedError(in_words(result.complaint, gradienter=self.request.action != "turn"))
 
 
-class ZeroTask(SpotTask):
+class ZeroTask(SamePlaceTask):
     """Measures the gradienter's zero; from tilted poses also its mounting relative to each IMU."""
 
     imus_alone: ClassVar[bool] = False
@@ -118,7 +118,7 @@ class ZeroTask(SpotTask):
 
     def __init__(self, core: Core, request: AlignmentRequest, kept: ActiveAlignment) -> None:
         super().__init__(core, request)
-        self.fit_from = LEAST_STANDS
+        self.fit_from = LEAST_POSES
         self._kept, self._compass = kept, models.compass_model(core.config.compass)
         gradienter = models.gradienter_model(core.config.gradienter)
         assert gradienter is not None
@@ -189,7 +189,7 @@ class ZeroTask(SpotTask):
         return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {sigma_deg:.3f}; now: companion calibrate"
 
 
-class TurnTask(SpotTask):
+class TurnTask(SamePlaceTask):
     """Measures the level aircraft's accelerometer biases and the ground's slope; after six positions, board tilt."""
 
     def __init__(
@@ -210,7 +210,7 @@ class TurnTask(SpotTask):
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> TurnRecord:
         result, degrees = self.result, _temperatures(state.windows[-1])
-        if self.request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
+        if self.request.headings == 2 and _level_sigma_m_s2(result) > TURN_LIMITED_M_S2:
             log.warnings.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg: turn it the same way both times, or --headings 4"
             )
@@ -279,7 +279,7 @@ def _temperatures(window: Window) -> dict[str, float | None]:
     return {imu.name: imu.temperature_degc for imu in window.imus}
 
 
-class SidesTask(PoseTask):
+class SixPositionTask(PoseTask):
     """Measures bias and scale of accelerometers in poses of any orientation, until every bias and scale is known."""
 
     total = EXPECTED
@@ -288,9 +288,9 @@ class SidesTask(PoseTask):
     def __init__(self, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], kept: ActiveSixPosition) -> None:
         self.request, self._imus, self._kept = request, imus, kept
         self._by_imu: dict[str, FacesEstimate] = {}
-        self._missing: Wish | None = _FIRST
+        self._missing: PoseRequest | None = _FIRST
 
-    def wish(self, state: SessionState) -> Wish | None:
+    def wish(self, state: SessionState) -> PoseRequest | None:
         return self._missing if len(state.poses) < MOST else None
 
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:

@@ -17,7 +17,7 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
+from companion.daemon.poses.alignment import ActiveAlignment, ActiveSixPosition
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.collector.intake import CollectorStatus
 from companion.estimation.machine import Event, State, What
@@ -25,7 +25,7 @@ from companion.estimation.means.windows import Window
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
-from companion.estimation.solution.truth import Otherwise
+from companion.estimation.solution.truth import FallbackPose
 from companion.links.system.events import Listeners
 
 POLL_S: Final = 0.2
@@ -90,7 +90,7 @@ class Measuring:
             msgspec.structs.replace(settings, target_gyro_sigma_rad_s=gyro, target_accel_sigma_m_s2=accel)
         )
         failures = {name: imu.failures for name, imu in self._imus.items()}
-        collector.on_second.append(job.look_again)
+        collector.on_second.append(job.wake_up)
         try:
             while True:
                 status, waiting_for, hold_still_s = await self.read_state(job, "armed; nothing written")
@@ -108,7 +108,7 @@ class Measuring:
                     self.tell(job, words, SAY_WAITING_EVERY_S if waiting_for else SAY_LEFT_EVERY_S)
                 await job.pause(POLL_S)
         finally:
-            collector.on_second.remove(job.look_again)
+            collector.on_second.remove(job.wake_up)
 
     def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
         now_s = asyncio.get_running_loop().time()
@@ -133,10 +133,10 @@ class Estimator:
 
     def __init__(self, core: Core, alignment: ActiveAlignment, faces: ActiveSixPosition, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
-        self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
+        self.on_solved: Listeners[Whereabouts, FallbackPose, What, Expectation] = Listeners()
         """Listeners to the inputs of an estimate: place, fallbacks for sensors, biases requested, biases predicted."""
 
-    async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, Otherwise]:
+    async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, FallbackPose]:
         config = self._core.config
         where, otherwise = models.whereabouts(config, self._core.vehicle), await self._otherwise(window)
         poses = self.alignment.model(), models.compass_model(config.compass)
@@ -146,7 +146,7 @@ class Estimator:
         )
         return found, where, otherwise
 
-    async def _otherwise(self, window: Window) -> Otherwise:
+    async def _otherwise(self, window: Window) -> FallbackPose:
         core, heading = self._core, self._own.heading() if self._core.config.compass is None else None
         try:
             # Use the autopilot's heading only if it is its own and not ours.
@@ -155,4 +155,4 @@ class Estimator:
         except AutopilotError:
             heading = None
         sides = self._faces.sides(window) if core.config.gradienter is None else {}
-        return Otherwise(sides=sides, heading=heading)
+        return FallbackPose(sides=sides, heading=heading)
