@@ -5,15 +5,18 @@ from __future__ import annotations
 import sys
 from typing import Final
 
-from companion.messages import KINDS, Entry, catalogue
+from companion.messages import ANY, KINDS, Entry, catalogue
 
 _HEAD: Final = """\
 # Messages: what the companion says, and what to do
 
-`companion explain WORDS` finds a line by some of its words; it knows more lines than this page. `…` is a name or a
-number. Of `Not armed: hold still 6 s` look up the part behind the colon. A line that begins with `... ` continues the
-one before. Change a setting in companion.toml, then restart the companion.
+`companion explain WORDS` finds a line by some of its words; it knows more lines than this page. `…` is a name, a number
+or the rest of a long line. For `Not armed: hold still 6 s` look up the part behind the colon. A line that begins with
+`... ` continues the one before. Change a setting in companion.toml, then restart the companion.
 """
+
+
+_LONGEST: Final = 9  # Words of a line that the page shows: a reader finds the line by its beginning
 
 
 def page() -> str:
@@ -29,8 +32,9 @@ def page() -> str:
 
 
 def _shown(entry: Entry) -> tuple[str, ...]:
-    # `companion explain` knows all patterns.
-    return entry.patterns[:1] if entry.text else entry.also[:1]
+    # `companion explain` knows all patterns, in full.
+    words = (entry.patterns if entry.text else entry.also)[0].split(" ")
+    return (" ".join(words if len(words) <= _LONGEST else [*words[:_LONGEST], ANY]),)
 
 
 def _row(see: str, cause: str, remedy: str, patterns: list[str]) -> str:

@@ -335,7 +335,7 @@ class AttitudeEstimator:
         return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return time and attitude (body to NED, newest levelling) at the last stored time up to `t_s`, or None."""
+        """Return the last stored time up to `t_s` and its attitude (body to NED by the newest levelling), or None."""
         for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:
                 return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)

@@ -197,7 +197,7 @@ class _Session:
         heard = found.autopilots
         if self._options.mavlink is not None:
             draft.take_url(self._options.mavlink)
-        elif was is not None and (not heard or any(same_url(url, was) for url in heard) or not found.silent_url(was)):
+        elif was is not None and (not heard or any(same_url(url, was) for url in heard) or not found.checked_url(was)):
             say(f"Autopilot: {was}, as it was")
         elif was is not None:
             say(f"The autopilot is not heard at {was}.")
@@ -231,7 +231,7 @@ class _Session:
         if section is not None:
             port = section["port"]
             again = [one for one in heard if same_port(one[0], port)]
-            if again or not heard or not found.silent(port):
+            if again or not heard or not found.checked(port):
                 for _, protocol, line in again:
                     draft.take(kind, port, protocol, line)
                 self.asking.say(f"{kind.capitalize()}: {section['protocol']} at {port}, as it was")

@@ -233,7 +233,7 @@ class BiasMemory:
         await self._write()
 
     async def look(self, solution: Solution) -> None:
-        """Store a window's biases if it is this power-up's first, or by far the best, within 1 K of its temperature."""
+        """Store biases if this power-up has none, or only far worse ones, within 1 K of the window's temperature."""
         unix_s = time.time()
         self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]

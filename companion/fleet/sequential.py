@@ -39,7 +39,7 @@ _FURTHER: Final = 6.0
 _TWICE: Final = (0.375, np.log(2.0))
 """Log-likelihood ratio of doubled to usual scatter: factor of z^2 (z: residual in sigmas), subtracted constant."""
 OWN_WEIGHT: Final = 8.0
-"""Weight of the initial scatter, as a number of an IMU's own power-ups: scatters within a model differ by a quarter."""
+"""Weight of the initial scatter, in power-ups of the IMU: the scatters of one model's IMUs differ by a quarter."""
 _HELD_SIGMAS: Final = 2.5
 _MEAN_SQUARE_OF_HELD: Final = 0.9775  # mean square of a standard normal number clipped to `_HELD_SIGMAS`
 _VARIANCE_OF_MEDIAN_OF_3: Final = 0.449  # variance of the median of three standard normal numbers

@@ -208,7 +208,7 @@ async def _imu(
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:
-    """Compare the readings before the motors' start with zero motion, in windows: no solution would be as exact."""
+    """Compare windows of readings before the motors' start with zero motion: it is more exact than logged motion."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:

@@ -42,7 +42,7 @@ _KINDS: Final = {
 
 
 class Recording:
-    """MCAP file of the companion, opened up to its first message; `offset_ns` is UTC minus the daemon's clock."""
+    """MCAP file of the companion; opening reads up to the first message. `offset_ns`: UTC minus the daemon's clock."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -68,7 +68,7 @@ class CurrentAircraft(msgspec.Struct, frozen=True):
 
 
 class Sources:
-    """Result files of one storage directory; `items` stores what was already read ("marks"). Methods block."""
+    """Result files of one storage directory; `items` has a mark for each result already read. Methods block."""
 
     def __init__(self, directory: Path, items: FleetItems) -> None:
         self._directory, self._items = directory, items
@@ -76,9 +76,9 @@ class Sources:
         self._settled = False
 
     def has_news(self) -> bool:
-        """Return True if a file may have been written since the last call, and again at the first call after that.
+        """Return True if a file has changed since the last call. Each change is reported by two calls in a row.
 
-        The repetition is needed because a second write in one tick of the file system's clock changes no timestamp.
+        The second report is needed because a second write in one tick of the file system's clock changes no timestamp.
         """
         seen = tuple(_stamp(self._directory / name) for name in _WATCHED)
         settled, self._settled = self._settled, seen == self._seen

@@ -99,17 +99,17 @@ class Survey:
             if main_kind(heard.candidate.protocol) == kind
         ]
 
-    def silent(self, port: str) -> bool:
-        """Return True if a serial port is absent or was scanned, False if it could not be opened."""
+    def checked(self, port: str) -> bool:
+        """Return True if a serial port was scanned or is absent, False if it could not be opened."""
         if port.startswith("/") and not os.path.exists(port):
             return True
         heard = [found for name, found in self.serial.items() if same_port(name, port)]
         return any(not isinstance(found, str) for found in heard)
 
-    def silent_url(self, url: str) -> bool:
+    def checked_url(self, url: str) -> bool:
         kind, where, number = parse_url(url)
         if kind == "serial":
-            return self.silent(where)
+            return self.checked(where)
         return kind == "udpin" and isinstance(self.udp.get(number), HeardUdp)
 
 

@@ -169,7 +169,7 @@ async def test_a_temperature_calibration_of_somebody_elses_is_kept_until_it_is_s
         before, left = rig.parameters(), rig.double.residual(1, rig.now_s)
         reply = await rig.ask(action="write")
         assert reply["state"] == "failed"
-        assert reply["reason"].startswith("imu fc: INS_TCAL1_ENABLE is on, and not by the companion: kept")
+        assert reply["reason"].startswith("imu fc: INS_TCAL1_ENABLE is on, set by another writer: its curve stays")
         assert rig.parameters() == before
         assert (await rig.ask(action="write", overwrite=True))["state"] == "done"
         now = rig.double.residual(1, rig.now_s)

@@ -235,7 +235,7 @@ class SlotMemory:
         self._instance_of[sensor, device_id] = instance
 
     def known(self, sensor: Triad, device_id: int) -> int | None:
-        """Return the IMU learned for a device; NO_IMU: it changes no telemetry; None: not learned yet."""
+        """Return the IMU whose telemetry a device's offsets change: NO_IMU if none does, None if not learned yet."""
         return self._instance_of.get((sensor, device_id))
 
     def holds_strangers(self, sensor: Triad, imus: int) -> bool:

@@ -32,7 +32,7 @@ or accepted from a file."""
 
 
 def firmware_named(name: FirmwareName | None) -> Firmware:
-    """Return the firmware with this name; None: no heartbeat of the autopilot yet."""
+    """Return the firmware named: `NO_FIRMWARE_YET` for None (no heartbeat yet), `OTHER` for an unknown name."""
     return NO_FIRMWARE_YET if name is None else next((one for one in FIRMWARES if one.name == name), OTHER)
 
 

@@ -121,7 +121,7 @@ def _judge_axis(expected: float, made: float, sigma: float, slack: float) -> tup
     if not all(map(math.isfinite, (expected, made, sigma))):
         return "wrong", "not a number"
     if abs(expected) < 2 * noise:
-        return ("too small to see", "") if agrees else ("wrong", "it moved although it should not")
+        return ("too small to see", "") if agrees else ("wrong", "it changed although it should not")
     if agrees:
         return "seen", ""
     if abs(made) <= noise:

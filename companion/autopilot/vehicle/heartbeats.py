@@ -156,10 +156,9 @@ class BootClock:
 
     A restart shows in one of two ways. First, the time goes back. Second, after a silence, the time since boot is
     shorter than the silence and has advanced by less than half of it. The autopilot then restarted while the link was
-    lost, and its time since boot has overtaken the old one. The limit is half, because a simulator may run slower than
-    real time. On a busy machine a simulator may even be slower; then a time since boot longer than the silence
-    excludes a restart. The second way must hold for another half second, as the first messages after a pause of our own
-    process are old.
+    lost, and its time since boot has overtaken the old one. Both conditions are needed: a simulator on a busy machine
+    may advance by less than half. But its time since boot is longer than the silence, so it did not restart meanwhile.
+    The second way must hold for another half second, as the first messages after a pause of our own process are old.
     """
 
     def __init__(self) -> None:

@@ -291,7 +291,7 @@ class ActiveCalibration:
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:
-        """Return whether a recent result stays held back: it fits the output, and the active calibration does not."""
+        """Return True if a held-back result is recent and fits the output, and the active calibration does not fit."""
         if state.in_doubt is None:
             return False
         measured = state.in_doubt[1]

@@ -311,7 +311,7 @@ class Calibrating(Subsystem):
                 left.append(f"imu {name}: it sends no temperature now")
             elif enabled_by and not overwrite and not self._wrote_curve(calibration.thermal):
                 left.append(
-                    f"imu {name}: {enabled_by} is on, and not by the companion: kept"
+                    f"imu {name}: {enabled_by} is on, set by another writer: its curve stays"
                     " (companion autopilot temperature --overwrite replaces it)"
                 )
             else:

@@ -109,7 +109,7 @@ class Difference:
         self.theirs: tuple[float, Quaternion] | None = None
         """Autopilot's latest attitude: time on the companion's clock, and quaternion from body to NED."""
         self.latest: tuple[float, float] | None = None
-        """Unsmoothed difference of tilt and of heading, rad; None while either pitch is beyond `STEEP_RAD`."""
+        """Unsmoothed differences between both attitudes, rad: tilt, heading; None if a pitch is beyond `STEEP_RAD`."""
         self.heard_s = -math.inf
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)

@@ -36,7 +36,7 @@ VERIFY_MAX_S: Final = 60.0  # Longest wait for stillness after a write; then its
 VERIFY_ON_DECK_S: Final = 180.0
 """Longest wait for a write's effect on a ship or boat, whose motion hides the step for most of a minute."""
 LOOK_S: Final = 10.0
-"""Sufficient time without movement to see the step of a write in the output, even if a calibration needs more."""
+"""Time without movement that is enough to see a write change the IMU output; a calibration may need more."""
 LOOK_LONGER_S: Final = 30.0
 """Longest observation of a step that noise hides at first: after this time, flicker noise makes averaging useless."""
 TELEMETRY_S: Final = 2.0

@@ -5,8 +5,8 @@ calibration, then our fine gyro offsets. We write the fine offsets also before t
 autopilot refuses them, all can still be restored. If the calibration command is lost, only the reset is missing.
 
 The fine offsets are known in advance. The output is R (raw - offset), R from board to vehicle axes. So the whole bias,
-offset + R^-1 residual in board axes, does not depend on the present offset. With ArduPilot's temperature calibration it
-does: the gyro calibration sets CALTEMP and so changes `raw`. We then skip it, and the EKF settles by itself.
+offset + R^-1 residual in board axes, does not depend on the present offset. With ArduPilot's temperature calibration
+the gyro calibration sets CALTEMP and so changes `raw`. Then we skip the gyro calibration; the EKF settles by itself.
 
 The firmware's calibration also overwrites gyro offsets that are not part of the plan. All of them are saved before it,
 and restored by every roll-back and undo.

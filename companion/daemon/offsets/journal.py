@@ -235,11 +235,11 @@ class Recovery:
             logger.warning("%s", message("history_not_kept", what="interrupted write", reason=error))
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
-        """Restore the values from before the last write, all or none; return its changes and the restored parameters.
+        """Restore the values from before the last write; return the write's changes and the restored parameters.
 
-        If somebody else has changed some of these values since, an AutopilotError lists each with the present value,
-        ours and the old one. With `force`, those values stay and the others are restored. After another AutopilotError
-        or a StorageError the newer values stay; if some do not, `Recovery` ends the undo once disarmed.
+        If somebody else changed some values since, nothing is restored. An AutopilotError lists each with its present
+        value, ours and the old one. With `force`, these stay and the others are restored. After another AutopilotError
+        or a StorageError the new values stay; if some were restored, `Recovery` completes the undo once disarmed.
         """
         if (why := self.why_no_undo()) is not None:
             raise AutopilotError(why)

@@ -300,7 +300,7 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
     in_use = {change.parameter: change.before for change in changes}
 
     def output(values: Mapping[str, float], triad: Triad) -> Array:
-        """Return the change of the output, x y z, when `values` replace the parameter values before the write."""
+        """Return the output, x y z, under the parameters `values`, minus the output under those before the write."""
         there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
         return np.array(output_step(calibration, there, accel_m_s2)[0 if triad == "gyro" else 1])
 

@@ -42,11 +42,11 @@ _SPREAD: Final = 1.5
 """Least standard deviation of readings, in integer steps, at which swaying averages out the rounding to integers."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
-"""Prior sigma of an accelerometer bias by comparison with the gradienter; `solve` adds sigma of the latter's zero."""
+"""Prior sigma of an accelerometer bias measured with a gradienter; `solve` adds the sigma of the gradienter's zero."""
 _MIDDLE: Final = 0.37  # Share of K^2 T that a slope through the window misses
 _FLICKER_TO_COME: Final = 0.75
-"""Variance, over B^2, of the flicker in the next minutes that past flicker does not predict. Together with the flicker
-within the window (a random walk of B / sqrt(T)), it is the flicker's part of V(T, H) (method.md section 2.2)."""
+"""Variance of the next minutes' flicker that past flicker does not predict, in multiples of B^2. Flicker's part of
+V(T, H) is this plus the flicker in the window, a random walk of B / sqrt(T) (method.md section 2.2)."""
 _GRAVITY_M_S2: Final = 9.8
 
 

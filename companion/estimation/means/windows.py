@@ -240,7 +240,7 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
 
 
 def _excess(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, int]:
-    """Return the excess (c,) of Allan variance over white noise at 1/5 of the window (0: by chance); and 1/5, s."""
+    """Return Allan variance (c,) beyond white noise (0 if by chance), and its averaging time, s, 1/5 of the window."""
     span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
     if span < 2:
         return np.zeros(values.shape[1]), span

@@ -47,7 +47,7 @@ class Split(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """Error of inertial navigation without GNSS, by the reference, after `seconds`; 1 start in 20 exceeds `worst_m`."""
+    """Position error after `seconds` of inertial navigation, from `starts` times of a flight; 5 % exceed `worst_m`."""
 
     seconds: float
     starts: int

@@ -111,8 +111,8 @@ class Objection(NamedTuple):
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     """Return the age, s, at which the predicted wander of a bias reaches DRIFT_SIGMAS times its sigma.
 
-    The wander since a mean over `averaged_s` counts, without white noise. The smallest axis of `sigma` counts. The age
-    is at most a day, far beyond the configured limit.
+    The wander begins with a mean over `averaged_s` and excludes white noise. It is compared with the smallest axis of
+    `sigma`. The returned age is at most a day, far beyond the configured limit.
     """
     horizons_s = np.geomspace(1.0, _LONGEST_S, 1200)
     drift = floor_variance(model.flicker, model.walk, averaged_s, horizons_s)

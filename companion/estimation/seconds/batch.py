@@ -84,7 +84,7 @@ def summary(
     steps: Floats | None = None,
     shared_variance: Floats | None = None,
 ) -> Batch:
-    """Summarise rows (n, c), n >= 1, of one second. `circle`: rows are unrolled angles. `steps` (c,): integers' LSB."""
+    """Summarise rows (n, c), n >= 1, of one second. `circle`: unrolled angles. `steps` (c,): unit of integer rows."""
     n = len(rows)
     ordered = np.sort(rows, axis=0)
     distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)

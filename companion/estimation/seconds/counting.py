@@ -25,7 +25,7 @@ LATE_S: Final = 0.05
 """Largest delay of a sample, s. Beyond it, host's and device's clocks run at different rates (a slow simulator)."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
-"""Sigma of each turn by non-orthogonal gyro axes while the aircraft is tilted; errors of scale and time stamps add."""
+"""Error of each turn due to non-orthogonal gyro axes of a tilted aircraft, 1 sigma; scale and time errors add to it."""
 
 
 class Counted(NamedTuple):

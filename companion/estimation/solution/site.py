@@ -40,7 +40,7 @@ class Remedies:
     height: str = "set vehicle.height_m or wait for GPS"
     no_heading: str = "no compass"
     part: str = "name its part (profile), or learn it (companion log profile)"
-    mounting: str = "mounting = \"{}\" (an autopilot's own IMU: its board orientation), or the gradienter's is wrong"
+    mounting: str = "mounting = \"{}\" (autopilot's IMU: board orientation) fits, if the gradienter's is right"
     any_bias: str = "calibration.any_bias = true accepts it"
 
 

@@ -38,7 +38,7 @@ MOST: Final = (0.07 * DEG, 1.0 * MG)
 150), and three times the noisiest common accelerometer."""
 RED: Final = 2.0
 """Largest ratio of noise densities at two averaging times: several seconds and one second, or one and half a second.
-Flicker, warm-up and a 1 Hz filter raise the ratio; slow rocking makes it 8 from one averaging time to its double."""
+Flicker, warm-up and a 1 Hz filter raise the ratio; slow rocking raises it to 8 if one time is double the other."""
 WHITE: Final = 0.8
 """Noise is white (unfiltered) if successive differences show more than this share of its variance."""
 ROUND: Final = 40.0

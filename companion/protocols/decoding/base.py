@@ -19,7 +19,7 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
 AHEAD_S = 0.5
-"""Largest lead of bytes over the baud rate, s. Beyond it the port has no UART (USB), so a byte's line time is 0."""
+"""If bytes come more than this time, s, before the baud rate permits, the port has no UART (USB): line time is 0."""
 _STALL_S = 10.0
 
 NO_FRAME: Final = 0
@@ -52,7 +52,7 @@ class Decoder(ABC):
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
         self.frame_bytes = self._earlier_bytes = 0
-        """Bytes in all frames of the latest reading; bytes in the reading's frames before its last one."""
+        """Bytes of the latest reading's frames; `_earlier_bytes`: those received before the reading's last frame."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0

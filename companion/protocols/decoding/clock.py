@@ -17,7 +17,7 @@ import msgspec
 from companion.samples import ImuSample, Sample
 
 CREEP: Final = 100e-6
-"""Largest rise of the minimum offset, s/s: two crystals of 50 ppm. A ceramic resonator also needs steps of `STEP_S`."""
+"""Largest drift of the device's clock against the host's, s/s: two crystals of 50 ppm. Resonators: see `STEP_S`."""
 
 STEP_S: Final = 0.005
 """Delay, s. If all samples within `SPAN_S` are delayed by more, the offset between the clocks itself has changed."""
@@ -29,7 +29,7 @@ LATE_S: Final = 1.0
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
-"""Largest relative difference of the two clocks' rates at which a wrap is recognised; a stall may add `_WRAP_S`."""
+"""At a wrap, the times elapsed on the two clocks may differ by this share, plus `_WRAP_S` for a stall of the host."""
 LATE: Final = "late"
 
 

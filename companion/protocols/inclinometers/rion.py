@@ -33,7 +33,7 @@ _LENGTHS: Final[dict[int, frozenset[int]]] = {
     0x94: frozenset(range(10, LONGEST, 5)),
     _ANSWER: frozenset((_ANGLES_LENGTH, _LONG_ANGLES_LENGTH)),
 }
-"""Allowed frame lengths by command byte; of most commands and answers the documents show only that they are short."""
+"""Allowed frame lengths by command byte. For most commands the documents give no length, but show short frames."""
 
 
 class RionDecoder(Decoder):

@@ -105,7 +105,7 @@ def test_sigmas_turn_with_the_board() -> None:
     )
     verdict = judge(seen)
     assert words(verdict) == ["too small to see", "wrong", "too small to see"]
-    assert "INS_GYROFFS_Y: the output moved by -0.001 rad/s, expected 0, noise 1.4e-05:" in verdict.problems[0]
+    assert "INS_GYROFFS_Y: the output changed by -0.001 rad/s, expected 0, noise 1.4e-05:" in verdict.problems[0]
 
 
 def test_what_remains_is_compared_with_the_tolerance() -> None:

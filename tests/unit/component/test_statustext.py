@@ -109,7 +109,7 @@ def sent_to_script(text: str) -> str:
         (Severity.WARNING, "Before flight: reboot PX4: tilt 1.2 deg off", None),
         (
             Severity.WARNING,
-            "The gradienter has moved by 0.31 deg (x +0.25, y -0.18): all accelerometers (fc, own) differ alike",
+            "The gradienter has moved by 0.31 deg (x +0.25, y -0.18): all accelerometers (fc, own) show this change",
             "The gradienter has moved by 0.31 deg",
         ),
         (

@@ -34,9 +34,9 @@ def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
         path.touch()
     alias.symlink_to(quiet)
     found = Survey({str(held): "in use by another program", str(quiet): SILENT}, {14540: "in use", 14550: _nobody()})
-    assert [found.silent(str(path)) for path in (held, quiet, alias, other)] == [False, True, True, False]
-    assert found.silent(str(tmp_path / "gone"))
-    assert not found.silent("tcp://box:4000")
+    assert [found.checked(str(path)) for path in (held, quiet, alias, other)] == [False, True, True, False]
+    assert found.checked(str(tmp_path / "gone"))
+    assert not found.checked("tcp://box:4000")
     urls = (
         "udpin:0.0.0.0:14540",
         "udpin:0.0.0.0:14550",
@@ -44,7 +44,7 @@ def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
         "tcp:box:5760",
         f"serial:{alias}:57600",
     )
-    assert [found.silent_url(url) for url in urls] == [False, True, False, False, True]
+    assert [found.checked_url(url) for url in urls] == [False, True, False, False, True]
 
 
 def _nobody() -> HeardUdp:
