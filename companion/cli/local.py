@@ -26,7 +26,6 @@ from companion.cli.terminal import (
     print_address,
     print_json,
     print_lines,
-    seconds,
     storage_path,
     within,
 )
@@ -68,7 +67,9 @@ def add_commands(commands: Commands, autopilot: Commands) -> None:
     option = add("run", run, "run the daemon in the foreground").add_argument
     option("-v", "--verbose", action="store_true", help="log what happens in detail")
     option = add("check", check, "check configuration, ports, sensors and autopilot").add_argument
-    option("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
+    option(
+        "--seconds", type=within(3.0, 600.0), default=3.0, metavar="S", help="how long to listen (3 to 600; default 3)"
+    )
     option = add("ports", ports, "list the serial ports, and name what is connected (--listen)").add_argument
     words = "listen on these ports and name the devices (default: all free ports), for up to half a minute; sends"
     option("--listen", nargs="*", metavar="PORT", help=f"{words} nothing, but opening a port restarts an Arduino")

@@ -97,7 +97,7 @@ class Devices(Subsystem):
 
     @property
     def not_heard(self) -> str:
-        words = message("autopilot_not_heard", url=self._core.config.mavlink.url)
+        words = self._core.link.fault or message("autopilot_not_heard", url=self._core.config.mavlink.url)
         return ": ".join(filter(None, (words, self.signing.rejecting)))
 
     def load(self) -> None:

@@ -166,6 +166,7 @@ class Interfaces(Subsystem):
             "summary": f"{vehicle.name}, {vehicle.arm_state.value}"
             if vehicle.system_id is not None
             else self._devices.not_heard,
+            "fault": link.fault,
             "heartbeat_age_s": None if age_s is None else round(age_s, 1),
             "messages": link.received.total() - link.received["bad"],
             "bad": link.received["bad"],

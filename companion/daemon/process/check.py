@@ -6,6 +6,7 @@ The check asks a running daemon, which has the ports open; without a daemon it o
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ LOST_S: Final = 5.0
 HEARTBEAT_WITHIN_S: Final = 4.0
 IMUS_MOST_S: Final = 30.0
 """Longest wait until an autopilot's IMUs are known: enough for all retries on a slow line that loses packets."""
+TRIED_BYTES: Final = 2**20  # Size of the file by which the check tries the storage
 TILTS_WITHIN_S: Final = 120.0  # Longest wait for the two tilts of the gradienter's test
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
@@ -164,7 +166,7 @@ async def run_check(
         findings.append(CheckLine("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
     else:
         findings.append(CheckLine("daemon", good=True, words="not running: ports opened by this check"))
-        findings.append(_storage(config.storage.path))
+        findings.append(storage_finding(config.storage.path))
         say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
         # Start a daemon that writes nothing, and use its status after some seconds.
         service = Service(config, only_listening=ONLY_CHECKING)
@@ -175,12 +177,10 @@ async def run_check(
     findings.append(_autopilot(config, vehicle))
     if (signing := vehicle["signing"]) is not None:
         findings.append(CheckLine("signing", good=signing["good"], words=signing["summary"]))
-    findings += [CheckLine(device["name"], device["good"], device["summary"]) for device in status["devices"]]
+    findings += _devices(config, status)
     findings += system_findings(config, list(ours))
     findings += await sensor_findings(config, status, may_listen=not is_running)
     findings += [CheckLine("warning", good=True, words=words) for words in status["warnings"]]
-    ground = status["ground_stations"]
-    findings.append(CheckLine("ground stations", good=ground["good"], words=ground["summary"]))
     for name in ("mqtt", "fleet", *(["page"] if is_running else [])):
         if (face := status[name]) is not None:
             findings.append(CheckLine(name, good=face["good"], words=face["summary"]))
@@ -232,6 +232,17 @@ async def find_law(config: Config, say: Callable[[str], object]) -> tuple[Law, i
     return law_of(test.tilts)
 
 
+def _devices(config: Config, status: Object) -> list[CheckLine]:
+    """List the devices; without a heartbeat leave out all that only an autopilot can show."""
+    names = {imu.name for imu in config.imu if imu.source == "autopilot"}
+    devices, ground = status["devices"], {**status["ground_stations"], "name": "ground stations"}
+    if status["vehicle"]["heartbeat_age_s"] is None:
+        shown = [device for device in devices if device["name"] not in names]
+    else:
+        shown = [*devices, ground]
+    return [CheckLine(one["name"], one["good"], one["summary"]) for one in shown]
+
+
 def _autopilot(config: Config, vehicle: Object) -> CheckLine:
     if (age_s := vehicle["heartbeat_age_s"]) is not None:
         if age_s < LOST_S:
@@ -239,6 +250,8 @@ def _autopilot(config: Config, vehicle: Object) -> CheckLine:
         remedy = "power? cable?"
         words = message("no_heartbeat_for", seconds=f"{age_s:.0f}", remedy=remedy)
         return CheckLine("autopilot", good=False, words=words, remedy=remedy)
+    if (fault := vehicle["fault"]) is not None:
+        return CheckLine("autopilot", good=False, words=fault)
     baud = baud_of(config.mavlink.url)
     needs = "switched on, and sent there (MAVProxy --out, mavlink-router)?"
     if baud is not None:
@@ -275,8 +288,17 @@ async def _heading(config: Config) -> CheckLine:
     return CheckLine("heading", good=reply.get("state") == "applied", words=words)
 
 
-def _storage(directory: Path) -> CheckLine:
+def storage_finding(directory: Path) -> CheckLine:
     place = next(path for path in (directory, *directory.parents) if path.exists())
-    good = place.is_dir() and os.access(place, os.W_OK)
-    words = str(directory) if good else message("path_not_usable", path=directory, reason=f"{place} is not writable")
-    return CheckLine("storage", good, words)
+    if not (place.is_dir() and os.access(place, os.W_OK)):
+        words = message("path_not_usable", path=directory, reason=f"{place} is not writable")
+        return CheckLine("storage", good=False, words=words)
+    try:
+        # A full card shows here, not in the middle of a calibration.
+        with tempfile.NamedTemporaryFile(dir=place) as file:
+            file.write(bytes(TRIED_BYTES))
+            os.fsync(file.fileno())
+    except OSError as error:
+        words = message("path_not_usable", path=directory, reason=error.strerror)
+        return CheckLine("storage", good=False, words=words)
+    return CheckLine("storage", good=True, words=str(directory))

@@ -51,6 +51,7 @@ class MavlinkLink:
         self.dropped = 0
         self.signing: Signing | None = None
         self.autopilot: Sender | None = None
+        self.fault: str | None = None  # Reason why the port or socket is not open; None while it is open
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None

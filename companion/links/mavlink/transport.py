@@ -37,15 +37,20 @@ Peer = tuple[Any, ...]
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
     """Keep `link` connected through `url` until cancelled; raise LinkError for an invalid url."""
     kind, where, number = parse_url(url)
+
+    def note(connected: bool, words: str) -> None:  # noqa: FBT001 - signature of `OnState`
+        link.fault = None if connected else words
+        if on_state is not None:
+            on_state(connected, words)
+
     if kind in ("udpin", "udpout"):
-        await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)
+        await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=note)
         return
     settings = PortSettings(f"tcp://{where}:{number}", 0) if kind == "tcp" else PortSettings(where, number)
 
-    def state(connected: bool, words: str) -> None:  # noqa: FBT001 - ByteLink's own signature
+    def state(connected: bool, words: str) -> None:  # noqa: FBT001 - signature of `OnState`
         link.attach(stream.write if connected else None, stream.settled)
-        if on_state is not None:
-            on_state(connected, words)
+        note(connected, words)
 
     stream = ByteLink(settings, link.receive, name="mavlink", on_state=state, on_turn=link.turn)
     await stream.run()

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from companion.config import parse
 from companion.config.sections import Config
-from companion.daemon.process.check import system_findings
+from companion.daemon.process.check import storage_finding, system_findings
 from companion.links.serial.ports import port_faults, same_ports
 from tests.support.usb_tree import UsbTree
 
@@ -171,3 +173,16 @@ def test_one_port_under_two_names(board: CheckedBoard) -> None:
 def test_a_machine_without_anything(tmp_path: Path) -> None:
     assert port_faults("/dev/ttyUSB0", root=tmp_path) == []
     assert system_findings(config(), [], tmp_path) == []
+
+
+def test_a_full_card_is_found_before_a_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert storage_finding(tmp_path / "new" / "state").verdict == "ok"
+    assert list(tmp_path.iterdir()) == []
+
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    found = storage_finding(tmp_path)
+    assert (found.verdict, found.words) == ("wrong", f"{tmp_path} not usable: No space left on device")
+    assert list(tmp_path.iterdir()) == []
