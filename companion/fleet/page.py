@@ -29,10 +29,11 @@ _CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
 SOURCE: Final = "from the fleet's database"
 _STANDINGS: Final = (
     ("alarm", "not calibrated", "calibrated_at IS NULL"),
-    ("alarm", "held back", "held_back <> ''"),
+    ("alarm", "not written", "held_back <> ''"),
     ("caution", "stale", "calibrated_at < :stale"),
-    ("caution", "armed without one", "armed_state = 'uncalibrated' AND armed_at > calibrated_at"),
+    ("caution", "armed uncalibrated", "armed_state = 'uncalibrated' AND armed_at > calibrated_at"),
     ("caution", "last try failed", "tried_state IN ('failed', 'cancelled') AND tried_reason <> ''"),
+    ("caution", "suspect", "EXISTS (SELECT 1 FROM findings w WHERE w.aircraft = f.aircraft)"),
     ("fine", "calibrated", "1 = 1"),
 )
 """Kind, name and SQL condition of each calibration status, worst first: the first condition that is true counts."""
@@ -54,11 +55,13 @@ def standing(one: Any) -> tuple[str, str, str]:
     kind, word, _ = _STANDINGS[one.standing]
     why = one.tried_reason if one.tried_state in ("failed", "cancelled") else ""
     if word == "not calibrated":
-        why = why or "no calibration stands"
-    elif word == "held back":
-        why = f"contradicts earlier ones, not written: {one.held_back}"
-    elif word == "armed without one":
+        why = why or "no calibration is active"
+    elif word == "not written":
+        why = f"disagrees with history: {one.held_back}"
+    elif word == "armed uncalibrated":
         why = one.armed_reason
+    elif word == "suspect":
+        why = "calibrated; see the findings"
     return kind, word, why
 
 

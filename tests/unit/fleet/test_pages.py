@@ -66,7 +66,7 @@ def test_invented_aircraft_push_no_real_one_from_the_page(
     with store._engine.begin() as connection:
         connection.execute(sa.insert(schema.findings).values(finding))
     first = shown(database)
-    assert "36 aircraft: 30 not calibrated, 1 last try failed, 5 calibrated<" in first
+    assert "36 aircraft: 30 not calibrated, 1 last try failed, 1 suspect, 4 calibrated<" in first
     assert "The 10 with findings, worst and latest heard are listed." in first
     assert len(listed(first)) == 10
     assert {one.id for one in real} < {*listed(first)}
