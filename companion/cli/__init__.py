@@ -23,7 +23,7 @@ from companion.cli.terminal import (
     NO_DAEMON,
     USAGE,
     Command,
-    Commands,
+    CommandGroup,
     DaemonRefusedError,
     Parser,
     how_to_start,
@@ -44,7 +44,7 @@ GROUPS: Final = {
 class _Overview(Parser):
     """Parser of the whole command line; its help lists the commands by group."""
 
-    commands: Commands
+    commands: CommandGroup
 
     def format_help(self) -> str:
         lines = ["companion: field self-calibration of gyro and accelerometer biases", ""]
@@ -99,7 +99,7 @@ def _parser() -> Parser:
 
     parser = _Overview(prog="companion", parents=[common])
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
-    commands = Commands(parser, common, listed=False)
+    commands = CommandGroup(parser, common, listed=False)
     log = commands.group("log", "record, replay, learn a noise profile, judge a flight")
     autopilot = commands.group("autopilot", "arming script, parameters and temperature curves of the autopilot")
     local.add_commands(commands, autopilot)

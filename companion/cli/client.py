@@ -15,7 +15,7 @@ from companion import commands, messages
 from companion.cli import show
 from companion.cli.monitor import FIGURES, monitor
 from companion.cli.terminal import (
-    Commands,
+    CommandGroup,
     DaemonRefusedError,
     add_fields,
     conclude,
@@ -45,7 +45,7 @@ ALIGNMENTS: Final = {
 """Kinds of `companion align`: help, and the fields of the request that each uses."""
 
 
-def add_commands(top: Commands, autopilot: Commands, log: Commands) -> None:
+def add_commands(top: CommandGroup, autopilot: CommandGroup, log: CommandGroup) -> None:
     for to, name, kind, command in (
         (top, "status", commands.Status, status),
         (top, "calibrate", commands.Calibrate, calibrate),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from companion.cli.terminal import (
     DONE,
-    Commands,
+    CommandGroup,
     Parser,
     add_fields,
     conclude,
@@ -41,7 +41,7 @@ _NEEDS_MORE: Final = (
 )
 
 
-def add_ground(commands: Commands) -> None:
+def add_ground(commands: CommandGroup) -> None:
     link = Parser(add_help=False)
     link.add_argument("--url", type=_url, default=DEFAULT_URL, help=f"{URLS} (default {DEFAULT_URL})")
     option, of_byte = link.add_argument, within(1, 255, int)
@@ -123,7 +123,7 @@ def _url(text: str) -> str:
 # --- fleet
 
 
-def add_fleet(commands: Commands) -> None:
+def add_fleet(commands: CommandGroup) -> None:
     add = commands.group("fleet", "collect the reports of many aircraft over MQTT in one database").add
     words = "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
     run = add("run", _run, words)

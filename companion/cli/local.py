@@ -18,7 +18,7 @@ from companion.cli import show
 from companion.cli.terminal import (
     DONE,
     USAGE,
-    Commands,
+    CommandGroup,
     Parser,
     conclude,
     config_path,
@@ -60,7 +60,7 @@ async def setup(options: argparse.Namespace) -> int:
     return await session.setup(options)
 
 
-def add_commands(commands: Commands, autopilot: Commands) -> None:
+def add_commands(commands: CommandGroup, autopilot: CommandGroup) -> None:
     add = commands.add
     words = "find autopilot and sensors, ask for the rest, write the file"
     _add_setup_options(add("setup", setup, words).add_argument)

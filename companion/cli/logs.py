@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from companion.cli import show
-from companion.cli.terminal import Commands, conclude, print_lines, storage_path, within
+from companion.cli.terminal import CommandGroup, conclude, print_lines, storage_path, within
 from companion.errors import ConfigError, StorageError
 from companion.estimation.records.flight_record import (
     HEADS,
@@ -41,7 +41,7 @@ MOST_DIFFERENCES: Final = 20
 MOST_REASONS: Final = 12
 
 
-def add_commands(log: Commands) -> None:
+def add_commands(log: CommandGroup) -> None:
     player = log.add("replay", replay, "calibrate from a recording, or from any log of an IMU at rest")
     player.add_argument(
         "files", nargs="+", type=Path, metavar="FILE",

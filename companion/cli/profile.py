@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from companion.cli.logs import add_table_options, log_lines
-from companion.cli.terminal import Commands, conclude, load_config, print_lines, seconds, storage_path
+from companion.cli.terminal import CommandGroup, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
@@ -28,7 +28,7 @@ LEAST_S: Final = 600  # Minimum time at rest: a profile from less fails its own 
 _UNITS: Final[dict[Triad, tuple[float, str, int]]] = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
-def add_commands(log: Commands) -> None:
+def add_commands(log: CommandGroup) -> None:
     sub = log.add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")

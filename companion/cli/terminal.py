@@ -178,7 +178,7 @@ class Parser(argparse.ArgumentParser):
         raise argparse.ArgumentError(action, f"found {str(value)!r}; {hint}")
 
 
-class Commands:
+class CommandGroup:
     """Commands of one parser, and the options that all of them have."""
 
     def __init__(self, parser: Parser, *parents: Parser, listed: bool = True) -> None:

@@ -162,7 +162,7 @@ class Imu(Section, frozen=True):
 
     @property
     def is_flown(self) -> bool:
-        """Whether the autopilot flies with this IMU."""
+        """True if the autopilot flies with this IMU."""
         return self.source == "autopilot" or self.autopilot_instance is not None
 
 

@@ -1,8 +1,8 @@
 """Replay of a recording through decoders, collector and estimator, in the recorded order and at the recorded times.
 
 Samples are computed again from their raw bytes, and from them batches, stillness, means, pose, biases and sigmas.
-Copied from the recording are times of ticks and windows, parameters of the autopilot, the place, the prediction from
-earlier power-ups, and all that only the autopilot knows, such as the outcome of a write.
+The replay copies from the recording the times of ticks and windows, the autopilot's parameters and the place. It also
+copies the prediction from earlier power-ups, and all that only the autopilot knows, such as the outcome of a write.
 """
 
 from __future__ import annotations

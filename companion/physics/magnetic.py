@@ -44,8 +44,8 @@ def heading_rad(field: Array, up: Array) -> float:
 def heading_by_up(field: Array, up: Array) -> Array:
     """Return the gradient (3,) of `heading_rad` by `up`; in a level aircraft -tan I along magnetic east.
 
-    A tilt error makes the vertical field look horizontal. With the inclination I, the heading turns by tan I times
-    the tilt error about magnetic north (2.5 times at 68 degrees), and tan theta times the tilt error about the heading.
+    A tilt error makes the vertical field look horizontal. A tilt error about magnetic north turns the heading by tan I
+    times itself, with the inclination I (2.5 times at 68 degrees); one about the heading by tan theta times itself.
 
     Raises:
         ValueError: the first axis or the field is vertical: there is no heading.

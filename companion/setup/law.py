@@ -1,8 +1,8 @@
 """Guided test of a gradienter: two opposite tilts show the law of its readings, and how it is turned.
 
-The autopilot's accelerometers measure both tilts. The size of gravity gives their biases in the plane of the two tilts,
-and half the difference of the tilts is free of the remaining bias and of the gradienter's zero. At 20 deg of pitch and
-roll the laws differ by 1.2 deg (companion/physics/gradienter.py).
+The autopilot's accelerometers measure both tilts. The size of gravity gives their biases in the plane of the two tilts.
+Half the difference of the tilts is free of the remaining bias and of the gradienter's zero. At 20 deg of pitch and roll
+the laws differ by 1.2 deg (companion/physics/gradienter.py).
 """
 
 from __future__ import annotations
