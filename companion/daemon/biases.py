@@ -121,7 +121,7 @@ class BiasMemory:
     # --- before a result is used
 
     def with_offsets(self, solution: Solution) -> Solution:
-        """Return the solution with the autopilot's offsets entered; raise AutopilotError if they are unknown."""
+        """Return the solution with the offsets of the autopilot's IMUs; raise AutopilotError if they are unknown."""
         imus = tuple(
             dataclasses.replace(imu, subtracted=self._imus[imu.name].in_force.subtracted(imu.temperature_degc))
             if imu.name in self._imus

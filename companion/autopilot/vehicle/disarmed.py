@@ -63,7 +63,7 @@ class DisarmedProof:
         self._answered_s = self._proven_s = -math.inf
 
     def awake(self, now_s: float) -> bool:
-        """Note that our event loop runs; return False after a long pause, which voids all earlier questions."""
+        """Note that our event loop runs; False after a long pause: earlier questions no longer count."""
         paused = now_s - self._awake_s > LONGEST_PAUSE_S
         if paused:
             self._asked_s.clear()

@@ -169,7 +169,7 @@ def without(found: ImuSolution, triads: Collection[Triad]) -> ImuSolution:
 
 
 def residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> Residual:
-    """Return the error left in our own IMU's output after an autopilot using this IMU subtracts its present offsets."""
+    """Return the error that the autopilot sees of the companion's own IMU after subtracting its present offsets."""
     rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
     gyro = accel = None
     if found.gyro_rad_s is not None:

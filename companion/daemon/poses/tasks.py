@@ -190,7 +190,7 @@ class ZeroTask(SamePlaceTask):
 
 
 class TurnTask(SamePlaceTask):
-    """Measures the level aircraft's accelerometer biases and the ground's slope; after six positions, board tilt."""
+    """Measures accelerometer biases and the ground's slope; after a six-position calibration also the board's tilt."""
 
     def __init__(
         self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: ActiveSixPosition

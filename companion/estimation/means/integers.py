@@ -213,7 +213,7 @@ def integer_columns(
 
 
 def _borrowed(own: Fit, pooled: Floats) -> Floats:
-    """Return the noise (c,) of axes that show only two integers: median sigma of the triad's other axes; else NaN."""
+    """Return noise (c,): the other axes' median for an axis that toggles between two integers, else NaN."""
     result = np.full(len(own.mean), np.nan)
     enough = ~own.identified & (pooled.sum(axis=0) - pooled.max(axis=0) >= MIN_BEYOND_TWO)
     for triad in (slice(start, start + 3) for start in range(0, len(result), 3)):

@@ -320,7 +320,7 @@ class _Fit:
         return self._first_bias - predicted, variance + self._first_variance + scatter
 
     def _by_others(self, scatter: float, rows: Floats) -> tuple[Floats, Floats]:
-        """Predict each power-up's bias (n, 3) from all others, and the variance (n,); `rows`: its polynomial terms."""
+        """Return each power-up's bias, predicted from all others, (n, 3), and the predictions' variance (n,)."""
         _, normal, right = self._equations(scatter)
         others = np.concatenate([rows[:, :, None], right.sum(axis=0) - right], axis=2)
         solved = rows[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)

@@ -38,7 +38,7 @@ from companion.samples import Triad, Vector
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
-"""Least effect of the attitude on an accelerometer bias that causes a warning; a wheel on a stone causes less."""
+"""Least effect of the attitude on an accelerometer bias for a warning; a wheel on a stone has a smaller effect."""
 _SIGMAS: Final = 2.0
 _PRIORS: Final = Priors()
 GATE_SIGMAS: Final = 4.0

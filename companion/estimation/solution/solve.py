@@ -318,7 +318,7 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
-    """Return the Earth's rate in the gyro means, (3,): the whole rate, or the share that remains on a turning deck."""
+    """Return the Earth's rate contained in the gyro means, (3,): whole on ground, averaged on a turning deck."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)

@@ -116,7 +116,7 @@ def by_compass(headings: Sequence[Batch]) -> Turn | None:
 
 
 def by_gyros(turns: Sequence[Turn]) -> Turn | None:
-    """Return the most precise of several IMUs' rates; if others contradict it, that with the fewest sigmas of turn."""
+    """Return the most precise of several IMUs' rates; if others contradict it, the least significant one."""
     if not turns:
         return None
     best = min(turns, key=lambda one: one.sigma_rad_s)
