@@ -109,7 +109,8 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
         async for reply in ask(load_config(options).control.path, wanted):
             silent.cancel()
             if reply["kind"] == "progress":
-                progress.show(reply["percent"], f"{reply.get('word', reply['state'])}: {reply['text']}")
+                words = ": ".join(filter(None, (reply.get("word", reply["state"]), reply["text"])))
+                progress.show(reply["percent"], words)
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:
             raise

@@ -134,7 +134,8 @@ class Automatic:
             if result.outcome == "done" and job.undid_calibration:
                 self._stop("undone")
         elif job.kind in NO_CALIBRATION:
-            return
+            if result.outcome == "cancelled":  # whoever cancels an alignment has the aircraft in hand, in any pose
+                self._next_s = max(self._next_s, now_s + SPACING_S)
         elif not job.automatic:
             self.stopped, self._failures, self._next_s = None, 0, now_s + SPACING_S
         else:

@@ -301,7 +301,7 @@ class SixPositionTask(PoseTask):
         found = self._by_imu[imu.name]
         up = self._face(imu)[0] - found.figures[BIAS]
         again = seen_before(found, up / np.linalg.norm(up), self._imus[imu.name].in_force.orientation)
-        return pose, None if again is None else f"same pose as pose {again + 1}: {self._missing.words}"
+        return pose, None if again is None else f"not counted, same pose as pose {again + 1}; now {self._missing.words}"
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         before, self._by_imu, self._missing = self._by_imu, {}, None

@@ -28,7 +28,8 @@ function headline(tone, word, reason) {
   $("head").dataset.tone = tone;
   document.querySelector("#word use").setAttribute("href", "#" + tone);
   const span = document.querySelector("#word span");
-  if (span.textContent !== word) span.textContent = word;
+  const whole = word.replace(" %", "\u00a0%");
+  if (span.textContent !== whole) span.textContent = whole;
   if ($("reason").textContent !== reason) $("reason").textContent = reason;
   document.title = word + " – companion";
   document.body.classList.toggle("gone", tone === "gone");
@@ -43,7 +44,9 @@ function show(status) {
   busy = status.progress !== null;
   const away = !["disarmed", undefined].includes(status.vehicle.armed);
   $("head").classList.toggle("armed", status.headline.word === "ARMED");
-  document.body.classList.toggle("aligning", status.stands !== null && status.stands.outcome === null);
+  const aligns = status.stands !== null && status.stands.outcome === null;
+  if (aligns && !document.body.classList.contains("aligning")) scrollTo(0, 0);
+  document.body.classList.toggle("aligning", aligns);
   $("progress").hidden = !busy;
   if (busy) document.querySelector("#progress div").style.width = status.progress + "%";
   quality(status);

@@ -69,6 +69,7 @@ function stands(found) {
   $("stands").hidden = found === null;
   if (found === null) return;
   const running = found.outcome === null, [first, unknown] = found.wish.split(/: (.*)/), [wish, grip] = first.split(/, (.*)/);
+  if (found.share > 0) $("still").textContent = "";
   $("share").style.strokeDasharray = `${100 * found.share} 100`;
   $("result").textContent = running ? "" : found.words;
   const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, found.outcome]);
@@ -79,7 +80,7 @@ function stands(found) {
   $("stands").dataset.outcome = found.outcome || "";
   $("wish").textContent = wish;
   $("grip").textContent = grip || "";
-  $("still").textContent = found.objection || "";
+  $("still").textContent = found.share > 0 ? "" : found.objection || "";
   $("unknowns").textContent = found.unknown.length ? "not known yet: " + found.unknown.join(", ") : unknown || "";
   $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
   const left = Math.max(found.total - found.done.length, 0);
