@@ -28,8 +28,6 @@ from companion.formats import Object
 from companion.links.system.connection import ask
 
 SILENT_S: Final = 2.0  # Silence after which the command reports that it waits for an answer
-
-
 CANCEL: Final = {"command": "cancel"}
 ALIGNMENTS: Final = {
     "zero": ("the gradienter's zero, by turning it on one place", ("headings", "timeout_s")),

@@ -120,6 +120,8 @@ class _Session:
         }
         given = {key: words for key, words in asked.items() if words is not None}
         _refuse_wrong(given)
+        if self._options.mavlink is not None:
+            Draft(drafting.sample(), is_new=True).take_url(self._options.mavlink)
         found = await self._listen(draft)
         while not await self._take_autopilot(draft, found):
             found = await self._listen(draft)
