@@ -31,7 +31,7 @@ SILENT_S: Final = 2.0  # Silence after which the command reports that it waits f
 CANCEL: Final = {"command": "cancel"}
 ALIGNMENTS: Final = {
     "zero": ("the gradienter's zero, by turning it on one place", ("headings", "timeout_s")),
-    "tilts": ("the zero, and the accelerometers' scale on four tilts", ("timeout_s",)),
+    "tilts": ("the zero, and the accelerometers' scale on four tilts", ("headings", "timeout_s")),
     "turn": (
         "accelerometers without a gradienter, by turning on one place",
         ("headings", "level", "write", "timeout_s"),

@@ -40,9 +40,12 @@ def record_lines(record: Object) -> list[str]:
     for imu in record["imus"]:
         lines += _imu_lines(imu)
     lines += [f"warning: {warning}" for warning in record["warnings"]]
-    written = sum(len(imu["written"]) for imu in record["imus"])
-    done = f"{written} parameters written to the autopilot; to restore them: companion undo"
-    return [*lines, done if written and record["state"] == "done" else "Nothing was changed on the autopilot."]
+    outcomes = [one["outcome"] for imu in record["imus"] for one in imu["written"].values()]
+    if "failed" in outcomes:
+        return [*lines, "Some parameters may hold neither the old nor the new value: companion status"]
+    if not outcomes or set(outcomes) == {"rolled_back"}:
+        return [*lines, "The autopilot has its old values."]
+    return [*lines, f"{len(outcomes)} parameters written to the autopilot; to restore them: companion undo"]
 
 
 def _magnetic_lines(magnetic: Object | None) -> list[str]:

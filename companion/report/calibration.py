@@ -143,7 +143,10 @@ def _warnings(record: Record) -> Markup | None:
     more = len(found) - MAX_WARNINGS
     return join(
         tag("h2", "Warnings"),
-        *(card("caution", tag("p", words), tag("p", remedy(words), class_="soft")) for words in found[:MAX_WARNINGS]),
+        *(
+            card("caution", tag("p", words), tag("p", advice, class_="soft") if (advice := remedy(words)) else None)
+            for words in found[:MAX_WARNINGS]
+        ),
         card("caution", f"{more} more warnings are not shown.") if more > 0 else None,
     )
 
@@ -162,7 +165,9 @@ def _imu(imu: ImuRecord) -> Markup:
         if names
         else None,
         card("caution", f"Held back: {held} measured, not written.") if held else None,
-        tag("table", tag("tr", *(tag("th", words) for words in ["", *heads])), *(row(*line) for line in cells)),
+        tag("table", tag("tr", *(tag("th", words) for words in ["", *heads])), *(row(*line) for line in cells))
+        if found
+        else None,
         tag("details", tag("summary", "Noise and change"), *(_details(imu, triad) for triad in found))
         if found
         else None,

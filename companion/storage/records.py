@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Final, Generic, TypeVar
@@ -160,29 +160,37 @@ def armings_in(directory: Path) -> BoundedList[ArmingRecord]:
 
 
 def stored_history(directory: Path, limit: int | None) -> Object:
-    """Read what `companion history` shows, the newest first; `in_force` of alignments is unknown without the autopilot.
+    """Read what `companion history` shows, the newest first, without files and folders that cannot be read.
 
-    Raises:
-        StorageError: a folder or file cannot be read.
+    `in_force` of alignments is unknown without the autopilot.
     """
-    armings = armings_in(directory).all()[::-1]
+    armings = _readable(armings_in(directory).all)[::-1]
     by_calibration: dict[str | None, list[ArmingRecord]] = {}
     for arming in reversed(armings):
         by_calibration.setdefault(arming.calibration, []).append(arming)
-    records = RecordStore(directory).newest(limit)
+    records = dict(_readable(lambda: list(RecordStore(directory).newest(limit).items())))
     shown = [
         msgspec.structs.replace(record, armings=tuple(by_calibration.get(record.started_at, ())))
         for record in records.values()
     ]
-    flights = FlightStore(directory).newest(limit)
+    flights = _readable(lambda: list(FlightStore(directory).newest(limit).items()))
+    by_hand = _readable(alignments_in(directory).all)[::-1][:limit]
     return {
         "numbers": list(records),
         "records": msgspec.to_builtins(shown),
         "armings": msgspec.to_builtins(armings[:limit]),
-        "by_hand": [{**msgspec.to_builtins(done), "in_force": None} for done in alignments_in(directory).all()[::-1]],
-        "interrupted": msgspec.to_builtins(interruptions_in(directory).all()[::-1][:limit]),
-        "flights": [msgspec.to_builtins(kept) | {"number": number} for number, kept in flights.items()],
+        "by_hand": [{**msgspec.to_builtins(done), "in_force": None} for done in by_hand],
+        "interrupted": msgspec.to_builtins(_readable(interruptions_in(directory).all)[::-1][:limit]),
+        "flights": [msgspec.to_builtins(kept) | {"number": number} for number, kept in flights],
     }
+
+
+def _readable(read: Callable[[], list[T]]) -> list[T]:
+    try:
+        return read()
+    except StorageError as error:
+        logger.warning("%s", error)
+        return []
 
 
 BIASES_VERSION: Final = 2

@@ -216,14 +216,16 @@ async def find_law(config: Config, say: Callable[[str], object]) -> tuple[Law, i
     Raises:
         CalibrationRefusedError: the tilts did not come in time, or no law explains them.
     """
-    service, test = Service(config, only_listening=ONLY_CHECKING), TiltTest(say)
+    alone = msgspec.structs.replace(config, mqtt=None, web=None)
+    service, test = Service(alone, only_listening=ONLY_CHECKING), TiltTest(say)
 
     def goes_on(listened_s: float) -> bool:
         collector = service.core.collector
-        imus, second = collector.imu_seconds(), collector.tilt_second()
-        force = next((imus[imu.name].mean[3:] for imu in config.imu if imu.is_flown and imu.name in imus), None)
-        if force is not None and second is not None:
-            test.add(second.slot, Tilt(second.mean[:2], force))
+        tilt, imus = collector.tilt_second(), collector.imu_seconds()
+        # Only the autopilot's samples are in the vehicle's axes, whatever the mountings.
+        seconds = [imus[imu.name] for imu in config.imu if imu.source == "autopilot" and imu.name in imus]
+        if tilt is not None and seconds and seconds[0].slot == tilt.slot:
+            test.add(tilt.slot, Tilt(tilt.mean[:2], seconds[0].mean[3:]))
         return not test.complete and listened_s < TILTS_WITHIN_S
 
     await service.listen(goes_on)
