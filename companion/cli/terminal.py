@@ -117,7 +117,6 @@ class _Removed(argparse.Action):
 
 MEANT: Final = {
     "monitor": "status --watch",
-    "watch": "status --watch",
     "web-token": "page",
     "install-service": "service install",
     "uninstall-service": "service remove",
@@ -133,7 +132,6 @@ MEANT: Final = {
     "doctor": "check",
     "test": "check",
     "restore": "undo",
-    "install": "service install",
 }
 """Commands by their names before 0.3, and by names that people try."""
 _NEAR: Final = 0.75  # Least ratio of `difflib` at which a word counts as misspelt

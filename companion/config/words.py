@@ -22,22 +22,12 @@ KEYS: Final[dict[str, str]] = {
 }
 """Removed configuration keys ("imu.port" for "imu[0].port"), each with the version that removed it and the remedy."""
 
-_RECORD: Final = "0.2: record where a gradienter or a boat is (companion log record), and replay that"
 _PROXY: Final = "0.2: put a web server with https before the page, as docs/fleet.md shows (The page)"
 COMMAND_LINE: Final[dict[str, str]] = {
     "companion align --show": "0.3: type companion align show",
     "companion align --forget": "0.3: type companion align forget",
-    "companion service install --dry-run": "0.2: install below a folder with --root to see the files",
-    "companion service remove --dry-run": "0.2: each removed file is printed",
-    "companion log flight --fetch": "0.2: download the log with your ground station, then companion log flight LOG",
-    "companion log flight --offsets": "0.2: companion log flight LOG compares with the offsets before the calibration",
     "companion report --flight": "0.2: companion log flight LOG prints all of it, companion history a line per flight",
-    "companion log replay --platform": _RECORD,
-    "companion log replay --law": _RECORD,
-    "companion log replay --tilt-lag": _RECORD,
-    "companion log replay --longitude-deg": _RECORD,
     "companion ground params": "0.2: set CMP_ parameters in the parameter list of a ground station program",
-    "companion log profile --warm-up": "0.2: leave it out (each IMU's temperature curve is learned in service)",
     "companion fleet run --cert": _PROXY,
     "companion fleet run --key": _PROXY,
     "companion fleet acl emqx": "0.2: give other brokers the rights that companion fleet acl mosquitto lists",
