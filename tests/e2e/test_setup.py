@@ -291,6 +291,7 @@ def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> 
     [
         ([], "no autopilot was heard"),
         (["--mavlink", "udpin:nowhere"], "'mavlink.url': found 'udpin:nowhere'"),
+        (["--mavlink", "udpin:0.0.0.0:14550", "--law", "round"], "gradienter.law: found 'round'"),
         (["--mavlink", "udpin:0.0.0.0:14550", "--law", "axis"], "gradienter.law: there is no such device"),
         (["--mavlink", "udpin:0.0.0.0:14550", "--mounting", "hat=90"], "--mounting: found 'hat=90'"),
         (["--mavlink", "udpin:0.0.0.0:14550", "--part", "fc=mpu6000", "--no-check"], "imu.fc.profile: found 'mpu6000'"),
@@ -304,6 +305,23 @@ def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[s
         assert reason in told.splitlines()[-1]
         assert told.splitlines()[-1].endswith("nothing was written")
         assert made.left() == set()
+
+    asyncio.run(main())
+
+
+def test_a_law_that_nothing_tells_is_not_guessed(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made:
+            code, _, told = await by_script(made, *made.words("gradienter"), "--no-check")
+            assert code == 2
+            assert "inclinometer_xy does not tell; name it by --law" in told.splitlines()[-1]
+            assert made.left() == set()
+        async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
+            await terminal.answer("on the ground", "?")
+            await terminal.says("a boat, a dock")
+            await terminal.answer("", "boat")
+            await terminal.answer("axis, slope, euler or test")
+            await terminal.says("found ''; allowed: axis, slope, euler, test")
 
     asyncio.run(main())
 
