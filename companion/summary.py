@@ -18,6 +18,13 @@ def headline(status: Object) -> str:
     return f"{status['headline']['word']}: {status['headline']['reason']}"
 
 
+def remedy(status: Object) -> str:
+    """Return the remedy for the headline; empty if it asks for nothing."""
+    headline = status["headline"]
+    found = messages.explain(headline["reason"]) if headline["tone"] in ("bad", "wait") else None
+    return "" if found is None else found[1].remedy
+
+
 def rows(status: Object) -> list[StatusRow]:
     """List the rows of a daemon's status: first autopilot and devices, then connections, problems and warnings."""
     vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]

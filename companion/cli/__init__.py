@@ -89,7 +89,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
         print_json({"state": state, "reason": reason})
 
 
-def _parser() -> Parser:
+def _parser() -> _Overview:
     from companion.cli import client, ground, local, logs, profile
 
     # -c and --json may precede or follow the subcommand. SUPPRESS: the later parser must not reset them to defaults.

@@ -86,6 +86,7 @@ def message(identifier: str, **fields: object) -> str:
     return catalogue()[identifier].text.format_map(fields)
 
 
+@functools.lru_cache(maxsize=256)  # a search takes milliseconds, and the same lines are shown again and again
 def explain(line: str) -> tuple[str, Entry] | None:
     """Find the message that a line of text contains, the longest one if it contains several; None: there is none."""
     shown = [(letters, identifier) for letters, identifier, pattern in _patterns() if pattern.search(line[:_LONGEST])]

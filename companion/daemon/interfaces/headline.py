@@ -16,7 +16,7 @@ from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.estimation.machine import State
 from companion.formats import Object
-from companion.messages import explain, message
+from companion.messages import message
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
@@ -41,9 +41,7 @@ class Headlines:
         concern = devices.watch.implausible() or devices.signing.warning or self._heading.concern
         if concern is not None and (good or word == ARMED):
             reason, tone = f"{concern}; {reason}", "wait" if good else tone
-        found = explain(reason) if tone in ("bad", "wait") else None
-        remedy = "" if found is None else found[1].remedy
-        return {"word": word, "reason": reason, "tone": tone, "remedy": remedy}
+        return {"word": word, "reason": reason, "tone": tone}
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()

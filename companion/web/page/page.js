@@ -36,8 +36,8 @@ function headline(tone, word, reason) {
 }
 function show(status) {
   headline(status.headline.tone, status.headline.word, status.headline.reason);
-  $("remedy").hidden = !status.headline.remedy;
-  $("remedy").textContent = (status.headline.remedy || "").replaceAll("`", "");
+  $("remedy").hidden = !status.remedy;
+  $("remedy").textContent = (status.remedy || "").replaceAll("`", "");
   firstRun(status.setup || null);
   if (status.setup) return;
   $("vehicle").textContent = status.vehicle.summary;
