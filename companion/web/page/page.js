@@ -225,7 +225,12 @@ function listen() {
   source = new EventSource("/events" + (token ? "?token=" + encodeURIComponent(token) : ""));
   source.addEventListener("hello", event => {
     const hello = JSON.parse(event.data);
-    if (page !== null && page !== hello.page) location.reload();
+    if (page !== null && page !== hello.page) {
+      // Nothing more is shown before the reload: it would drop the finger of a button that seems alive.
+      source.close();
+      location.reload();
+      return;
+    }
     page = hello.page;
     handedOut = hello.token !== null;
     if (handedOut) token = hello.token;
