@@ -176,11 +176,13 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
 
 # --- of an unknown part
 
-_FLOOR_MEDIAN: Final = 0.2  # Allan floor A over N, 1 / sqrt(s): 0.06 to 0.42 in the catalogue
-_FLOOR_SPREAD: Final = math.log(2.0)
+_FLOOR_MEDIAN: Final = 0.25
+"""Allan floor A over white noise N, 1 / sqrt(s): 0.06 to 0.42 in the catalogue, 0.05 to 0.5 in recordings of others."""
+_FLOOR_SPREAD: Final = math.log(2.5)
 _FLOOR_RATIOS: Final = np.geomspace(0.03, 3.0, 21)
 _TINY: Final = 1e-30  # (rad/s)^2 or (m/s^2)^2: less than any noise, for readings that never change
-_WALKS_S: Final = np.array([30.0, 100.0, 300.0, 1000.0])  # Averaging times at which the walk reaches the floor
+_WALKS_S: Final = np.array([100.0, 300.0, 1000.0])
+"""Averaging times at which the walk reaches the floor; six gyros of an ADIS16405: 106 to 280 s."""
 
 
 def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, Floats]:
@@ -193,7 +195,7 @@ def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tu
     ratio2, walk_s = (each.ravel() for each in np.meshgrid(np.square(_FLOOR_RATIOS), _WALKS_S))
     log_weight = -0.5 * np.square((np.log(ratio2) / 2.0 - math.log(_FLOOR_MEDIAN)) / _FLOOR_SPREAD)
     length, span = int(slots[-1] - slots[0]) + 1, 2
-    while span <= length // _LONGEST_SHARE:
+    while 2 * span <= length:
         variance, freedom = allan_variance(slots, values, span)
         if freedom > 0.0:
             model = 1.0 / span + ratio2 * (1.0 + span / walk_s)

@@ -76,8 +76,8 @@ def test_the_robust_mean_forgets_a_knock_that_hubers_feels() -> None:
 def test_the_limit_of_a_slope_in_a_short_window_is_students(count: int) -> None:
     from scipy import stats
 
-    assert slope_limit(count) == pytest.approx(stats.t.isf(0.5e-4, count - 2), rel=0.03)
-    assert slope_limit(60) == 5.0
+    assert slope_limit(count) == pytest.approx(stats.t.isf(0.5e-5, count - 2), rel=0.04)
+    assert slope_limit(60) == 6.0
 
 
 def test_chance_seldom_makes_a_slope_of_ten_seconds() -> None:
