@@ -58,7 +58,7 @@ def _wrong(name: str, words: str) -> StatusRow:
 def _counts(device: Object) -> str:
     words = {
         "bad frames": sum((device.get("rejected") or {}).values()),
-        "lost": device.get("lost"),
+        "samples lost": device.get("lost"),
         "repeated": (device.get("dropped") or {}).get("repeated"),
         "too late": device.get("too_late"),
         "restarts": device.get("restarts"),

@@ -105,6 +105,7 @@ def parser() -> argparse.ArgumentParser:
     for name, text in FIRMWARE_COMMANDS.items():
         commands.add_parser(name, help=text)
     commands.add_parser("fly", help="a real firmware flies with our heading, and something fails")
+    commands.add_parser("recordings", help="is sigma honest on recordings of real sensors at rest")
     commands.add_parser("rest", help="a log of an IMU at rest for hours, to try `companion log profile` with")
     accuracy.add_options(commands.add_parser("accuracy", help=accuracy.HELP))
     return top

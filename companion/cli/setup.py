@@ -134,8 +134,9 @@ class _Session:
             told = {one["imu"]: one["name"] for one in daemon.get("profiles", ()) if one["by_device_id"]}
         elif not self._options.no_check:
             told = await _ask_autopilot(self.asking, draft, by_default=is_new)
-        names = [imu["name"] for imu in draft.wanted["imu"]]
-        to_ask = [name for name in names if told.get(name) is None or name in parts]
+        # A protocol that a maker uses for one product only tells the part, whose noise is learned at rest.
+        names = [imu["name"] for imu in draft.wanted["imu"] if imu.get("protocol", "imu_line") == "imu_line"]
+        to_ask = [*(name for name in names if told.get(name) is None), *(parts.keys() - set(names))]
         given = {part_key(name): part for name, part in parts.items()}
         await self._ask(draft, draft.part_questions(to_ask), given)
         draft.parsed()
@@ -187,7 +188,7 @@ class _Session:
 
         found = await survey(ports, udp, tell, draft.lines)
         if not self.asking.yes and options.page is None:
-            self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
+            self.asking.say("", "Enter takes the answer in [brackets], ? explains, Ctrl-C ends and writes nothing.")
         return found
 
     async def _take_autopilot(self, draft: Draft, found: Survey) -> bool:
@@ -314,7 +315,7 @@ class _Session:
             self._measured = {LAW_KEY, "gradienter.mounting"}
             draft.put_law(law)
             draft.put_mounting("gradienter", str(yaw_deg))
-            self.asking.say(f"  The gradienter reads {law}, and is turned by {yaw_deg} deg.")
+            self.asking.say(f"  The gradienter reads {law}, and is turned by {yaw_deg} deg. Put it back level.")
             return
 
     def _write(self, text: str) -> None:

@@ -200,7 +200,7 @@ def _bias_lines(calibration: Object | None) -> list[str]:
 
 def _held_back(imu: Object, triad: str) -> str:
     if triad in imu.get("unchanged", ()):
-        return "  already correct: not written"
+        return "  not written: the old offsets agree within sigma"
     return "  held back: not written" if triad in imu.get("held_back", ()) else ""
 
 

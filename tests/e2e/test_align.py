@@ -29,7 +29,7 @@ TARGET_MG = 0.25
 
 
 def rig(folder: Path, *, seed: int = 1, placement_deg: float = 0.02, **more: Any) -> tuple[Rig, Hands]:
-    made = Rig(folder, pose=SPOT, seed=seed, **({"imu_rate_hz": 10.0} | more))
+    made = Rig(folder, seed=seed, **({"pose": SPOT, "imu_rate_hz": 10.0} | more))
     made.config = replaced(made.config, gradienter={"sigma_deg": 0.1})
     made.devices["gradienter"] = Gradienter(made.aircraft, seed=seed, law="slope", offset_deg=ZERO_DEG)
     made.devices["compass"] = HMR3300(made.aircraft, seed=seed, heading_error_deg=0.7)
@@ -93,6 +93,19 @@ async def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path
         assert sigma_mg <= TARGET_MG
         assert off_mg < 2.5 * sigma_mg
         assert made.service.status()["alignment"]["in_force"] is True
+
+
+async def test_a_zero_from_a_slope_does_not_replace_a_better_one(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, pose=Pose(pitch_deg=4.0, roll_deg=-4.0, heading_deg=40.0))
+    made.config = replaced(made.config, gradienter={"sigma_deg": 0.01})
+    made.devices["gradienter"] = Gradienter(made.aircraft, seed=1, law="slope")
+    async with made.running():
+        await made.ready()
+        result = await aligned(made, hands)
+        assert result.outcome == "failed", result
+        assert "the active zero agrees and has 0.010: kept" in result.reason
+        assert made.service.calibrating.alignment.record is None
+        assert any("it slopes by 5.7 degrees" in words for words in made.ground.texts())
 
 
 async def moved(rig: Rig, hands: Hands, job: Job, stand: int, degrees: float) -> None:

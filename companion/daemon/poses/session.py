@@ -44,8 +44,7 @@ STAND_S: Final = 12.0
 SETTLE_S: Final = 1.0
 STOP_WITHIN_DEG: Final = 5.0
 """Remaining angle at which the operator is asked to stop: the next sample would come this close to the target."""
-TURNS_DEG: Final = 2.0
-"""Minimum turn within a second that counts as turning."""
+TURNS_DEG: Final = 2.0  # Minimum turn within a second that counts as turning
 EARLY_S: Final = 3.0
 """Time at rest after which a movement counts as too early; earlier ones count as setting the aircraft down."""
 STILL_MOVING_S: Final = 20.0

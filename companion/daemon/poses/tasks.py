@@ -10,6 +10,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import changes_for, whole_accelerometer
 from companion.autopilot.parameters.change import Change
+from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -38,13 +39,11 @@ from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
 
 LEAST_POSES: Final = 3
-READING_SIGMA_DEG: Final = 0.005
-"""Noise of one mean of a gradienter, one sigma (docs/reference/method.md section 3.4, table)."""
+READING_SIGMA_DEG: Final = 0.005  # Noise of one mean of a gradienter (docs/reference/method.md section 3.4, table)
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 EXPECTED: Final = 12  # Usual number of poses in a six-position alignment
-MOST: Final = 24
-"""Maximum number of poses in a six-position alignment."""
+MOST: Final = 24  # Maximum
 _FIRST: Final = PoseRequest("any side down, propped up, hands off")
 TURN_LIMITED_M_S2: Final = 0.5 * MG
 """Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""
@@ -137,6 +136,8 @@ class ZeroTask(SamePlaceTask):
         else:
             heading_deg = vehicle_heading_rad(self._compass, now.heading.heading_deg, up) / DEG
             pose = HeldPose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
+        if not state.poses and (slope_deg := math.degrees(math.acos(-up[2]))) > SLOPE_WARNING_DEG:
+            self._core.say(Severity.WARNING, f"Take flatter ground: it slopes by {slope_deg:.1f} degrees")
         return pose, objection(self.request, state.poses, pose)
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
@@ -152,8 +153,7 @@ class ZeroTask(SamePlaceTask):
         assert settings is not None
         if result.slope_deg > SLOPE_WARNING_DEG:
             log.warnings.append(
-                f"the spot slopes by {result.slope_deg:.1f} deg, so that each degree of heading error counts: a flatter"
-                " one gives a better zero"
+                f"the spot slopes by {result.slope_deg:.1f} deg: heading errors widen sigma, use one below 1.5 deg"
             )
         largest_deg, usual_deg = float(np.abs(result.offset_deg).max()), self._gradienter.sigma_deg
         if largest_deg > OFFSET_WARNING_SIGMAS * usual_deg:
@@ -182,6 +182,12 @@ class ZeroTask(SamePlaceTask):
 
     async def keep(self, record: HandRecord) -> None:
         assert isinstance(record, AlignmentRecord)
+        used = self._kept.used
+        zero_deg, sigma_deg = (used.offset_deg, used.sigma_deg) if used else ((0.0, 0.0), self._gradienter.sigma_deg)
+        apart_deg = max(abs(new - old) for new, old in zip(record.offset_deg, zero_deg, strict=True))
+        if record.kind == "zero" and sigma_deg < record.sigma_deg and apart_deg < 2.0 * record.sigma_deg:
+            words = f"sigma {record.sigma_deg:.3f} deg; the active zero agrees and has {sigma_deg:.3f}: kept"
+            raise CalibrationRefusedError(words)
         await self._kept.keep(record)
 
     def summary(self) -> str:

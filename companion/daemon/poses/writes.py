@@ -35,12 +35,10 @@ from companion.physics.frames import Array, Matrix
 from companion.storage.changes import Origin
 
 MOST_DEG: Final = 10.0
-SEEN_DEG: Final = 0.1
-"""Smallest step that is visible in an autopilot's attitude, which wanders by hundredths of a degree."""
+SEEN_DEG: Final = 0.1  # Smallest step that is visible in an autopilot's attitude, which wanders by hundredths
 SEEN_SHARE: Final = 0.2
 WITHIN_S: Final = 15.0
-USED_AFTER_S: Final = 1.5
-"""Time until written parameters are in use: both firmwares read them once a second."""
+USED_AFTER_S: Final = 1.5  # Time until written parameters are in use: both firmwares read them once a second
 LATEST_S: Final = 4.0
 """Largest age of attitude messages used: a busy link delays messages by seconds, but old estimates have wandered."""
 POLL_S: Final = 0.25

@@ -44,8 +44,7 @@ RAW_BATCHES: Final = 10  # Least seconds of floats, beside integers, that show t
 RAW_STEP: Final = 1e-5  # Rounding of the floats beside integers: five decimals, rad/s and m/s^2
 SPOT_WALK: Final = np.repeat([0.0, 0.05 * MG], 3)
 """Random walk (6,) of an unknown IMU by tilt of the ground and temperature, unit / sqrt(s), beside the IMU's own walk.
-No window shows it in advance. On benches it was 0.013 (Movella DOT), 0.03 (VN-100), 0.05 (MPU6050) mg / sqrt(s) on the
-horizontal axes; this is the rms of a log-normal fit to these three."""
+No window shows it in advance. Rms of a log-normal fit to 0.013 (Movella DOT), 0.03 (VN-100), 0.05 (MPU6050)."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95

@@ -181,8 +181,7 @@ _FLOOR_MEDIAN: Final = 0.25
 _FLOOR_SPREAD: Final = math.log(2.5)
 _FLOOR_RATIOS: Final = np.geomspace(0.03, 3.0, 21)
 _TINY: Final = 1e-30  # (rad/s)^2 or (m/s^2)^2: less than any noise, for readings that never change
-_WALKS_S: Final = np.array([100.0, 300.0, 1000.0])
-"""Averaging times at which the walk reaches the floor; six gyros of an ADIS16405: 106 to 280 s."""
+_WALKS_S: Final = np.array([100.0, 300.0, 1000.0])  # Averaging times at which the walk reaches the floor
 
 
 def learned_floor(slots: NDArray[np.int64], values: Floats, white: Floats) -> tuple[Floats, Floats]:

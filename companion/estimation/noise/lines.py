@@ -172,9 +172,8 @@ def is_ramp(line: RobustLine, count: int, wander: Floats) -> NDArray[np.bool_]:
 def slope_limit(count: int) -> float:
     """Return the threshold for |t| of a slope through at least 3 values: `RAMP_T`, or more if `count` is small.
 
-    Student's t with a probability of 1 in 100 000 is 9.9 for 10 values; from 21 values on, it is below 6. In six nights
-    of an ADIS16405 and 11 min of an MPU6050 at rest, a threshold of 5 took chance for a ramp in one of 1000 windows of
-    10 s, and the line's end was off by four times as much as the mean.
+    Student's t with a probability of 1 in 100 000 is 9.9 for 10 values; from 21 values on, it is below 6. With 5, one
+    window of 10 s in 1000 of an ADIS16405 at rest had a ramp by chance; its end was four times as far off as its mean.
     """
     return max(RAMP_T, student_quantile(_ONE_IN_100000, count - 2.0))
 

@@ -182,15 +182,15 @@ def solve(
     warnings = list(local.warnings)
     gradienter = gradienter if window.tilt is not None else None
     compass = compass if window.heading is not None else None
-    if what.accelerometers and gradienter is None:
-        missing = message("sensor_missing", sensor="gradienter", sensors="accelerometers")
-        if what is What.ACCELEROMETERS:
-            raise CalibrationRefusedError(missing)
-        warnings.append(missing)
+    missing = message("sensor_missing", sensor="gradienter", sensors="accelerometers")
+    if what is What.ACCELEROMETERS and gradienter is None:
+        raise CalibrationRefusedError(missing)
     if platform == "deck":
         # The deck turns, and the time at which the yaw was valid is unknown.
         otherwise = msgspec.structs.replace(otherwise, heading=None)
     truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
+    if what.accelerometers and truth.tilt_from is None:
+        warnings.append(missing)
     unknown_heading = None
     if compass is None and truth.heading_rad is None:
         _, unknown_heading = local.rate_in_body(np.eye(3), heading_known=False)
