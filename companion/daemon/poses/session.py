@@ -42,15 +42,12 @@ from companion.samples import Vector
 STAND_S: Final = 12.0
 """Time without motion in each pose: averaging beyond 10 s improves no accelerometer (method.md section 2.3)."""
 SETTLE_S: Final = 1.0
-STOP_WITHIN_DEG: Final = 5.0
-"""Remaining angle at which the operator is asked to stop: the next sample would come this close to the target."""
+STOP_WITHIN_DEG: Final = 5.0  # Angle before the target at which the operator is asked to stop
 TURNS_DEG: Final = 2.0  # Minimum turn within a second that counts as turning
-EARLY_S: Final = 3.0
-"""Time at rest after which a movement counts as too early; earlier ones count as setting the aircraft down."""
-STILL_MOVING_S: Final = 20.0
-"""Duration of movement after which the operator gets a message: a hand or the wind may move the aircraft."""
-LEANED_DEG: Final = 0.03
-"""Largest change of tilt within a pose: half of it enters the mean, as much as a wrong placement on floor marks."""
+EARLY_S: Final = 3.0  # Time at rest after which a movement counts as too early: before, the aircraft is set down
+STILL_MOVING_S: Final = 20.0  # Duration of movement after which the operator gets a message: a hand, or the wind
+LEANED_DEG: Final = 0.03  # Largest change of tilt within a pose: half of it enters the mean
+TO_MOVE: Final = "waiting for it to move"
 ARMED: Final = "armed during the alignment; the earlier one stays active"
 
 
@@ -59,6 +56,7 @@ class SessionState:
     """State of one alignment; available after its end too, for web pages that are opened later."""
 
     job: Job
+    writes: bool
     windows: list[Window] = dataclasses.field(default_factory=list)
     poses: list[HeldPose] = dataclasses.field(default_factory=list)
     ups: list[Vector] = dataclasses.field(default_factory=list)
@@ -98,6 +96,7 @@ class SessionState:
     def shown(self) -> Object:
         return {
             "kind": self.job.kind,
+            "writes": self.writes,
             "number": self.number,
             "total": self.total,
             "wish": self.wish.words,
@@ -210,7 +209,7 @@ class PoseSession:
         self._collector.count_turns(wanted=True)
         if task.imus_alone:
             self._collector.expect(gradienter=False, compass=False)
-        self.state = state = SessionState(job)
+        self.state = state = SessionState(job, task.request.write or task.request.level)
 
         def ended(result: asyncio.Future[JobResult]) -> None:
             state.outcome, state.words, state.share = result.result().outcome, result.result().reason, 0.0
@@ -242,7 +241,7 @@ class PoseSession:
             state.share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
             turned = self._turned(state, now_s) if moving or standing else ""
             if not standing:
-                reason = turned or waiting_for if state.moved else "waiting for it to move"
+                reason = turned or waiting_for if state.moved else TO_MOVE
                 words = f"{state.objection or wish.words}; {reason}"
             else:
                 words = f"measuring, {max(state.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"

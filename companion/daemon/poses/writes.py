@@ -39,8 +39,7 @@ SEEN_DEG: Final = 0.1  # Smallest step that is visible in an autopilot's attitud
 SEEN_SHARE: Final = 0.2
 WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5  # Time until written parameters are in use: both firmwares read them once a second
-LATEST_S: Final = 4.0
-"""Largest age of attitude messages used: a busy link delays messages by seconds, but old estimates have wandered."""
+LATEST_S: Final = 4.0  # Largest age of attitude messages: a busy link delays them, old estimates have wandered
 POLL_S: Final = 0.25
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 

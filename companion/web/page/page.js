@@ -18,6 +18,9 @@ function sign(name) {
   return svg;
 }
 const fixed = (value, digits, unit) => value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "−") + unit;
+// The command line's words, with the page's buttons in place of its commands.
+const here = words => words.replaceAll("`", "").replace("type companion calibrate", "hold CALIBRATE").replace("type companion undo", "hold UNDO")
+  .replace("(--write does)", "(to write, tick the box before the start)");
 const signed = (value, digits) => (value < 0 ? "−" : "+") + Math.abs(value).toFixed(digits);
 const ago = s => s < 99.5 ? Math.round(s) + " s ago" : s < 5970 ? Math.round(s / 60) + " min ago" : (s / 3600).toFixed(1) + " h ago";
 const utc = iso => iso.slice(0, 16).replace("T", " ") + " UTC";
@@ -37,7 +40,7 @@ function headline(tone, word, reason) {
 function show(status) {
   headline(status.headline.tone, status.headline.word, status.headline.reason);
   $("remedy").hidden = !status.remedy;
-  $("remedy").textContent = (status.remedy || "").replaceAll("`", "");
+  $("remedy").textContent = here(status.remedy || "");
   firstRun(status.setup || null);
   if (status.setup) return;
   $("vehicle").textContent = status.vehicle.summary;
@@ -45,7 +48,7 @@ function show(status) {
   const away = !["disarmed", undefined].includes(status.vehicle.armed);
   $("head").classList.toggle("armed", status.headline.word === "ARMED");
   const aligns = status.stands !== null && status.stands.outcome === null;
-  if (aligns && !document.body.classList.contains("aligning")) scrollTo(0, 0);
+  if (aligns !== document.body.classList.contains("aligning")) scrollTo(0, 0);
   document.body.classList.toggle("aligning", aligns);
   $("progress").hidden = !busy;
   if (busy) document.querySelector("#progress div").style.width = status.progress + "%";
@@ -67,7 +70,11 @@ function show(status) {
   links(status);
   byHand(status.by_hand);
   aloud(status);
-  stands(status.stands);
+  const wrote = {"six-position calibration": ["faces"], "turn on the spot": ["turn", "level"]}[status.stands && status.stands.kind] || [];
+  const undone = status.by_hand.some(one => one.undone_at && wrote.includes(one.what));
+  stands(undone ? null : status.stands);
+  // No pose is wanted any more.
+  $("now").hidden = /^(WRITING|CHECKING|SETTLING)/.test(status.headline.word);
   // Disable only buttons that make no sense: the daemon decides whether an action is allowed, and gives the reason.
   $("calibrate").disabled = busy || away;
   for (const button of document.querySelectorAll("#align button")) button.disabled = busy || away;
@@ -155,16 +162,19 @@ function calibration(found, arming) {
   }));
 }
 function byHand(found) {
-  $("by-hand").replaceChildren(...found.map(one => {
-    const written = Object.keys(one.written).length;
+  $("by-hand").replaceChildren(...found.flatMap(one => {
+    const written = Object.entries(one.written), list = make("details"), open = document.querySelector("#by-hand details[open]");
+    list.append(make("summary", `${written.length} parameters written`), ...written.map(([name, value]) => make("p", `${name} ${+value.toPrecision(6)}`, "note")));
+    list.open = open !== null;
     const end = one.undone_at ? `undone ${utc(one.undone_at)}` : one.in_force ? "active" : one.in_force === false ? "changed since" : "";
-    return make("p", `${one.what}, ${utc(one.measured_at)}: ${one.state === "failed" ? "failed: " : ""}${one.reason}` + (written && end ? `; ${end}` : ""), "note");
+    const words = `${one.what}, ${utc(one.measured_at)}: ${one.state === "failed" ? "failed: " : ""}${here(one.reason)}`;
+    return [make("p", words + (written.length && end ? `; ${end}` : ""), "note"), ...(written.length ? [list] : [])];
   }));
 }
 function link(good, name, words, remedy) {
   const row = make("div", undefined, good ? "link" : "link bad"), text = make("div");
   text.append(make("b", name + " "), document.createTextNode(words));
-  if (remedy) text.append(make("p", remedy.replaceAll("`", ""), "note"));
+  if (remedy) text.append(make("p", here(remedy), "note"));
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
