@@ -1,6 +1,7 @@
 """ArduPilot: names, ranges and peculiarities of the parameters that the companion reads or writes.
 
-R, the rotation from the IMU's axes to the vehicle's, comes from AHRS_ORIENTATION (docs/reference/autopilots 1.2).
+R, the rotation from the IMU's axes to the vehicle's, comes from AHRS_ORIENTATION (docs/reference/autopilots 1.2), or
+from BRD_ORIENTATION where ArduPilot has moved it there (pull request 34173).
 AHRS_TRIM rotates the reported attitude only, not IMU data. A calibration leaves CALTEMP unchanged, so a new offset is
 the old offset plus the residual (recipe (a) of docs/reference/autopilots 1.6).
 
@@ -134,7 +135,12 @@ class ArduPilot(Firmware):
     faster_log = "LOG_BITMASK with IMU_FAST"
     ranges = _ranges()
     rivals = (
-        Rival(AT_START, "the next boot measures the gyros itself and overwrites these gyro offsets", at_start=True),
+        Rival(
+            AT_START,
+            "the next boot measures the gyros itself and overwrites these gyro offsets",
+            at_start=True,
+            known=1,
+        ),
     )
     parts = {
         (0x2B, 0x2B): "bmi088",
@@ -321,15 +327,17 @@ async def _read_board_rotation(parameters: Parameters) -> Matrix:
     Raises:
         AutopilotError: an unknown orientation, a custom one that is not active, or an error of `Parameters.read`.
     """
-    value = await parameters.read("AHRS_ORIENTATION")
+    name, value = "AHRS_ORIENTATION", await parameters.read_optional("AHRS_ORIENTATION")
+    if value is None:
+        name, value = "BRD_ORIENTATION", await parameters.read("BRD_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1
     if 0 <= number < len(ROTATION_NAMES):
         return rotation_matrix(ROTATION_NAMES[number])
     if number in _ARDUPILOT_ONLY_DEG:
         return rotation_matrix(_ARDUPILOT_ONLY_DEG[number])
     if number not in _CUSTOM_NAMES:
-        raise implausible("AHRS_ORIENTATION", f"{value:g}", "a known orientation")
+        raise implausible(name, f"{value:g}", "a known orientation")
     # A custom rotation that is selected but switched off is an internal error of ArduPilot: its effect is unknown.
     if number > 100 and not await parameters.read_optional("CUST_ROT_ENABLE"):
-        raise implausible("AHRS_ORIENTATION", f"{number}", "CUST_ROT_ENABLE = 1 with it")
+        raise implausible(name, f"{number}", "CUST_ROT_ENABLE = 1 with it")
     return rotation_matrix(await parameters.read_vector(_CUSTOM_NAMES[number]))

@@ -143,7 +143,7 @@ class Firmware:
         for rival in self.rivals:
             value = await parameters.read_integer(rival.parameter)
             if value:
-                found.append(dataclasses.replace(rival, value=value))
+                found.append(rival.active(value))
                 seen[rival.parameter] = boots
             elif rival.from_boot and seen.get(rival.parameter) == boots:
                 found.append(rival)

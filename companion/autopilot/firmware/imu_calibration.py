@@ -25,6 +25,8 @@ from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector
 
+ANY_TIME: Final = "the autopilot may measure the gyros at any time and overwrite these gyro offsets"
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rival:
@@ -32,7 +34,7 @@ class Rival:
 
     `at_start`: overwrites only at a start of the autopilot. `from_boot`: read only at a boot, so switching it off has
     no effect before the next boot. `value`: as read; 0: switched off, but active until the next boot. `accelerometers`:
-    also overwrites accelerometer offsets.
+    also overwrites accelerometer offsets. `known`: the only value that `what` describes; None: all values.
     """
 
     parameter: str
@@ -40,7 +42,13 @@ class Rival:
     at_start: bool = False
     accelerometers: bool = False
     from_boot: bool = False
+    known: int | None = None
     value: int = 0
+
+    def active(self, value: int) -> Rival:
+        """Return this rival as read; a value of a later firmware may overwrite the offsets at any time."""
+        what = self.what if self.known in (None, value) else ANY_TIME
+        return dataclasses.replace(self, what=what, value=value)
 
     @property
     def words(self) -> str:

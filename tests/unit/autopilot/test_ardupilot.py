@@ -103,9 +103,10 @@ def test_reads_what_is_there() -> None:
     assert calibration.warnings == ()
 
 
-def board_x(orientation: int, **angles: float) -> list[float]:
+def board_x(orientation: int, name: str = "AHRS_ORIENTATION", **angles: float) -> list[float]:
     """Direction of the board's x axis in the vehicle."""
-    calibration = read(IMU1 | {"AHRS_ORIENTATION": orientation} | angles)
+    others = {each: value for each, value in IMU1.items() if each != "AHRS_ORIENTATION"}
+    calibration = read(others | {name: orientation} | angles)
     pointing: list[float] = (calibration.orientation @ np.array([1.0, 0.0, 0.0])).tolist()
     return pointing
 
@@ -155,6 +156,10 @@ def test_what_cannot_be_worked_with_is_refused_with_a_reason(changed: dict[str, 
         read(IMU1 | changed)
 
 
+def test_a_board_orientation_under_its_later_name() -> None:
+    assert board_x(2, "BRD_ORIENTATION") == pytest.approx([0.0, 1.0, 0.0])
+
+
 def test_an_instance_that_does_not_exist() -> None:
     with pytest.raises(AutopilotError, match="no IMU 3: INS_GYR3OFFS_X does not exist"):
         read(IMU1, 3)
@@ -175,6 +180,7 @@ def only_warning(**changed: float) -> str:
     ("changed", "words"),
     [
         ({"INS_GYR_CAL": 1}, "INS_GYR_CAL = 1: the next boot"),
+        ({"INS_GYR_CAL": 2}, "INS_GYR_CAL = 2: the autopilot may measure the gyros at any time"),
         ({"INS_ACCOFFS_X": 0, "INS_ACCOFFS_Y": 0, "INS_ACCOFFS_Z": 0}, "3D Accel calibration needed"),
         ({"INS_ACCSCAL_X": 1.3}, "INS_ACCSCAL_X is 1.3, expected 0.8 to 1.2"),
         ({"INS_USE": 0}, "INS_USE = 0"),
