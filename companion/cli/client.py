@@ -112,8 +112,8 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:
             raise
-        reply = await request(options, at_interrupt)
-        if reply.get("reason") == "cancelled by companion cancel":
+        reply = await request(options, at_interrupt | {"face": "interrupt"})
+        if reply.get("reason") == "cancelled by Ctrl-C's cancel":
             reply["reason"] = "Cancelled (Ctrl-C). Nothing was written."
         return reply
     finally:

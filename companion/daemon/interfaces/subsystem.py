@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
-FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
+FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet", "interrupt": "Ctrl-C's"}
 """Names of interfaces in requests, and in texts for people, as in "cancelled by mqtt cancel"."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
 """Status of the web page while its process reports nothing."""
