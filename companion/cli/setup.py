@@ -134,9 +134,8 @@ class _Session:
             told = {one["imu"]: one["name"] for one in daemon.get("profiles", ()) if one["by_device_id"]}
         elif not self._options.no_check:
             told = await _ask_autopilot(self.asking, draft, by_default=is_new)
-        # A protocol that a maker uses for one product only tells the part, whose noise is learned at rest.
-        names = [imu["name"] for imu in draft.wanted["imu"] if imu.get("protocol", "imu_line") == "imu_line"]
-        to_ask = [*(name for name in names if told.get(name) is None), *(parts.keys() - set(names))]
+        names = [imu["name"] for imu in draft.wanted["imu"]]
+        to_ask = [name for name in names if told.get(name) is None or name in parts]
         given = {part_key(name): part for name, part in parts.items()}
         await self._ask(draft, draft.part_questions(to_ask), given)
         draft.parsed()

@@ -74,6 +74,7 @@ class Page:
         self.app = Starlette(
             routes=[
                 Route("/", self._page),
+                Route("/register_service", _for_blueos),
                 Route("/events", self._events),
                 Route("/records.json", self._last_records),
                 Route("/records/{name}", self._record),
@@ -301,6 +302,12 @@ def _plots(imus: object) -> str:
 
 def _json(value: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(value), status, media_type="application/json")
+
+
+async def _for_blueos(_request: Request) -> Response:
+    """Describe the page for BlueOS's menu; it opens in a tab of its own, as frames are forbidden."""
+    about = {"name": "Companion", "description": "calibrates the IMUs", "icon": "mdi-axis-arrow", "company": ""}
+    return _json({**about, "version": __version__, "webpage": "", "api": "", "avoid_iframes": True})
 
 
 async def _refuse(_request: Request, error: Exception) -> Response:

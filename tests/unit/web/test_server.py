@@ -68,6 +68,17 @@ def test_the_page_runs_its_own_style_and_script_and_nothing_else(tmp_path: Path)
     run(tmp_path, visitor)
 
 
+def test_blueos_finds_the_page_for_its_menu(tmp_path: Path) -> None:
+    async def visitor(visit: Visit) -> None:
+        said = await visit.ask("GET", "/register_service", Host="localhost:8191")
+        about = said.json
+        # What the scanner of BlueOS's helper wants of a service.
+        assert {"name", "description", "icon", "company", "version", "webpage", "api"} < about.keys()
+        assert about["avoid_iframes"] is True
+
+    run(tmp_path, visitor)
+
+
 @pytest.mark.parametrize(
     "host",
     ["127.0.0.1", "localhost:9000", "LOCALHOST", "[::1]:8191", "192.168.4.1:8191", "own", "own.local:8191", "own.lan"],
