@@ -22,7 +22,6 @@ ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
 """Tone: good (ready to fly), wait (be patient or hold still), busy (the companion works), bad (somebody must act)."""
 
-
 Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, and the tone
 
 
@@ -92,11 +91,14 @@ class Headlines:
         if state is State.VERIFYING and moves is not None and job.words != TELEMETRY:
             return "HOLD STILL", moves, "wait"
         if state is not State.WAITING:
-            return f"{state.word.upper()} {job.progress_percent} %", words, "busy"
+            percent = f" {job.progress_percent} %" if job.act is None else ""
+            return f"{state.word.upper()}{percent}", words, "busy"
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()
         if job.hold_still_s is not None:
             return _hold_still(job.hold_still_s)
+        if job.act:
+            return job.act, words, "wait"
         if self._collector.glance(now_s).moving:
             return "HOLD STILL", words, "wait"
         return "WAITING", words, "wait"
