@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Literal
 
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
@@ -16,11 +16,13 @@ from companion.links.system.events import comes
 from companion.storage.changes import BY_TEMPERATURE
 
 ALIGNMENT: Final = "gradienter alignment"
-FACES: Final = "six-position calibration"
+FACES: Final = "faces alignment"
 TURN: Final = "turn on the spot"
 TEMPERATURE: Final = "temperature curve"
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 
+Act = Literal["", "PUT IT DOWN", "TURN IT", "HOLD STILL"]
+"""What the operator of an alignment must do now, as the headline shows it; empty: wait."""
 GoOn = Callable[[str], None]
 """Callback, called during a long wait: it sets the progress text, and raises `JobCancelledError` after a cancel."""
 
@@ -47,8 +49,7 @@ class Job:
         self.reboot = reboot  # Restart the autopilot once the result is stored
         self.automatic = automatic  # Started by the daemon itself
         self.was_armed = False
-        self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
-        """Time on the event loop's clock by which measuring must end; None: no limit."""
+        self.deadline_s = None if timeout_s is None else loop.time() + timeout_s  # Event-loop time; None: no limit
         self.finished: asyncio.Future[JobResult] = loop.create_future()
         self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Object | None = None
         self.undid_calibration = kind == "undo"
@@ -56,8 +57,8 @@ class Job:
         self.words = ""  # Present activity, as text for people
         self.hold_still_s: int | None = None
         """Seconds for which the aircraft must be held motionless, if the job waits for nothing else; otherwise None."""
-        self.progress_percent = 0
-        """Progress in percent, 0 to 100; it never falls."""
+        self.act: Act | None = None  # None: no alignment, or not begun
+        self.progress_percent = 0  # 0 to 100; it never falls
         self._until_s = 0.0
         self.cancelled_by: str | None = None
         self._nudge = asyncio.Event()

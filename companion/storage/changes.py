@@ -94,7 +94,8 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def shown(self) -> Object:
         origin = self.origin
-        return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names}
+        before = {changed.parameter: changed.before for changed in self.changes}
+        return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names, "before": before}
 
     def after(self, older: ChangeSet) -> ChangeSet:
         """Join this write and the `older` one to one undo step, which restores the values from before both."""

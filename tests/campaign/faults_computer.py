@@ -332,14 +332,7 @@ def faults() -> list[Fault]:
             names=r"skipped",
             **back,
         ),
-        Fault(
-            "undo-damaged",
-            "files",
-            "the values for undo are damaged",
-            spoil_undo,
-            names=r"cannot be used",
-            **back,
-        ),
+        Fault("undo-damaged", "files", "the values for undo are damaged", spoil_undo, names=r"cannot be used", **back),
         Fault(
             "journal-damaged",
             "files",

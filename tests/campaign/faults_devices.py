@@ -274,12 +274,7 @@ def faults() -> list[Fault]:
             excused=STILLNESS,
         ),
         Fault(
-            "imu-spikes",
-            "device",
-            "one reading in ten of the serial IMU cannot be",
-            spikes,
-            calm,
-            excused=STILLNESS,
+            "imu-spikes", "device", "one reading in ten of the serial IMU cannot be", spikes, calm, excused=STILLNESS
         ),
         Fault(
             "imu-nan",

@@ -24,6 +24,7 @@ from sim.ardupilot.parameters import offset_names
 from sim.hands import Hands
 from sim.imu_model import MG
 from tests.e2e.test_calibration import calibrated, started
+from tests.e2e.test_page import Watch
 from tests.support.by_hand import alone, follow
 from tests.support.rig import ACCEL_BIAS_MG, Rig
 
@@ -52,10 +53,15 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
     async with made.running():
         await made.ready()
         old = {name: made.double.parameter(name) for what in ("accel", "scale") for name in offset_names(1, what)}
-        job = faced(made, write=True)
+        watch, job = Watch(made), faced(made, write=True)
         result = await follow(made, hands, job)
         assert result.outcome == "done", result
         assert result.reason.endswith("written")
+        big = (await watch.stop())[-6:-1]
+        assert big == ["TURN IT", "HOLD STILL", "MEASURING", "WRITING", "CHECKING"]
+        status = made.service.status()
+        stands, (step,) = status["stands"], status["undoable"]
+        assert (stands["what"], stands["write"], stands["outcome"], step["before"]) == ("faces", True, "done", old)
         record = job.product
         assert isinstance(record, FacesRecord)
         assert 11 <= len(record.stands) <= 14
@@ -83,6 +89,7 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         # A calibration of the gyros afterwards does not put them out of reach.
         gyros = {name: made.double.parameter(name) for name in offset_names(1, "gyro")}
         assert (await calibrated(made, What.GYROS))[0].outcome == "done"
+        assert made.service.status()["stands"] is None, "somebody has started something else"
         for what in ("calibration", "faces"):
             undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
@@ -168,4 +175,4 @@ async def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autop
         assert 0.0 < (pose.sigma_deg.theta or 0.0) < 0.02
         assert pose.psi_deg == pytest.approx(np.degrees(yaw) % 360.0, abs=0.5)
         assert pose.sigma_deg.psi == pytest.approx(10.0)
-        assert any("calibrated in six positions" in words for words in after.warnings)
+        assert any("after a faces alignment" in words for words in after.warnings)

@@ -179,9 +179,7 @@ async def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undon
         with monkeypatch.context() as patched:
             patched.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
             result = await follow(
-                made,
-                hands,
-                started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test")),
+                made, hands, started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test"))
             )
         assert result.outcome == "failed"
         assert result.reason == "the attitude did not follow the new level, or the aircraft moved; old values restored"

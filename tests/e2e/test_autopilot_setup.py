@@ -57,11 +57,7 @@ async def follow(rig: Rig) -> None:
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 async def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmware: Firmware) -> None:
     async with flight(
-        tmp_path,
-        firmware=firmware,
-        calibrated=False,
-        used=False,
-        parameters={**BEFORE[firmware], RIVAL[firmware]: 1.0},
+        tmp_path, firmware=firmware, calibrated=False, used=False, parameters={**BEFORE[firmware], RIVAL[firmware]: 1.0}
     ) as flying:
         rig = flying.rig
         shown = await ask(rig)

@@ -122,13 +122,7 @@ def _rss_mib() -> float:
     return pages * os.sysconf("SC_PAGESIZE") / 1024**2
 
 
-@pytest.mark.parametrize(
-    ("state", "blow"),
-    [
-        (State.WRITING, signal.SIGSTOP),
-        (State.VERIFYING, signal.SIGKILL),
-    ],
-)
+@pytest.mark.parametrize(("state", "blow"), [(State.WRITING, signal.SIGSTOP), (State.VERIFYING, signal.SIGKILL)])
 def test_a_child_that_is_killed_or_stopped_returns(tmp_path: Path, state: State, blow: signal.Signals) -> None:
     async def main() -> None:
         async with broker(tmp_path) as one, peer(one) as watcher:

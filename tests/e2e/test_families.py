@@ -89,11 +89,7 @@ def plain_runs() -> list[Run]:
     imus, gradienters, compasses = list(IMUS), list(GRADIENTERS), list(COMPASSES)
     count = max(len(gradienters), len(compasses))
     return [
-        Run(
-            tuple(imus[k::count]) or (imus[0],),
-            gradienters[k % len(gradienters)],
-            compasses[k % len(compasses)],
-        )
+        Run(tuple(imus[k::count]) or (imus[0],), gradienters[k % len(gradienters)], compasses[k % len(compasses)])
         for k in range(count)
     ]
 

@@ -8,7 +8,11 @@ from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
+
 from companion.estimation.machine import What
+from companion.estimation.records.validity import Held
 from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated, started
 from tests.support import page
@@ -153,3 +157,25 @@ async def test_left_alone_it_says_how_long_to_hold_still_until_it_is_ready(tmp_p
         counted = watch.seconds
         assert len(set(counted)) > 5
         assert counted == sorted(counted, reverse=True)
+
+
+async def test_noise_at_the_threshold_does_not_change_the_word_every_second(tmp_path: Path) -> None:
+    async with Rig(tmp_path, max_s=12.0).running() as rig:
+        await rig.ready()
+        await calibrated(rig)
+        await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
+        in_force, core = rig.service.arming.readiness.in_force, rig.service.core
+        state = in_force._triads["fc", "gyro"]
+        held = state.held
+        assert isinstance(held, Held)
+        words = []
+        for off_sigmas in (2.9, 3.1, 2.9, 2.1, 1.9, 2.9):
+            window = await core.window()
+            solution, *_ = await in_force._estimator.solve(window, in_force.what)
+            (imu,) = [imu for imu in solution.imus if imu.name == "fc"]
+            both = np.hypot(held.sigma, np.sqrt(np.diag(imu.covariance))[:3])
+            expected = np.array(imu.gyro_rad_s) - off_sigmas * both
+            state.held = msgspec.structs.replace(held, expected=tuple(expected.tolist()))
+            in_force._note(solution, window.end_s, 12.0)
+            words.append(headline(rig)[1])
+        assert words == ["READY", *["NOT CALIBRATED"] * 3, "READY", "READY"]

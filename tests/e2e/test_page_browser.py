@@ -135,10 +135,12 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
                 assert await tab.value(f"{box}.height >= 80 && {box}.width >= 90 && {box}.bottom <= innerHeight")
             await read_the_record(here, record)
 
+            remedy = "document.querySelector('#remedy').textContent"
+            assert await tab.value(remedy) == "Hold the aircraft still, or hold CALIBRATE."
             # A short tap is no order, and says why.
             await tab.touch("#calibrate")
             await tab.lift()
-            assert await tab.until(SAID) == "hold calibrate for 1.5 s"
+            assert await tab.until(SAID) == "hold CALIBRATE for 1.5 s"
             # Neither is a finger that goes away before the time.
             await tab.touch("#calibrate")
             await tab.roll("#calibrate", 200.0)
@@ -157,7 +159,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             assert await tab.value("document.querySelector('#calibrate').disabled")
             await tab.touch("#cancel")
             await tab.lift()
-            await tab.until(f'{SAID} === "cancel: cancelled by the page\'s cancel"')
+            await tab.until(f'{SAID} === "CANCEL: cancelled by the page\'s cancel"')
             await tab.until("document.querySelector('#last').textContent.includes('cancelled by the page')")
             assert (await here.status())["last"]["state"] == "cancelled"
 
@@ -166,13 +168,27 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             button = "#align button[data-name='align turn']"
             await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'center'}})")
             await tab.touch(button)
-            await tab.until("$('standing').textContent === '1 of 5' && $('wish').textContent")
+            await tab.until("$('standing').textContent === 'TURN: 1 of 5' && $('wish').textContent")
+            assert await tab.value("$('writes').textContent") == "will not be written: WRITE is not ticked"
             await tab.lift()
             assert await tab.value("document.querySelectorAll('#how .nose').length") == 4
             await tab.value("scrollTo(0, 0)")
             await tab.touch("#cancel")
             await tab.lift()
-            await tab.until("$('result').textContent === \"cancelled by the page's cancel\"")
+            await tab.until("$('result').textContent === \"TURN: cancelled by the page's cancel\"")
+            assert await tab.value("$('standing').textContent") == "CANCELLED"
+            await tab.value("$('dismiss').click()")
+            await asyncio.sleep(1.0)
+            assert await tab.value("$('stands').hidden")
+
+            # A page that the browser has stopped for a while has not lost the companion.
+            await tab.value(
+                "const seen = []; new MutationObserver(() => seen.push($('word').innerText))"
+                ".observe($('word'), {subtree: true, childList: true}); source.close();"
+                "const woken = Date.now() + 5000; while (Date.now() < woken);"
+            )
+            await tab.until(f"seen.length && {WORD} === 'NOT CALIBRATED'")
+            assert "NO LINK" not in await tab.value("seen.join()")
 
             # The daemon goes away, is noticed, and comes back; the page's old token is none any more.
             assert here.line.daemon is not None
@@ -232,13 +248,13 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
                 await tab.until(f"{SAID} !== 'token kept: press again' && !{SAID}.endsWith('asked for')")
                 said = await tab.value(SAID)
                 if typed != token:
-                    assert said == "calibrate: wrong token: companion page, on the board, shows the right one"
+                    assert said == "CALIBRATE: wrong token: companion page, on the board, shows the right one"
                     assert (await here.status())["state"] == "idle"
-            assert said == "calibrate: calibration started"
+            assert said == "CALIBRATE: calibration started"
             assert (await here.status())["state"] != "idle"
             await tab.mouse("#cancel", "mousePressed")
             await tab.mouse("#cancel", "mouseReleased")
-            await tab.until(f'{SAID} === "cancel: cancelled by the page\'s cancel"')
+            await tab.until(f'{SAID} === "CANCEL: cancelled by the page\'s cancel"')
 
             # An address that brings the token along: nothing has to be typed.
             await tab.value("localStorage.clear()")

@@ -119,10 +119,7 @@ def test_a_flood_holds_nobody_up(path: Path, caplog: pytest.LogCaptureFixture) -
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
-        async with (
-            Chatter(path, tilt_frame) as device,
-            listening("gradienter", "inclinometer_xy", path) as one,
-        ):
+        async with Chatter(path, tilt_frame) as device, listening("gradienter", "inclinometer_xy", path) as one:
             await one.data()
             device.muted = True
             ended = threading.Event()

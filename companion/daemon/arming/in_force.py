@@ -30,6 +30,7 @@ from companion.estimation.machine import What
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.records.validity import (
+    RETURNED_SIGMAS,
     Held,
     Objection,
     Present,
@@ -274,6 +275,9 @@ class ActiveCalibration:
                     continue
                 state.judged = True
                 present = Present(residual=vector(residual), sigma_use=vector(use[rows]), sigma=vector(settled[rows]))
+                was, before = state.held, state.present
+                if isinstance(was, Held) and before is not None and worst_axis(was, before) is not None:
+                    present = msgspec.structs.replace(present, limit_sigmas=RETURNED_SIGMAS)
                 state.present = present
                 self._confirm(key, state, present, imu.temperature_degc, end_s, averaged_s)
                 if not self._stays_in_doubt(state, present, end_s):

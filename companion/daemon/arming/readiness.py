@@ -43,10 +43,7 @@ _STEPS: Final[dict[State, str]] = {
     State.SETTLING: ADJUSTING,
     State.UNDOING: "restoring old offsets",
 }
-_CHECKED_NEXT: Final[dict[Why, str]] = {
-    Why.REBOOTED: "checking after restart",
-    Why.UNSEEN: _STEPS[State.VERIFYING],
-}
+_CHECKED_NEXT: Final[dict[Why, str]] = {Why.REBOOTED: "checking after restart", Why.UNSEEN: _STEPS[State.VERIFYING]}
 """Findings that the next window without motion can clear without a new calibration, with their messages."""
 _NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
 """Preconditions without which the arm gate refuses, whatever calibration is active."""

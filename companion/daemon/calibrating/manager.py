@@ -91,6 +91,7 @@ class CalibrationManager:
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
         """Running job, or the latest one if none is running."""
+        self.asked: Job | None = None  # Latest job that somebody asked for, other than an undo
         self.reason = ""
         self.last: Record | None = None  # Record of the latest calibration, loaded from disk at start
         self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified when a job ends, before its requester
@@ -148,6 +149,7 @@ class CalibrationManager:
         own = self._automatic_run()
         if isinstance(own, CalibrationRun) and own.is_adoptable and own.what in (what, What.BOTH):
             own.adopt(requester, timeout_s, reboot=reboot)
+            self.asked = own
             return own
         untold = what is What.ACCELEROMETERS and self._core.config.gradienter is None
         missing = "accelerometers need a gradienter: none is configured" if untold else None
@@ -213,6 +215,7 @@ class CalibrationManager:
         if event is not None:
             self._machine.on(event)
         self.job = job
+        self.asked = self.asked if job.automatic or job.kind == "undo" else job
         logger.info("%s asked for by %s", job.kind, job.requester)
         self._task = asyncio.get_running_loop().create_task(work, name=job.kind)
         return job

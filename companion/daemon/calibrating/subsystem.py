@@ -85,7 +85,7 @@ class Calibrating(Subsystem):
 
     def status(self) -> Object:
         manager, running, job, last = self.manager, self.manager.running, self.manager.job, self.manager.last
-        still = self._core.collector.status(asyncio.get_running_loop().time())
+        stands, still = self.stands.state, self._core.collector.status(asyncio.get_running_loop().time())
         words = manager.reason if running is None else running.words
         return {
             "state": manager.state.shown,
@@ -95,7 +95,7 @@ class Calibrating(Subsystem):
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
-            "stands": None if self.stands.state is None else self.stands.state.shown(),
+            "stands": None if stands is None or stands.job is not manager.asked else stands.shown(),
             "last": None
             if last is None
             else {
@@ -234,7 +234,7 @@ class Calibrating(Subsystem):
         if request.level and request.write:
             return "either --write (offsets) or --level (the board's tilt): what is in one is not in the other"
         if request.level and self.faces.record is None:
-            return "the board's tilt needs a six-position calibration: companion align faces --write first"
+            return "the board's tilt needs a faces alignment: companion align faces --write first"
         return self._why_not_written(write=request.write or request.level)
 
     def _why_not_written(self, *, write: bool) -> str | None:

@@ -52,15 +52,9 @@ class Child:
 
     async def _once(self) -> str:
         try:
+            # A session of its own keeps Ctrl-C in the terminal from the child: the daemon handles it.
             process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-m",
-                self._module,
-                stdin=PIPE,
-                stdout=PIPE,
-                limit=REPORT_LIMIT,
-                # A session of its own keeps Ctrl-C in the terminal from the child: the daemon handles it.
-                start_new_session=True,
+                sys.executable, "-m", self._module, stdin=PIPE, stdout=PIPE, limit=REPORT_LIMIT, start_new_session=True
             )
         except OSError as error:
             reason = f"cannot be started: {error.strerror or error}"

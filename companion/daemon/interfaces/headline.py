@@ -12,9 +12,8 @@ from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.subsystem import Heading
-from companion.daemon.job import NO_CALIBRATION, Job
+from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
-from companion.daemon.poses.session import TO_MOVE
 from companion.estimation.machine import State
 from companion.formats import Object
 from companion.messages import message
@@ -22,7 +21,6 @@ from companion.messages import message
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
 """Tone: good (ready to fly), wait (be patient or hold still), busy (the companion works), bad (somebody must act)."""
-
 
 Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, and the tone
 
@@ -87,19 +85,20 @@ class Headlines:
             return "CANCELLING", words, "busy"
         if state is State.UNDOING:
             return state.word.upper(), "the old values are being written", "busy"
+        if state is State.SETTLING:
+            return state.word.upper(), words, "busy"
         moves = self._collector.glance(now_s).moves
         if state is State.VERIFYING and moves is not None and job.words != TELEMETRY:
             return "HOLD STILL", moves, "wait"
-        aligns = job.kind in NO_CALIBRATION
         if state is not State.WAITING:
-            percent = "" if aligns or state is State.SETTLING else f" {job.progress_percent} %"
+            percent = f" {job.progress_percent} %" if job.act is None else ""
             return f"{state.word.upper()}{percent}", words, "busy"
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()
         if job.hold_still_s is not None:
             return _hold_still(job.hold_still_s)
-        if aligns:
-            return "MOVE IT" if words.endswith(TO_MOVE) else "SET IT DOWN", words, "wait"
+        if job.act:
+            return job.act, words, "wait"
         if self._collector.glance(now_s).moving:
             return "HOLD STILL", words, "wait"
         return "WAITING", words, "wait"

@@ -35,7 +35,6 @@ from companion.samples import Triad
 if TYPE_CHECKING:
     from companion.daemon.interfaces.child import Child, StartChild
 
-
 LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2

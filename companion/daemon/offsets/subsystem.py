@@ -63,11 +63,8 @@ class Offsets(Subsystem):
     def __init__(self, core: Core, devices: Devices) -> None:
         vehicle, imus = core.vehicle, devices.imus
         self._core, self._vehicle, self._machine, self._imus = core, vehicle, core.machine, imus
-        self.slots, self.rivalry, self.owed = (
-            devices.slots,
-            FirmwareCalibrationWarnings(core, imus),
-            RequiredReboot(core),
-        )
+        self.slots, self.owed = devices.slots, RequiredReboot(core)
+        self.rivalry = FirmwareCalibrationWarnings(core, imus)
         self.companions = OtherCompanions(core.link, core.say, lambda: core.wanted.push)
         self.journal = WriteJournal(ChangeLog(core.config.storage.path), core.offload, self.companions.why_not)
         self.writer = ParameterWriter(core.parameters, vehicle)

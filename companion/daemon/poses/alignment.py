@@ -212,13 +212,9 @@ class ByHand:
         await self._write([*self._done, done][-KEEP_DONE:])
 
     async def undone(self, step: ChangeSet) -> None:
-        now = utc_now()
-        await self._write(
-            [
-                msgspec.structs.replace(each, undone_at=now) if each.measured_at == step.origin.at else each
-                for each in self._done
-            ]
-        )
+        now, at = utc_now(), step.origin.at
+        undone = [msgspec.structs.replace(one, undone_at=now) if one.measured_at == at else one for one in self._done]
+        await self._write(undone)
 
     async def _write(self, done: list[Done]) -> None:
         self._done = done

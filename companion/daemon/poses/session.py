@@ -22,7 +22,7 @@ from companion.component.service import JobResult
 from companion.component.statustext import LINE_BYTES, Severity, Tune
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import Job
+from companion.daemon.job import Act, Job
 from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.poses.measuring import POLL_S, Measuring
 from companion.daemon.poses.writes import AlignmentWrites
@@ -47,7 +47,6 @@ TURNS_DEG: Final = 2.0  # Minimum turn within a second that counts as turning
 EARLY_S: Final = 3.0  # Time at rest after which a movement counts as too early: before, the aircraft is set down
 STILL_MOVING_S: Final = 20.0  # Duration of movement after which the operator gets a message: a hand, or the wind
 LEANED_DEG: Final = 0.03  # Largest change of tilt within a pose: half of it enters the mean
-TO_MOVE: Final = "waiting for it to move"
 ARMED: Final = "armed during the alignment; the earlier one stays active"
 
 
@@ -56,7 +55,7 @@ class SessionState:
     """State of one alignment; available after its end too, for web pages that are opened later."""
 
     job: Job
-    writes: bool
+    asked: AlignmentRequest
     windows: list[Window] = dataclasses.field(default_factory=list)
     poses: list[HeldPose] = dataclasses.field(default_factory=list)
     ups: list[Vector] = dataclasses.field(default_factory=list)
@@ -78,6 +77,7 @@ class SessionState:
     still_s: float = 0.0
     moving_since_s: float = math.inf
     hold_still_said: bool = False
+    act: Act = "PUT IT DOWN"
     turn_read_s: float = -math.inf
     turned_deg: float = math.nan
     stop_said: bool = False
@@ -88,6 +88,7 @@ class SessionState:
         self.since_s, self.moved = (self.windows[-1].end_s, False) if self.windows else (now_s, True)
         self.still_s, self.moving_since_s, self.objection, self.hold_still_said = 0.0, math.inf, "", False
         self.turn_read_s, self.turned_deg, self.stop_said = -math.inf, math.nan, False
+        self.act = "TURN IT" if self.windows else "PUT IT DOWN"
 
     @property
     def request(self) -> str:
@@ -96,7 +97,8 @@ class SessionState:
     def shown(self) -> Object:
         return {
             "kind": self.job.kind,
-            "writes": self.writes,
+            "what": "level" if self.asked.level else self.asked.action,
+            "write": self.asked.write or self.asked.level,
             "number": self.number,
             "total": self.total,
             "wish": self.wish.words,
@@ -209,7 +211,7 @@ class PoseSession:
         self._collector.count_turns(wanted=True)
         if task.imus_alone:
             self._collector.expect(gradienter=False, compass=False)
-        self.state = state = SessionState(job, task.request.write or task.request.level)
+        self.state = state = SessionState(job, task.request)
 
         def ended(result: asyncio.Future[JobResult]) -> None:
             state.outcome, state.words, state.share = result.result().outcome, result.result().reason, 0.0
@@ -240,8 +242,10 @@ class PoseSession:
             standing = state.moved and (waiting_for is None or hold_still_s is not None)
             state.share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
             turned = self._turned(state, now_s) if moving or standing else ""
+            state.act = "HOLD STILL" if standing else state.act
+            job.act = state.act if waiting_for is None or hold_still_s is not None or moving else ""
             if not standing:
-                reason = turned or waiting_for if state.moved else TO_MOVE
+                reason = turned or waiting_for if state.moved or not job.act else "waiting for it to move"
                 words = f"{state.objection or wish.words}; {reason}"
             else:
                 words = f"measuring, {max(state.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
@@ -268,7 +272,7 @@ class PoseSession:
             self._object(state, f"it leaned by {leaned:.2g} degrees: hands off, firm ground")
             return False
         if objection is not None:
-            state.moved = False
+            state.moved, state.act = False, "TURN IT"
             self._measuring.show(measuring=False)
             self._object(state, objection)
             return False
@@ -295,7 +299,7 @@ class PoseSession:
             step_deg = state.turned_deg - before_deg
             is_near = state.turned_deg + step_deg > wanted_deg - STOP_WITHIN_DEG
             if not state.stop_said and step_deg > TURNS_DEG and is_near:
-                state.stop_said = True
+                state.stop_said, state.act = True, "HOLD STILL"
                 self._say(Severity.NOTICE, "Stop turning")
         return "" if math.isnan(state.turned_deg) else f"turned {state.turned_deg:.0f} of {wanted_deg:.0f} degrees"
 
@@ -309,7 +313,7 @@ class PoseSession:
             if state.still_s >= EARLY_S:
                 self._object(state, f"it moved after {state.still_s:.0f} of {self._stand_s:.0f} seconds: hands off")
             elif now_s - state.moving_since_s >= STILL_MOVING_S:
-                state.moving_since_s = now_s
+                state.moving_since_s, state.act = now_s, "HOLD STILL"
                 self._say(Severity.NOTICE, "It still moves: set it down, hands off")
         state.moved, state.since_s, state.still_s = True, now_s, 0.0
         return True

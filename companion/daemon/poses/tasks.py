@@ -44,6 +44,7 @@ SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 EXPECTED: Final = 12  # Usual number of poses in a six-position alignment
 MOST: Final = 24  # Maximum
+NOT_WRITTEN: Final = "not written (--write does)"
 _FIRST: Final = PoseRequest("any side down, propped up, hands off")
 TURN_LIMITED_M_S2: Final = 0.5 * MG
 """Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""
@@ -224,7 +225,7 @@ class TurnTask(SamePlaceTask):
         sides = self._known.known(first.name, self._imus[first.name].in_force, degrees.get(first.name))
         self.board = None if sides is None else mounting(first, sides, local.gravity_m_s2)
         if self.board is None and self.request.level:
-            raise CalibrationRefusedError("these accelerometers have no six-position calibration: align faces again")
+            raise CalibrationRefusedError("these accelerometers have no faces alignment: align faces again")
         return TurnRecord(
             measured_at=log.started,
             slope_deg=round(result.slope_deg, 3),
@@ -253,7 +254,7 @@ class TurnTask(SamePlaceTask):
         words = f"level known to {_level_sigma_m_s2(result) / MG:.2f} mg, the spot slopes by {result.slope_deg:.2f} deg"
         if board is not None:
             words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
-        end = "level written" if request.level else "written" if request.write else "not written"
+        end = "level written" if request.level else "written" if request.write else NOT_WRITTEN
         return f"{words}: {end}"
 
 
@@ -376,7 +377,7 @@ class SixPositionTask(PoseTask):
     def summary(self) -> str:
         bias_mg = max(float(found.sigma[BIAS].max()) for found in self._by_imu.values()) / MG
         scale = max(float(found.sigma[SCALE].max()) for found in self._by_imu.values())
-        end = "written" if self.request.write else "not written (--write does)"
+        end = "written" if self.request.write else NOT_WRITTEN
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:

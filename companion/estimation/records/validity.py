@@ -31,6 +31,8 @@ from companion.samples import Triad, Vector
 
 DRIFT_SIGMAS: Final = 2.0
 RESIDUAL_SIGMAS: Final = 3.0
+RETURNED_SIGMAS: Final = 2.0
+"""Threshold of a residual that was beyond RESIDUAL_SIGMAS: noise must not change the verdict every second."""
 WORTH_SIGMAS: Final = 2.0
 """Least improvement that is worth a new write, in sigmas; a smaller one would mostly write noise."""
 
@@ -100,6 +102,7 @@ class Present(msgspec.Struct, frozen=True, kw_only=True):
     residual: Vector
     sigma_use: Vector
     sigma: Vector  # `sigma_use` and `sigma` are as in `Held`
+    limit_sigmas: float = RESIDUAL_SIGMAS
 
 
 class Objection(NamedTuple):
@@ -172,8 +175,8 @@ def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor:
 
 
 def worst_axis(held: Held, present: Present) -> float | None:
-    """Return the largest signed change of the output beyond RESIDUAL_SIGMAS combined sigmas; None: all axes agree."""
-    return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
+    """Return the largest signed change of the output beyond `limit_sigmas` combined sigmas; None: all axes agree."""
+    return max(_off(present, held.expected, held.sigma, present.limit_sigmas), key=abs, default=None)
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:

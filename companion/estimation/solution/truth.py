@@ -196,7 +196,7 @@ def _up_by_sides(
         up_covariance = across @ covariance @ across.T
         sigma_deg = float(np.sqrt(np.linalg.eigvalsh(up_covariance)[-1])) / DEG
         angle, sigma_words = (
-            f"tilt by the accelerometers of imu {imu.name}, calibrated in six positions",
+            f"tilt by the accelerometers of imu {imu.name} after a faces alignment",
             f"{sigma_deg:.2g}",
         )
         warnings.append(message("angle_without_sensor", sensor="gradienter", angle=angle, sigma_deg=sigma_words))

@@ -2,7 +2,7 @@
 const DEG_H = Math.PI / 180 / 3600, MG = 9.80665e-3;
 const HOLD_MS = 1500, GONE_MS = 3000, AGAIN_MS = 1000, SLIP_PX = 80, DRAWN_MS = 10000;
 const $ = id => document.getElementById(id);
-let token = null, handedOut = false, source = null, heardAt = 0, page = null, shownRecords = null, counted = {}, busy = false;
+let token = null, handedOut = false, source = null, heardAt = 0, triedAt = 0, page = null, shownRecords = null, counted = {}, busy = false;
 
 function make(tag, text, className) {
   const it = document.createElement(tag);
@@ -18,16 +18,28 @@ function sign(name) {
   return svg;
 }
 const fixed = (value, digits, unit) => value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "−") + unit;
-// The command line's words, with the page's buttons in place of its commands.
-const here = words => words.replaceAll("`", "").replace("type companion calibrate", "hold CALIBRATE").replace("type companion undo", "hold UNDO")
-  .replace("(--write does)", "(to write, tick the box before the start)");
 const signed = (value, digits) => (value < 0 ? "−" : "+") + Math.abs(value).toFixed(digits);
 const ago = s => s < 99.5 ? Math.round(s) + " s ago" : s < 5970 ? Math.round(s / 60) + " min ago" : (s / 3600).toFixed(1) + " h ago";
 const utc = iso => iso.slice(0, 16).replace("T", " ") + " UTC";
 
+// Commands in texts of the daemon, and the buttons of this page that do the same.
+const BUTTONS = new Map([...document.querySelectorAll("button.hold, #cancel")].map(it =>
+  [it.dataset.name || it.id, it.querySelector("span").firstChild.textContent]));
+const COMMANDS = new RegExp("(type )?(`?)companion (" + [...BUTTONS.keys()].sort((a, b) => b.length - a.length).join("|")
+  + ")( --write)?\\2(?![\\w-]| --)", "gi");
+function inPageWords(text) {
+  const press = (_, type, quote, command, write) => {
+    const verb = command === "cancel" ? "tap " : "hold ";
+    return (type ? (type[0] === "T" ? verb[0].toUpperCase() + verb.slice(1) : verb) : "") + BUTTONS.get(command) + (write ? " with WRITE ticked" : "");
+  };
+  return text.replace(COMMANDS, press).replace("type `companion status`", "look at this page")
+    .replace(" (--write does)", ": tick WRITE before the start").replaceAll("`", "");
+}
+
 // --- display
 
-function headline(tone, word, reason) {
+function headline(tone, word, text) {
+  const reason = inPageWords(text);
   $("head").dataset.tone = tone;
   document.querySelector("#word use").setAttribute("href", "#" + tone);
   const span = document.querySelector("#word span");
@@ -40,7 +52,7 @@ function headline(tone, word, reason) {
 function show(status) {
   headline(status.headline.tone, status.headline.word, status.headline.reason);
   $("remedy").hidden = !status.remedy;
-  $("remedy").textContent = here(status.remedy || "");
+  $("remedy").textContent = inPageWords(status.remedy || "");
   firstRun(status.setup || null);
   if (status.setup) return;
   $("vehicle").textContent = status.vehicle.summary;
@@ -50,6 +62,7 @@ function show(status) {
   const aligns = status.stands !== null && status.stands.outcome === null;
   if (aligns !== document.body.classList.contains("aligning")) scrollTo(0, 0);
   document.body.classList.toggle("aligning", aligns);
+  document.body.classList.toggle("blocked", status.headline.word === "WAITING" || status.headline.tone === "bad");
   $("progress").hidden = !busy;
   if (busy) document.querySelector("#progress div").style.width = status.progress + "%";
   quality(status);
@@ -66,15 +79,11 @@ function show(status) {
   calibration(status.calibration, status.arming);
   const last = status.last, missed = last && last.state !== "done";
   $("last").hidden = !missed;
-  if (missed) $("last").textContent = "the last one: " + (last.reason.startsWith(last.state) ? last.reason : `${last.state}: ${last.reason}`);
+  if (missed) $("last").textContent = "the last one: " + inPageWords(last.reason.startsWith(last.state) ? last.reason : `${last.state}: ${last.reason}`);
   links(status);
-  byHand(status.by_hand);
+  byHand(status.by_hand, status.undoable);
   aloud(status);
-  const wrote = {"six-position calibration": ["faces"], "turn on the spot": ["turn", "level"]}[status.stands && status.stands.kind] || [];
-  const undone = status.by_hand.some(one => one.undone_at && wrote.includes(one.what));
-  stands(undone ? null : status.stands);
-  // No pose is wanted any more.
-  $("now").hidden = /^(WRITING|CHECKING|SETTLING)/.test(status.headline.word);
+  stands(status.stands, status);
   // Disable only buttons that make no sense: the daemon decides whether an action is allowed, and gives the reason.
   $("calibrate").disabled = busy || away;
   for (const button of document.querySelectorAll("#align button")) button.disabled = busy || away;
@@ -161,20 +170,27 @@ function calibration(found, arming) {
         earlier(found, imu.name, "accel"))];
   }));
 }
-function byHand(found) {
-  $("by-hand").replaceChildren(...found.flatMap(one => {
-    const written = Object.entries(one.written), list = make("details"), open = document.querySelector("#by-hand details[open]");
-    list.append(make("summary", `${written.length} parameters written`), ...written.map(([name, value]) => make("p", `${name} ${+value.toPrecision(6)}`, "note")));
-    list.open = open !== null;
+let shownByHand = null;
+function byHand(found, undoable) {
+  const key = JSON.stringify([found, undoable]);
+  if (key === shownByHand) return;
+  shownByHand = key;
+  const open = new Set([...document.querySelectorAll("#by-hand details[open]")].map(it => it.dataset.at));
+  $("by-hand").replaceChildren(...found.map(one => {
+    const rows = written(one, undoable), it = make(rows.length ? "details" : "p", undefined, "note");
     const end = one.undone_at ? `undone ${utc(one.undone_at)}` : one.in_force ? "active" : one.in_force === false ? "changed since" : "";
-    const words = `${one.what}, ${utc(one.measured_at)}: ${one.state === "failed" ? "failed: " : ""}${here(one.reason)}`;
-    return [make("p", words + (written.length && end ? `; ${end}` : ""), "note"), ...(written.length ? [list] : [])];
+    const line = make(rows.length ? "summary" : "span", `: ${one.state === "failed" ? "failed: " : ""}${inPageWords(one.reason)}` + (rows.length && end ? `; ${end}` : ""));
+    line.prepend(make("b", one.what.toUpperCase()), `, ${utc(one.measured_at)}`);
+    it.append(line, ...rows.map(words => make("div", words)));
+    it.dataset.at = one.measured_at;
+    it.open = open.has(one.measured_at);
+    return it;
   }));
 }
 function link(good, name, words, remedy) {
   const row = make("div", undefined, good ? "link" : "link bad"), text = make("div");
-  text.append(make("b", name + " "), document.createTextNode(words));
-  if (remedy) text.append(make("p", here(remedy), "note"));
+  text.append(make("b", name + " "), document.createTextNode(inPageWords(words)));
+  if (remedy) text.append(make("p", inPageWords(remedy), "note"));
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
@@ -191,11 +207,11 @@ async function records() {
     const it = make("details"), head = make("summary"), body = make("div"), get = make("a", "DOWNLOAD", "button");
     it.dataset.file = file;
     it.open = open.has(file);
-    head.append(make("b", record.undone_at ? "undone" : record.state), document.createTextNode(` ${utc(record.started_at)}: ${record.reason}`));
+    head.append(make("b", record.undone_at ? "undone" : record.state), document.createTextNode(` ${utc(record.started_at)}: ${inPageWords(record.reason)}`));
     body.append(make("p", `${Math.round(record.duration_s)} s` + (record.pose ? `; pitch ${fixed(record.pose.theta_deg, 2, "°")}, roll `
       + `${fixed(record.pose.gamma_deg, 2, "°")}, heading ${fixed(record.pose.psi_deg, 1, "°")}` : ""), "note"));
     for (const imu of record.imus) body.append(make("p", figures(imu, record.undone_at), "note"));
-    for (const warning of record.warnings) body.append(make("p", "warning: " + warning, "note"));
+    for (const warning of record.warnings) body.append(make("p", "warning: " + inPageWords(warning), "note"));
     get.href = "/records/" + file;
     get.download = file;
     body.append(get);
@@ -230,6 +246,7 @@ setInterval(temperature, DRAWN_MS);
 
 let refused = null; // reason why the server does not accept this viewer
 function listen() {
+  triedAt = Date.now();
   if (source) source.close();
   // A viewer with the token is accepted even if many viewers without it are connected.
   source = new EventSource("/events" + (token ? "?token=" + encodeURIComponent(token) : ""));
@@ -251,16 +268,23 @@ function listen() {
   source.onmessage = event => { heardAt = Date.now(); refused = null; show(JSON.parse(event.data)); };
   source.onerror = () => { source.close(); source = null; setTimeout(() => source || listen(), AGAIN_MS); };
 }
-setInterval(() => {
-  const silent = Date.now() - heardAt;
-  if (silent < GONE_MS) return;
-  headline("gone", "NO LINK", refused || (heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
+let watchedAt = Date.now(), awakeAt = 0;
+function watch() {
+  const now = Date.now(), asleep = now - watchedAt > GONE_MS;
+  watchedAt = now;
+  if (now - heardAt < GONE_MS) return;
+  // Browsers stop a page that nobody sees: that silence tells nothing about the companion.
+  if (asleep) { awakeAt = now; listen(); }
+  const silent = now - Math.max(heardAt, awakeAt);
+  if (silent < GONE_MS) headline("gone", "RECONNECTING", "this page was asleep");
+  else headline("gone", "NO LINK", refused || (heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
     : "no word from the companion yet"));
   $("progress").hidden = true;
   for (const button of document.querySelectorAll("#keys button, #align button")) button.disabled = true;
-  if (source && silent > 2 * GONE_MS && heardAt) { heardAt = Date.now() - GONE_MS; listen(); }
-}, 500);
-document.addEventListener("visibilitychange", () => { if (!document.hidden && Date.now() - heardAt > GONE_MS) listen(); });
+  if (source && now - triedAt > (heardAt ? 2 : 5) * GONE_MS) listen();
+}
+setInterval(watch, 500);
+document.addEventListener("visibilitychange", () => { if (!document.hidden) watch(); });
 
 // --- actions
 
@@ -284,7 +308,7 @@ async function act(what, path, body) {
     const answer = await fetch("/" + path, {method: "POST", body: JSON.stringify(body),
       headers: {"Content-Type": "application/json", "X-Companion-Token": token}});
     const said = await answer.json();
-    say(`${what}: ${said.reason}`, !answer.ok || said.state === "failed");
+    say(`${what}: ${inPageWords(said.reason)}`, !answer.ok || said.state === "failed");
     if (answer.status === 403 && !handedOut) $("ask").hidden = false;
   } catch { say(`${what}: no answer from the companion`, true); }
 }
@@ -302,7 +326,7 @@ if (location.hash.startsWith("#token=")) {
 } else { try { token = localStorage.getItem("token"); } catch { /* none */ } }
 
 for (const button of document.querySelectorAll("button.hold")) {
-  const name = button.dataset.name || button.id, path = name.split(" ")[0];
+  const command = button.dataset.name || button.id, name = BUTTONS.get(command), path = command.split(" ")[0];
   let timer = 0, from = null;
   const stop = () => {
     if (timer) { clearTimeout(timer); timer = 0; say("hold " + name + " for 1.5 s", true); }
@@ -319,7 +343,7 @@ for (const button of document.querySelectorAll("button.hold")) {
       if (navigator.vibrate) navigator.vibrate(80);
       const body = JSON.parse(button.dataset.body || "{}");
       if ($("write").checked && ["faces", "turn"].includes(body.action) && !body.level) body.write = true;
-      act(name + (body.write ? " --write" : ""), path, body);
+      act(name + (body.write ? " with WRITE" : ""), path, body);
     }, HOLD_MS);
   };
   button.addEventListener("pointerdown", event => {
@@ -337,5 +361,5 @@ for (const button of document.querySelectorAll("button.hold")) {
   button.addEventListener("keydown", event => { if (!event.repeat && (event.key === "Enter" || event.key === " ")) start(); });
   button.addEventListener("keyup", stop);
 }
-$("cancel").addEventListener("click", () => act("cancel", "cancel", {}));
+$("cancel").addEventListener("click", () => act("CANCEL", "cancel", {}));
 listen();

@@ -64,26 +64,34 @@ function picture(up, turnDeg, label) {
   return svg;
 }
 
-let shownStands = null;
-function stands(found) {
-  $("stands").hidden = found === null;
-  if (found === null) return;
-  const running = found.outcome === null, [first, unknown] = found.wish.split(/: (.*)/), [wish, grip] = first.split(/, (.*)/);
+const DISMISSED_KEY = "dismissed", END = {done: "DONE", failed: "FAILED", cancelled: "CANCELLED", undone: "UNDONE"};
+let shownStands = null, shownEnd = "", dismissed = null;
+function stands(found, status) {
+  const running = found !== null && found.outcome === null;
+  if (running) dismiss("");
+  const ended = running ? null : end(found, status);
+  shownEnd = ended ? ended.key : "";
+  $("stands").hidden = found === null || (ended !== null && dismissed === ended.key);
+  if ($("stands").hidden) return;
+  const [first, why] = found.wish.split(/: (.*)/), [wish, grip] = first.split(/, (.*)/);
+  const writing = running && ["writing", "verifying"].includes(status.state);
   if (found.share > 0) $("still").textContent = "";
   $("share").style.strokeDasharray = `${100 * found.share} 100`;
-  $("result").textContent = running ? "" : here(found.words);
-  const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, found.outcome]);
+  $("now").classList.toggle("writing", writing);
+  $("grip").textContent = writing ? status.reason : grip || (found.unknown.length ? "" : why || "");
+  $("wish").textContent = writing ? "leave it as it is" : wish;
+  const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, ended]);
   if (key === shownStands) return;
   shownStands = key;
-  $("standing").textContent = running ? `${found.number} of ${found.total}` : found.outcome === "done" ? "DONE: put it down" : found.outcome.toUpperCase();
-  const writes = found.writes ? "the result will be written" : "nothing will be written";
-  $("kind").textContent = running && !found.kind.startsWith("gradienter") ? writes : found.kind;
-  $("stands").dataset.outcome = found.outcome || "";
-  $("wish").textContent = wish;
-  const why = unknown && !/\d/.test(unknown) ? unknown : "";
-  $("grip").textContent = [grip, why].filter(Boolean).join("; ");
+  const what = found.what.toUpperCase();
+  $("standing").textContent = running ? `${what}: ${found.number} of ${found.total}` : ended.title;
+  $("writes").textContent = !running || ["zero", "tilts"].includes(found.what) ? ""
+    : found.write ? "will be written to the autopilot" : "will not be written: WRITE is not ticked";
+  $("result").textContent = running ? "" : `${what}: ${ended.words}`;
+  $("written").replaceChildren(...(running ? [] : ended.written.map(words => make("div", words))));
+  $("stands").dataset.outcome = running ? "" : ended.outcome;
   $("still").textContent = found.share > 0 ? "" : found.objection || "";
-  $("unknowns").textContent = found.unknown.length ? "not known yet: " + found.unknown.join(", ") : unknown || "";
+  $("unknowns").textContent = running && found.unknown.length ? "not known yet: " + found.unknown.join(", ") : "";
   $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
   const left = Math.max(found.total - found.done.length, 0);
   $("done").replaceChildren(...found.done.map((up, k) => {
@@ -92,3 +100,25 @@ function stands(found) {
     return it;
   }), ...Array.from({length: running ? left : 0}, (_, k) => make("li", String(found.done.length + k + 1))));
 }
+// How an alignment ended, and what has become of it since; `key` tells it from others that were dismissed.
+function end(found, status) {
+  if (found === null) return null;
+  const one = status.by_hand.find(({what, reason}) => what === found.what && reason === found.words);
+  const outcome = one && one.undone_at ? "undone" : found.outcome;
+  const title = END[outcome] + (outcome === "done" && ["faces", "tilts"].includes(found.what) ? ": put it down" : "");
+  const words = outcome === "undone" ? "the old values are restored" : inPageWords(found.words);
+  return {title, outcome, words, written: one && outcome !== "undone" ? written(one, status.undoable) : [], key: JSON.stringify([found.what, outcome, words])};
+}
+// Parameters that an alignment wrote; the old values are known as long as it can be undone.
+function written(one, undoable) {
+  const step = undoable.find(({at}) => at === one.measured_at), before = step ? step.before : {};
+  const short = value => String(+value.toPrecision(6)).replace("-", "−");
+  return Object.entries(one.written).map(([name, value]) => `${name} ${name in before ? short(before[name]) + " → " : ""}${short(value)}`);
+}
+function dismiss(key) {
+  if (dismissed === key) return;
+  dismissed = key;
+  try { localStorage.setItem(DISMISSED_KEY, key); } catch { /* private window: shown again after a reload */ }
+}
+try { dismissed = localStorage.getItem(DISMISSED_KEY); } catch { /* none */ }
+document.getElementById("dismiss").addEventListener("click", () => { dismiss(shownEnd); $("stands").hidden = true; });

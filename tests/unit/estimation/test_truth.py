@@ -139,14 +139,14 @@ def test_without_sides_nobody_knows_the_tilt() -> None:
     without = solve(window, LOCAL, None, None, What.BOTH).pose
     assert {without.tilt_from, without.theta_deg, without.gamma_deg, without.sigma_deg.theta} == {None}
     assert later.solution.imus[0].accel_m_s2 is None, "a tilt by the accelerometers says nothing of themselves"
-    assert "tilt by the accelerometers of imu fc, calibrated in six positions" in " ".join(later.solution.warnings)
+    assert "tilt by the accelerometers of imu fc after a faces alignment" in " ".join(later.solution.warnings)
 
 
 def test_accelerometers_that_read_another_gravity_give_no_tilt_and_are_named() -> None:
     sensor = Wandering(1)
     later = sensor.later(sensor.known(), 60.0, np.full(3, 5.0 * MG), 0.0)
     assert later.solution.pose.tilt_from is None
-    assert "more gravity than in its six-position calibration" in " ".join(later.solution.warnings)
+    assert "more gravity than in its faces alignment" in " ".join(later.solution.warnings)
 
 
 @pytest.mark.parametrize("off_deg", [-15.0, 0.0, 12.0])

@@ -10,15 +10,7 @@ import pytest
 
 from companion.config.sections import AllanModel, Calibration
 from companion.estimation.noise.allan import PROFILES, predicted_sigma
-from companion.estimation.records.validity import (
-    DRIFT_SIGMAS,
-    Held,
-    Present,
-    Why,
-    age_limit_s,
-    judge,
-    worth_writing,
-)
+from companion.estimation.records.validity import DRIFT_SIGMAS, Held, Present, Why, age_limit_s, judge, worth_writing
 from companion.physics.units import DEG_H
 from companion.samples import Vector
 from tests.support.histories import imu_record
