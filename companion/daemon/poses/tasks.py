@@ -10,7 +10,6 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import changes_for, whole_accelerometer
 from companion.autopilot.parameters.change import Change
-from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -125,6 +124,13 @@ class ZeroTask(SamePlaceTask):
         assert core.config.gradienter is not None
         self._gradienter, self.zero_deg = gradienter, core.config.gradienter.offset_deg
 
+    def wish(self, state: SessionState) -> PoseRequest | None:
+        wish = super().wish(state)
+        slope_deg = math.degrees(math.acos(-state.poses[0].up[2])) if len(state.poses) == 1 else 0.0
+        if wish is None or slope_deg <= SLOPE_WARNING_DEG:
+            return wish
+        return wish._replace(words=f"{wish.words}: better on flatter ground, it slopes by {slope_deg:.1f} deg")
+
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         if now.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this pose")
@@ -137,8 +143,6 @@ class ZeroTask(SamePlaceTask):
         else:
             heading_deg = vehicle_heading_rad(self._compass, now.heading.heading_deg, up) / DEG
             pose = HeldPose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
-        if not state.poses and (slope_deg := math.degrees(math.acos(-up[2]))) > SLOPE_WARNING_DEG:
-            self._core.say(Severity.WARNING, f"Take flatter ground: it slopes by {slope_deg:.1f} degrees")
         return pose, objection(self.request, state.poses, pose)
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
