@@ -22,6 +22,7 @@ from companion.estimation.alignment.align_model import Ground, PoseMeans
 from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, mounting, seen_before
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
+    LEVEL,
     AlignmentRequest,
     HeldPose,
     PoseRequest,
@@ -125,9 +126,9 @@ class ZeroTask(SamePlaceTask):
         self._gradienter, self.zero_deg = gradienter, core.config.gradienter.offset_deg
 
     def wish(self, state: SessionState) -> PoseRequest | None:
-        wish = super().wish(state)
-        slope_deg = math.degrees(math.acos(-state.poses[0].up[2])) if len(state.poses) == 1 else 0.0
-        if wish is None or slope_deg <= SLOPE_WARNING_DEG:
+        wish, (ahead, right, down) = super().wish(state), state.poses[0].up if state.poses else LEVEL
+        slope_deg = math.degrees(math.atan2(math.hypot(ahead, right), -down))
+        if wish is None or len(state.poses) != 1 or slope_deg <= SLOPE_WARNING_DEG:
             return wish
         return wish._replace(words=f"{wish.words}: better on flatter ground, it slopes by {slope_deg:.1f} deg")
 
