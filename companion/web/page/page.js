@@ -200,7 +200,9 @@ function links(status) {
 }
 async function records() {
   let found;
-  try { found = (await (await fetch("/records.json")).json()).records; } catch { shownRecords = null; return; }
+  try { found = (await (await fetch("/records.json")).json()).records; } catch { /* asked for again below */ }
+  // A daemon that has just started may refuse: the next status asks again.
+  if (!found) { shownRecords = null; return; }
   recordsRead = found;
   const open = new Set([...document.querySelectorAll("details[open]")].map(it => it.dataset.file));
   $("records").replaceChildren(...(found.length ? found.map(({file, record}) => {
@@ -339,7 +341,7 @@ for (const button of document.querySelectorAll("button.hold")) {
     timer = setTimeout(() => {
       timer = 0;
       button.classList.remove("held");
-      if (button.disabled) return;
+      if (button.disabled) { say(`${name}: not possible just now, hold it again`, true); return; }
       if (navigator.vibrate) navigator.vibrate(80);
       const body = JSON.parse(button.dataset.body || "{}");
       if ($("write").checked && ["faces", "turn"].includes(body.action) && !body.level) body.write = true;
