@@ -22,7 +22,7 @@ TEMPERATURE: Final = "temperature curve"
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 
 Act = Literal["", "PUT IT DOWN", "TURN IT", "HOLD STILL"]
-"""What the operator of an alignment must do now, as the headline shows it; empty: wait."""
+"""Present task of an alignment's operator, shown by the headline; empty: wait."""
 GoOn = Callable[[str], None]
 """Callback, called during a long wait: it sets the progress text, and raises `JobCancelledError` after a cancel."""
 
