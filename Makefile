@@ -55,9 +55,10 @@ quick: $(VENV)/.dev
 
 # Both parts always run, and both have to be green. Real autopilots (sitl) want a core of their own. The second part does
 # without the plugin of Hypothesis: it reads every source for constants, in every worker.
+# The daemon's children have niceness 19: with tests of less, they would starve.
 test: $(VENV)/.dev
 	@$(PYTEST) -n $(JOBS) -m 'not real_clock or sitl' $(if $(DURATIONS),--write-durations); working=$$?; \
-	$(PYTEST) -p no:hypothesispytest -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations) && exit $$working
+	nice -n 19 $(PYTEST) -p no:hypothesispytest -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations) && exit $$working
 
 long: $(VENV)/.dev
 	@TESTS=long $(PYTEST) -n $(JOBS)
