@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from companion.formats import Object
-from companion.links.system.process import ChildSettings, run_child
+from companion.links.system.process import REPORT_EVERY_S, ChildSettings, run_child
 
 
 class Work:
@@ -45,6 +45,8 @@ class Work:
                     sys.stdout.buffer.flush()
             await asyncio.get_running_loop().create_future()
         except asyncio.CancelledError:
+            if self.manner == "slow end":
+                await asyncio.sleep(1.5 * REPORT_EVERY_S)
             self.note("ended")
             raise
 

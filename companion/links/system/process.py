@@ -223,13 +223,14 @@ async def _run(work: ChildWork) -> None:
 
     def end() -> None:
         loop.remove_reader(sys.stdin)
-        working.cancel()
+        if not working.cancelling():  # a second cancellation would break off what the work does at its end
+            working.cancel()
 
     loop.add_signal_handler(signal.SIGTERM, end)
     loop.add_reader(sys.stdin, end)
     await asyncio.wait([working, reporting], return_when=asyncio.FIRST_COMPLETED)
-    for task in (working, reporting):
-        task.cancel()
+    end()
+    reporting.cancel()
     for result in await asyncio.gather(working, reporting, return_exceptions=True):
         if isinstance(result, Exception):
             raise result
@@ -244,6 +245,9 @@ def _on_error(loop: asyncio.AbstractEventLoop, context: Object) -> None:
 
 async def _report(work: ChildWork) -> None:
     while True:
-        sys.stdout.buffer.write(msgspec.json.encode(work.status()) + b"\n")
-        sys.stdout.buffer.flush()
+        try:
+            sys.stdout.buffer.write(msgspec.json.encode(work.status()) + b"\n")
+            sys.stdout.buffer.flush()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # its daemon was killed: stdin has ended
         await asyncio.sleep(REPORT_EVERY_S)

@@ -27,7 +27,6 @@ source = "autopilot"
 [storage]
 directory = "{}"
 """
-"""No child of these tests opens the autopilot's link."""
 
 pytestmark = pytest.mark.real_clock
 
@@ -108,8 +107,9 @@ def test_a_child_that_ignores_the_request_to_end_is_killed(tmp_path: Path, monke
     assert not Path(f"/proc/{process_id}").exists()
 
 
-def test_a_child_ends_when_its_daemon_is_gone(tmp_path: Path) -> None:
-    environment = {**os.environ, "COMPANION_TEST_CHILD": "work"}
+def test_a_child_whose_daemon_was_killed_does_its_last_work_whole(tmp_path: Path) -> None:
+    """A report finds nobody who reads it while the child does what it has to do at its end."""
+    environment = {**os.environ, "COMPANION_TEST_CHILD": "slow end"}
     with subprocess.Popen(
         [sys.executable, "-m", MODULE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
     ) as process:
@@ -119,5 +119,6 @@ def test_a_child_ends_when_its_daemon_is_gone(tmp_path: Path) -> None:
         process.stdin.flush()
         assert msgspec.json.decode(process.stdout.readline())["good"]
         process.stdin.close()
+        process.stdout.close()
         assert process.wait() == 0
     assert _log(tmp_path)[-1] == "ended"
