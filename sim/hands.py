@@ -23,17 +23,15 @@ from sim.motions import Handling, Turn
 TAKES_S: Final = 6.0
 AHEAD_S: Final = 0.1
 """Lead of a real firmware's readings over the simulator's clock."""
-HELP: Final = (
-    "turn DEG | tilt PITCH ROLL | hold PITCH ROLL | spot PITCH ROLL | back | bump PITCH ROLL | grip SECONDS"
-    " | wait SECONDS"
-)
 PLACEMENT_DEG, PROPPED_DEG = 0.02, 4.0
 """Sigmas of the error when placing the aircraft on marks by careful hands, and when propping it up; degrees."""
-_EXAMPLES: Final = (
-    "turn 180: clockwise on its spot; tilt 20 0: nose up; hold 0 180: on its back, whatever the spot; spot 3 0:"
-    " onto another one, which slopes; back: onto its spot; bump 0.3 0: the spot tips; grip 20: a hand stays on it;"
-    " wait 20: the next line later"
+HANDS: Final = (
+    "turn DEG: clockwise on its spot; tilt PITCH ROLL: nose up and right side down against its spot (tilt 20 0); hold"
+    " PITCH ROLL: against the horizon (hold 0 180: on its back); spot PITCH ROLL: onto another spot, which slopes so;"
+    " back: onto its spot; bump PITCH ROLL: the spot tips; grip SECONDS: a hand stays on it; wait SECONDS: before the"
+    " next line"
 )
+"""Typed lines, each with its meaning."""
 SIDES: Final = {
     "level": (0.0, 0.0),
     "on its back": (0.0, 180.0),
@@ -170,7 +168,7 @@ class Hands:
         except ValueError:
             count, figures = -1, []
         if len(figures) != count:
-            return f"found {line.strip()!r}; allowed: {HELP} ({_EXAMPLES})"
+            return f"found {line.strip()!r}; allowed: {HANDS}"
         move(t_s, *figures)
         if word == "bump":
             return "the spot has tipped; it shows when the aircraft is put onto it again"

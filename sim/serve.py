@@ -17,7 +17,7 @@ from pathlib import Path
 from sim.accuracy import cli as accuracy
 from sim.aircraft import Pose
 from sim.devices import SerialDevice
-from sim.hands import HELP, PLACEMENT_DEG, PROPPED_DEG, Hands, take_lines
+from sim.hands import HANDS, PLACEMENT_DEG, PROPPED_DEG, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import MOTIONS, TURN_DEG_S, motions_of
 from sim.pty_device import PtyDevice
@@ -107,6 +107,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("fly", help="a real firmware flies with our heading, and something fails")
     commands.add_parser("recordings", help="is sigma honest on recordings of real sensors at rest")
     commands.add_parser("rest", help="a log of an IMU at rest for hours, to try `companion log profile` with")
+    commands.add_parser("recordings", help="sigma and error of the estimator on recordings of real sensors")
     accuracy.add_options(commands.add_parser("accuracy", help=accuracy.HELP))
     return top
 
@@ -135,7 +136,7 @@ def add_world_options(command: argparse.ArgumentParser) -> None:
 
 
 def add_hands(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
+    command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HANDS}")
 
 
 def hands_of(arguments: argparse.Namespace, scenario: Scenario) -> Hands | None:
