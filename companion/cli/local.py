@@ -50,7 +50,7 @@ def _add_setup_options(option: Callable[..., argparse.Action]) -> None:
     option("--mounting", action="append", default=[], metavar="DEVICE=HOW", help=words)
     words = "of an IMU by its name: fc=icm42688p (bmi088, adis16470, adis16405, unknown)"
     option("--part", action="append", default=[], metavar="IMU=PART", help=words)
-    option("--no-check", action="store_true", help="write the file only")
+    option("--no-check", action="store_true", help="write the file only; IMU 2 and 3 are not looked for")
     option("--no-service", action="store_true", help="do not offer to start it at every boot")
 
 

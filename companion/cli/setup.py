@@ -132,7 +132,9 @@ class _Session:
         told: dict[str, str | None] = {}
         if daemon is not None:
             told = {one["imu"]: one["name"] for one in daemon.get("profiles", ()) if one["by_device_id"]}
-        elif not self._options.no_check:
+        elif self._options.no_check:
+            say("--no-check: the autopilot is not asked for IMU 2 and 3; companion setup without it finds them")
+        else:
             told = await _ask_autopilot(self.asking, draft, by_default=is_new)
         names = [imu["name"] for imu in draft.wanted["imu"]]
         to_ask = [name for name in names if told.get(name) is None or name in parts]
@@ -248,6 +250,8 @@ class _Session:
         chosen = await self._choose(kind.capitalize() if kind != "imu" else "Own IMU", names)
         if chosen in named:
             draft.take(kind, *named[chosen])
+            if kind == "imu":
+                self.asking.say("  Its biases are shown only, not written to the autopilot (see autopilot_instance).")
 
     async def _choose(self, what: str, names: Sequence[str]) -> str:
         if len(names) == 1:
@@ -394,9 +398,6 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
         yield f"{command} align faces --write   (once: accelerometers too, in about 12 poses, held by hand, 5 min)"
-
-
-# --- the IMUs of the autopilot
 
 
 def _refuse_wrong(given: dict[str, str]) -> None:

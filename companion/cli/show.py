@@ -66,6 +66,8 @@ def _imu_lines(imu: Object) -> list[str]:
         lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
         if imu["written"] and imu.get(left) not in (None, imu[bias]):
             lines.append(f"      change {unit} {axes(imu[left], None, form, scale)}")
+    if not imu["written"] and imu.get("residual_gyro_rad_s") is imu.get("residual_accel_m_s2") is None:
+        lines.append("  shown only, not written to the autopilot")
     lines += written_lines(imu["written"])
     lines += [f"  warning: {warning}" for warning in imu["warnings"]]
     return lines

@@ -37,9 +37,6 @@ def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     hurry(monkeypatch, BEST)
 
 
-# --- it comes and goes
-
-
 def test_the_last_will_after_the_daemon_was_killed(tmp_path: Path) -> None:
     async def main() -> None:
         async with broker(tmp_path) as one, peer(one) as watcher:
@@ -108,9 +105,6 @@ def test_a_vehicle_that_is_heard_late_moves_to_its_own_topics(tmp_path: Path, mo
             await asyncio.wait([task])
 
     asyncio.run(main())
-
-
-# --- who may speak
 
 
 @pytest.mark.parametrize("kind", KINDS)

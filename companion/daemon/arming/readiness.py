@@ -82,8 +82,6 @@ class Readiness:
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
 
-    # --- the answer
-
     def answer(self) -> ArmAnswer:
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
@@ -153,6 +151,7 @@ class Readiness:
         if glance.obstacle is not None and not glance.moving:
             yield ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
+            reading = f"{Why.UNDONE.value}; {reading}" if self.in_force.undone else reading
             yield ArmAnswer("wait", reading, against=reading)
         if findings := self.in_force.findings(now_s):
             first, remedy = findings[0], self._automatic.why_not()
@@ -167,8 +166,6 @@ class Readiness:
             yield ArmAnswer("refuse", self.owed.words, against=self.owed.words)
         if glance.moving or glance.steady_s < STEADY_S:
             yield ArmAnswer.hold_still(STEADY_S - glance.steady_s)
-
-    # --- remaining time
 
     def _until_calibrated_s(self, now_s: float) -> float:
         status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
@@ -196,8 +193,6 @@ class Readiness:
         if state is State.VERIFYING:
             return ArmAnswer.hold_still(self._check_s - self._collector.glance(now_s).still_s, words, words)
         return ArmAnswer("wait", f"{words}: {left_s} s at most" if left_s else f"{words}: wait", against=words)
-
-    # --- texts for arming, status and history
 
     def state(self, now_s: float) -> tuple[ArmedState, str]:
         state, words = self._state(now_s)

@@ -225,7 +225,11 @@ class Calibrating(Subsystem):
             task = TurnTask(self._core, request, self._imus, self.faces)
         else:
             task = ZeroTask(self._core, request, self.alignment)
-        return await self.stands.run(job, task)
+        result = await self.stands.run(job, task)
+        if request.write and request.action == "faces":
+            self.memory.forgotten()  # the new scales end them; a calibration need not warn of that
+            await self.memory.keep({})
+        return result
 
     def _why_not_aligned(self, request: AlignmentRequest) -> str | None:
         if _KINDS[request.action] == ALIGNMENT:
@@ -260,8 +264,6 @@ class Calibrating(Subsystem):
                 "text": job.words,
             }
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
-
-    # --- bias curves over temperature, written as the autopilot's temperature calibration
 
     def _why_no_curve_undo(self) -> str | None:
         steps = self._offsets.journal.steps(self._core.vehicle.system_id)
