@@ -107,7 +107,6 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("fly", help="a real firmware flies with our heading, and something fails")
     commands.add_parser("recordings", help="is sigma honest on recordings of real sensors at rest")
     commands.add_parser("rest", help="a log of an IMU at rest for hours, to try `companion log profile` with")
-    commands.add_parser("recordings", help="sigma and error of the estimator on recordings of real sensors")
     accuracy.add_options(commands.add_parser("accuracy", help=accuracy.HELP))
     return top
 
