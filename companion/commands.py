@@ -169,17 +169,27 @@ class Calibrate(Command, frozen=True, tag="calibrate"):
 
 
 class Align(Command, frozen=True, tag="align"):
-    help = "measure the gradienter's zero, or the accelerometers by hand"
+    help = "measure the gradienter's zero, or accelerometers and compasses by hand"
     by = _SHELL | Interface.PAGE
     action: Annotated[
-        Literal["zero", "tilts", "turn", "faces", "show", "forget"] | None,
+        Literal["zero", "tilts", "turn", "faces", "compass", "show", "forget"] | None,
         Field(by=by),
     ] = None
     headings: Annotated[
-        Literal[2, 4] | None,
+        Literal[2, 3, 4, 6, 8] | None,
         Field(
-            "2 (default for zero): turn by 180 deg, then the same way to the start; 4 (default for turn): every 90 deg",
+            "2 (default for zero): turn by 180 deg, then the same way to the start; 4 (default for turn and compass):"
+            " every 90 deg; compass also: 3, 6, 8",
             by=by,
+        ),
+    ] = None
+    heading: Annotated[
+        Annotated[float, msgspec.Meta(ge=0.0, le=360.0)] | None,
+        Field(
+            "true heading of the first pose, if a line on the ground tells it to 2 deg",
+            by=by,
+            metavar="DEG",
+            allowed_words="a number from 0 to 360",
         ),
     ] = None
     level: Annotated[bool, Field("after faces: write the tilt of the board (AHRS_TRIM, SENS_BOARD)", by=by)] = False

@@ -37,6 +37,10 @@ ALIGNMENTS: Final = {
         ("headings", "level", "write", "timeout_s"),
     ),
     "faces": ("accelerometers by hand, in about 12 poses on any side", ("write", "timeout_s")),
+    "compass": (
+        "the autopilot's compasses, by turning on one place (no heading need be known)",
+        ("headings", "heading", "write", "timeout_s"),
+    ),
     "show": ("show the stored alignment", ()),
     "forget": ("return to the zero and sigma of the configuration", ()),
 }
@@ -281,7 +285,25 @@ def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float]
     return [_figure_line(words, "mg", whole, sigma, "+.3f"), _figure_line("  change", "mg", left, None, "+.3f")]
 
 
+def compass_lines(record: Object) -> list[str]:
+    turns = " ".join(f"{turn:+.0f}" for turn in record["turns_deg"])
+    heading = f"{record['heading_deg']:.1f} +- {record['heading_sigma_deg']:.1f} deg, then {turns or 'no turn'}"
+    tilt = f"tilt up to {record['tilt_deg']:.1f} deg"
+    lines = [f"measured {record['measured_at'][:19]} UTC; first heading {heading}; {tilt}"]
+    for one in record["compasses"]:
+        good = f"{one['heading_sigma_deg']:.1f} deg, leaned by 10 deg {one['heading_sigma_leaned_deg']:.1f}"
+        lines += [
+            f"compass {one['number']}: heading good to {good}; it was up to {one['heading_before_deg']:.1f} deg off",
+            _figure_line("hard iron", "mG", one["offset_mgauss"], one["offset_sigma_mgauss"], "+.1f"),
+            _figure_line("soft iron", "", one["soft_diagonal"], None, "+.4f"),
+            *show.written_lines(one["written"]),
+        ]
+    return [*lines, *(f"warning: {words}" for words in record["warnings"])]
+
+
 def pose_lines(record: Object) -> list[str]:
+    if record["kind"] == "compass":
+        return compass_lines(record)
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} poses{slope}"]
     zero: list[str] = []

@@ -9,7 +9,7 @@ from typing import Final, Literal
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.estimation.machine import What
-from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
+from companion.estimation.records.align_record import HandRecord
 from companion.estimation.records.record import Record
 from companion.formats import Object
 from companion.links.system.events import comes
@@ -18,8 +18,9 @@ from companion.storage.changes import BY_TEMPERATURE
 ALIGNMENT: Final = "gradienter alignment"
 FACES: Final = "faces alignment"
 TURN: Final = "turn on the spot"
+COMPASS: Final = "compass alignment"
 TEMPERATURE: Final = "temperature curve"
-NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
+NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, COMPASS, TEMPERATURE)
 
 Act = Literal["", "PUT IT DOWN", "TURN IT", "HOLD STILL"]
 """Present task of an alignment's operator, shown by the headline; empty: wait."""
@@ -51,7 +52,7 @@ class Job:
         self.was_armed = False
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s  # Event-loop time; None: no limit
         self.finished: asyncio.Future[JobResult] = loop.create_future()
-        self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Object | None = None
+        self.product: Record | HandRecord | Object | None = None
         self.undid_calibration = kind == "undo"
         """True if this job has undone a calibration; False for the undo of an alignment or a temperature curve."""
         self.words = ""  # Present activity, as text for people
@@ -73,7 +74,7 @@ class Job:
 
     @property
     def short(self) -> str:
-        return {FACES: "faces", TURN: "turn", TEMPERATURE: BY_TEMPERATURE}.get(self.kind, self.kind)
+        return {FACES: "faces", TURN: "turn", COMPASS: "compass", TEMPERATURE: BY_TEMPERATURE}.get(self.kind, self.kind)
 
     @property
     def left_s(self) -> float:

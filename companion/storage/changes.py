@@ -28,7 +28,7 @@ AUTOMATIC: Final = "auto calibration"
 BY_TEMPERATURE: Final = "temperature"
 PREDICTION: Final = "gyro prediction"
 """Kind of a write of predicted gyro offsets: made by versions before 0.2 only, but can still be undone."""
-BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
+BY_HAND: Final = ("faces", "turn", "level", "compass", BY_TEMPERATURE, PREDICTION)
 """Kinds of writes without a calibration record: alignments, and offsets from temperature curves."""
 
 

@@ -10,7 +10,7 @@ from typing import Final
 
 SECTIONS: Final = (
     "white", "floors", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "power-up",
-    "mid-warm-up",
+    "mid-warm-up", "compasses",
 )  # fmt: skip
 HELP: Final = "errors and sigmas of the estimator, beside the physical bound"
 

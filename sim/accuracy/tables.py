@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from sim.accuracy import by_hand, deck, temperature, turning, warmup
+from sim.accuracy import by_hand, compasses, deck, temperature, turning, warmup
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -95,6 +95,10 @@ def report(
         progress(f"by hand: {each} aircraft of each of {len(by_hand.BY_HAND)} parts")
         boards = product(by_hand.BY_HAND, [seed], range(each))
         found["by-hand"] = by_hand.section(many(by_hand.by_hand, [*boards], jobs), each)
+    if "compasses" in only:
+        each = max(runs // 10, 1)
+        progress(f"compasses: {each} boards in {len(compasses.CASES)} cases")
+        found["compasses"] = compasses.section(many(compasses.board, [*product([seed], range(each))], jobs))
     found |= _by_temperature(runs, seed, only, jobs, progress)
     return found
 

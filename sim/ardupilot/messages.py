@@ -8,7 +8,9 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import ArduPilotBoard
-from sim.ardupilot.parameters import NEWEST
+from sim.ardupilot.parameters import NEWEST, compass_names
+from sim.earth import Array
+from sim.firmware.compass import corrected
 from sim.firmware.messages import (
     SCALED_IMU,
     global_position_int,
@@ -39,7 +41,7 @@ def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
     """Build HIGHRES_IMU: floats of the first IMU, the barometer's temperature; the magnetic unit is wrong by 10^6."""
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
-    mx, my, mz = (magnetic_body(double, t_s) * 1000.0).tolist()
+    mx, my, mz = (_field(double, t_s, 0) * 1000.0).tolist()
     baro_degc = double.aircraft.temperature_degc(t_s) + 7.63
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz,
@@ -47,10 +49,18 @@ def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
     )  # fmt: skip
 
 
+def _field(double: ArduPilotBoard, t_s: float, index: int) -> Array:
+    """Return the field of a compass as its parameters correct it, in milligauss; a missing one shows the last."""
+    number = "" if index == 0 or index >= len(double.compasses) else str(index + 1)
+    vectors = [double.parameters.vector(compass_names(number, what)) for what in ("OFS", "DIA", "ODI")]
+    field = magnetic_body(double, t_s, index)
+    return corrected(field, *vectors) if field.any() else field
+
+
 def _integers(double: ArduPilotBoard, index: int, loop_s: float) -> tuple[int, ...]:
     """Return xacc to zgyro of RAW and SCALED messages (mG, mrad/s), field in milligauss, temperature in 0.01 degC."""
     t_s = double.aircraft.time_at(loop_s)
-    mx, my, mz = (truncated_16(float(value)) for value in magnetic_body(double, t_s))
+    mx, my, mz = (truncated_16(float(value)) for value in _field(double, t_s, index))
     if index >= len(double.imus):
         return (0, 0, 0, 0, 0, 0, mx, my, mz, 0)  # the trap of SCALED_IMU3: sent, with a compass and no IMU
     temperature = truncated_16(double.imus[index].temperature_degc(t_s) * 100.0)

@@ -68,6 +68,16 @@ def tcal_names(instance: int, kind: Literal["GYR", "ACC"]) -> list[tuple[str, st
     return [(base + x, base + y, base + z) for base in (f"{tcal_name(instance, kind)}{order}_" for order in (1, 2, 3))]
 
 
+def compass_names(number: str, what: Literal["OFS", "DIA", "ODI"]) -> tuple[str, str, str]:
+    """Return the names of a vector of compass "" (the first), "2" or "3"."""
+    x, y, z = (f"COMPASS_{what}{number}_{axis}" for axis in AXES)
+    return x, y, z
+
+
+COMPASS_ID: Final = 97539
+"""Device id of the first compass in ArduPilot's own simulation."""
+
+
 class ArduPilotParameters:
     """Parameter values by name: `values` are stored, `effective` are in use."""
 
@@ -152,7 +162,7 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
         "EK3_IMU_MASK": (2 ** min(imus, 3) - 1, INT8),
         **{f"EK3_SRC1_{what}": (value, INT8) for what, value in EKF_SOURCES.items()},
         **{f"EK3_SRC{number}_{what}": (0, INT8) for number in (2, 3) for what in EKF_SOURCES},
-        "COMPASS_USE": (1, INT8),
+        "COMPASS_LEARN": (0, INT8),
         "COMPASS_DEC": (0.0, REAL32),
         "SCHED_LOOP_RATE": (400, INT16),
         "SCR_ENABLE": (0, INT8),
@@ -161,6 +171,12 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
         "LOG_DISARMED": (0, INT8),
         "STAT_BOOTCNT": (1, INT16),
     }
+    for slot in ("", "2", "3"):
+        device_id = COMPASS_ID if slot == "" else 0
+        table |= {f"COMPASS_DEV_ID{slot}": (device_id, INT32), f"COMPASS_PRIO{slot or 1}_ID": (device_id, INT32)}
+        table |= {f"COMPASS_USE{slot}": (1, INT8), f"COMPASS_SCALE{slot}": (0.0, REAL32)}
+        table |= dict.fromkeys((*compass_names(slot, "OFS"), *compass_names(slot, "ODI")), (0.0, REAL32))
+        table |= dict.fromkeys(compass_names(slot, "DIA"), (1.0, REAL32))
     groups = ("RAW_SENS", "EXT_STAT", "RC_CHAN", "RAW_CTRL", "POSITION", "EXTRA1", "EXTRA2", "EXTRA3", "PARAMS")
     for port in range(2):
         table |= {f"SR{port}_{group}" if old else f"MAV{port + 1}_{group}": (0, INT16) for group in groups}

@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.aircraft import VirtualAircraft
 from sim.firmware.buzzer import Buzzer
 from sim.firmware.channel import Channel, Message, Write
+from sim.firmware.compass import SimCompass
 from sim.firmware.faults import Faults
 from sim.imu_model import Bias, ImuModel
 
@@ -58,6 +59,7 @@ class AutopilotDouble(abc.ABC):
         declination = math.radians(aircraft.site.declination_deg)
         north, down = FIELD_MILLIGAUSS
         self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
+        self.compasses = [SimCompass()]
         self.channels = channels
         self._port, self.ground = channels
         self.random = np.random.default_rng([seed, 4])

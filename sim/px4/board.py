@@ -6,10 +6,14 @@ import abc
 from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
+from sim.earth import Array
+from sim.firmware.compass import corrected
 from sim.firmware.double import AutopilotDouble
+from sim.firmware.messages import magnetic_body
 from sim.imu_model import Bias, ImuModel
 from sim.px4.parameters import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, PX4Parameters, default_parameters
 from sim.px4.port import NORMAL_RATES, ONBOARD_RATES, PX4Port
@@ -101,6 +105,7 @@ class PX4Board(AutopilotDouble):
         self.primary_imu = 0
         """Number of the IMU that flies the aircraft, which HIGHRES_IMU shows."""
         self._frozen: dict[int, VehicleImuSample] = {}
+        self._compass = [np.zeros(3), np.ones(3), np.zeros(3)]
 
     def residual(self, instance: int, loop_s: float) -> Bias:
         """Error left in the output of IMU `instance` (1..) after offsets and scales: output minus truth, FRD."""
@@ -115,6 +120,19 @@ class PX4Board(AutopilotDouble):
         sample = self.vehicle_imus[index].sample(self.aircraft.time_at(loop_s))
         self._frozen[index] = sample
         return sample
+
+    def compass_output(self, t_s: float) -> Array:
+        """Return the field of the first compass as its parameters correct it, in milligauss."""
+        used = [
+            np.array([self.parameters[f"CAL_MAG0_{axis}{what}"] for axis in "XYZ"])
+            for what in ("OFF", "SCALE", "ODIAG")
+        ]
+        for number, (now, least) in enumerate(zip(used, (0.005, 0.01, 0.01), strict=True)):
+            # Magnetometer.cpp: a small step of a vector is not taken into use.
+            if np.linalg.norm(now - self._compass[number]) > least:
+                self._compass[number] = now
+        offset, scale, beside = self._compass
+        return corrected(magnetic_body(self, t_s), -1e3 * offset, scale, beside)
 
     def update_estimators(self, loop_s: float) -> None:
         """Advance the estimators to this time; call it before anything changes the output."""

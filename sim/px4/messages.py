@@ -48,7 +48,7 @@ def highres_imu(double: PX4Board, loop_s: float) -> Message:
     sample_s, output = double.imu_output(double.primary_imu, loop_s)
     double.update_estimators(loop_s)
     gx, gy, gz, ax, ay, az = (output - double.vehicle_imus[double.primary_imu].estimator.published).tolist()
-    mx, my, mz = (magnetic_body(double, t_s) * 0.001).tolist()
+    mx, my, mz = (double.compass_output(t_s) * 0.001).tolist()
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(double.aircraft.loop_time_of(sample_s)), ax, ay, az, gx, gy, gz, mx, my, mz,
         pressure_hpa(height_m), 0.0, height_m, double.aircraft.temperature_degc(t_s) + 7.63, 4095, 0,
@@ -61,7 +61,7 @@ def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
         return None
     t_s = double.aircraft.time_at(loop_s)
     sample_s, output = double.imu_output(index, loop_s)
-    magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s)]
+    magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s, index)]
     temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
     boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s) + _PUBLISHED_AFTER_S)
     fields = (*in_integers(output), *magnetic, temperature)

@@ -25,6 +25,12 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.base import Firmware, HeadingFallback, HeadingSetting, SlotMemory
+from companion.autopilot.firmware.compass_calibration import (
+    CompassCalibration,
+    compass_ranges,
+    no_compass,
+    read_vectors,
+)
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
@@ -73,6 +79,16 @@ _CUSTOM_NAMES: Final = {
 }
 
 
+_COMPASS_SLOTS: Final = ("", "2", "3")
+_COMPASS_LEARN: Final = "COMPASS_LEARN"
+_COMPASS_OFFSET: Final = Range(-2000.0, 2000.0, unit="mG")
+_COMPASS_SCALE: Final = Range(0.85, 1.4)  # ArduPilot ignores a scale outside (AP_Compass.h)
+
+
+def _compass_names(slot: str) -> tuple[Names, Names, Names]:
+    return _xyz(f"COMPASS_OFS{slot}_"), _xyz(f"COMPASS_DIA{slot}_"), _xyz(f"COMPASS_ODI{slot}_")
+
+
 class ArduPilotParameters(ImuParameters):
     """Parameter names of IMU 1 to 5; the names of IMU 1, 4 and 5 are irregular (docs/reference/autopilots 1.1)."""
 
@@ -115,6 +131,8 @@ def _ranges() -> dict[str, Range]:
         found |= {**offset_ranges(names), **dict.fromkeys(names.tcal, _TCAL_RANGE)}
         found |= dict.fromkeys((names.gyro_caltemp, names.accel_caltemp, names.tcal_low, names.tcal_high), DEGC_RANGE)
         found |= {names.tcal_enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE}
+    for slot in _COMPASS_SLOTS:
+        found |= compass_ranges(_compass_names(slot), _COMPASS_OFFSET)
     return found | dict.fromkeys(TRIM, _TRIM_RANGE)
 
 
@@ -235,6 +253,41 @@ class ArduPilot(Firmware):
         old, new = [await parameters.read(name) for name in TRIM], [roll_rad, pitch_rad]
         before, after = (rotation_matrix((x, y, 0.0)) for x, y in np.degrees([old, new]).tolist())
         return list(map(Change, TRIM, old, new)), after @ before.T
+
+    # --- compasses
+
+    compass_messages = {
+        1: mavlink.MAVLink_raw_imu_message,
+        2: mavlink.MAVLink_scaled_imu2_message,
+        3: mavlink.MAVLink_scaled_imu3_message,
+    }
+
+    async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:
+        priority, use = f"COMPASS_PRIO{number}_ID", f"COMPASS_USE{'' if number == 1 else number}"
+        device_id, warnings = await parameters.read_integer(priority), []
+        slots = [
+            n for n in _COMPASS_SLOTS if device_id and await parameters.read_integer(f"COMPASS_DEV_ID{n}") == device_id
+        ]
+        if not slots or not await parameters.read_integer(use):
+            raise no_compass(number, f"{priority} = {device_id}" if not slots else f"{use} = 0")
+        if await parameters.read_integer(_COMPASS_LEARN):
+            warnings.append(message("rival_may_rewrite", what="compass", parameter=_COMPASS_LEARN))
+        scale = await parameters.read_optional(f"COMPASS_SCALE{slots[0]}") or 0.0
+        names = _compass_names(slots[0])
+        offset, diagonal, beside = await read_vectors(parameters, names)
+        return CompassCalibration(
+            number=number,
+            device_id=device_id or 0,
+            names=names,
+            offset=offset,
+            diagonal=diagonal,
+            beside=beside,
+            unit_gauss=1e-3 * (scale if _COMPASS_SCALE.holds(scale) else 1.0),
+            in_vehicle=np.eye(3),
+            reads_raw=False,
+            offset_range=_COMPASS_OFFSET,
+            warnings=tuple(warnings),
+        )
 
     # --- heading from outside
 

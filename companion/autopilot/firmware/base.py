@@ -12,6 +12,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
+from companion.autopilot.firmware.compass_calibration import CompassCalibration, no_compass
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, Range, Rival
 from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.parameters.change import Change, FirmwareName, Names, Parameters, same_float32
@@ -77,6 +78,13 @@ class Firmware:
     ) -> list[Change]:
         """Plan the changes that write curves of bias over temperature; the IMU's output at `degc` stays unchanged."""
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
+
+    compass_messages: Mapping[int, type[Message]] = {}  # by compass (from 1), in milligauss
+    corrected_field: type[Message] | None = None  # field of the compass in use, gauss, if the others carry raw fields
+
+    async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:
+        """Read the correction that the autopilot applies to compass `number`; AutopilotError: it has none."""
+        raise no_compass(number, message("firmware_not_supported", what="compass"))
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float

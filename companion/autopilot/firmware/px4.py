@@ -24,6 +24,12 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.base import NO_IMU, Firmware, HeadingFallback, HeadingSetting, SlotMemory
+from companion.autopilot.firmware.compass_calibration import (
+    CompassCalibration,
+    compass_ranges,
+    no_compass,
+    read_vectors,
+)
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
@@ -35,7 +41,7 @@ from companion.autopilot.firmware.imu_calibration import (
     offset_ranges,
 )
 from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
-from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Parameters, implausible
+from companion.autopilot.parameters.change import SCALES, Change, FirmwareName, Names, Parameters, implausible
 from companion.errors import AutopilotError
 from companion.messages import message
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
@@ -97,6 +103,19 @@ _RIVALS: Final = (
 )
 
 
+_MAG: Final = "CAL_MAG"
+_MAG_AUTOCAL: Final = "SENS_MAG_AUTOCAL"
+_MAG_OFFSET: Final = Range(-2.0, 2.0, unit="gauss")
+
+
+def _mag_names(slot: int) -> tuple[Names, Names, Names]:
+    stem = f"{_MAG}{slot}_"
+    offset, diagonal, beside = (
+        (f"{stem}X{what}", f"{stem}Y{what}", f"{stem}Z{what}") for what in ("OFF", "SCALE", "ODIAG")
+    )
+    return offset, diagonal, beside
+
+
 def _ranges() -> dict[str, Range]:
     found = dict.fromkeys((*(rival.parameter for rival in _RIVALS), "TC_G_ENABLE"), SWITCH_RANGE) | dict.fromkeys(
         LEVEL[:2], _LEVEL_RANGE
@@ -104,6 +123,7 @@ def _ranges() -> dict[str, Range]:
     for slot in range(SLOTS):
         # Former versions wrote TC_G*, and their undo must still be able to restore the old values.
         own = f"TC_G{slot}_"
+        found |= compass_ranges(_mag_names(slot), _MAG_OFFSET)
         found |= {**offset_ranges(parameters_of(slot, slot)), f"{own}ID": DEVICE_ID_RANGE}
         found |= {f"{own}{name}": DEGC_RANGE for name in ("TREF", "TMIN", "TMAX")}
         found |= {f"{own}X{power}_{axis}": _TC_RANGE for power in range(4) for axis in range(3)}
@@ -134,8 +154,8 @@ class PX4(Firmware):
 
     async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
         boots = parameters.boots
-        accel = choose_slot(memory, "accel", instance, await read_slots(parameters, "accel"))
-        gyro = choose_slot(memory, "gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
+        accel = choose_slot(memory, "accel", instance, await read_slots(parameters, PREFIX["accel"]))
+        gyro = choose_slot(memory, "gyro", instance, await read_slots(parameters, PREFIX["gyro"]), like=accel.device_id)
         names = parameters_of(gyro.number, accel.number)
         offset = await parameters.read_vector(names.accel_offset)
         orientation = await _read_rotation(parameters, gyro, accel)
@@ -176,6 +196,42 @@ class PX4(Firmware):
         roll, pitch = np.degrees(roll_pitch_from_up(level.T @ seen)).tolist()
         turn: Matrix = rotation_matrix((roll, pitch, z)) @ level.T
         return [Change(LEVEL[0], x, roll), Change(LEVEL[1], y, pitch)], turn
+
+    # --- compasses
+
+    compass_messages = {
+        1: mavlink.MAVLink_scaled_imu_message,
+        2: mavlink.MAVLink_scaled_imu2_message,
+        3: mavlink.MAVLink_scaled_imu3_message,
+    }
+    corrected_field = mavlink.MAVLink_highres_imu_message
+
+    async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:
+        slots = await read_slots(parameters, _MAG)
+        # PX4 prefers the slot of the driver's number; no message tells another one.
+        own = [slot for slot in slots if slot.number == number - 1] or list(slots[number - 1 : number])
+        if not own or not own[0].enabled:
+            raise no_compass(number, f"{_MAG}{number - 1}_ID = 0" if not own else f"{_MAG}{own[0].number}_PRIO = 0")
+        names, warnings = _mag_names(own[0].number), []
+        if await parameters.read_integer(_MAG_AUTOCAL):
+            warnings.append(message("rival_may_rewrite", what="compass", parameter=_MAG_AUTOCAL))
+        level = rotation_matrix(await parameters.read_vector(LEVEL))
+        turn = level @ await _read_mounting(parameters, _MAG, own[0])
+        offset, diagonal, beside = await read_vectors(parameters, names)
+        return CompassCalibration(
+            number=number,
+            device_id=own[0].device_id,
+            names=names,
+            offset=offset,
+            diagonal=diagonal,
+            beside=beside,
+            unit_gauss=-1.0,
+            in_vehicle=turn,
+            reads_raw=True,
+            offset_range=_MAG_OFFSET,
+            far_axis=int(np.abs(turn[2]).argmax()),
+            warnings=tuple(warnings),
+        )
 
     # --- heading from outside
 
@@ -273,13 +329,13 @@ class Slot:
         return self.device_id & 0b111
 
 
-async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
+async def read_slots(parameters: Parameters, prefix: str) -> tuple[Slot, ...]:
     """Read all parameter slots with a device id, in order. Raises the errors of `Parameters.read_optional`."""
     found: list[Slot] = []
     for number in range(SLOTS):
-        device_id = await parameters.read_integer(f"{PREFIX[sensor]}{number}_ID")
+        device_id = await parameters.read_integer(f"{prefix}{number}_ID")
         if device_id:
-            priority = await parameters.read_integer(f"{PREFIX[sensor]}{number}_PRIO")
+            priority = await parameters.read_integer(f"{prefix}{number}_PRIO")
             found.append(Slot(number, device_id, enabled=priority != 0))
     return tuple(found)
 
@@ -314,8 +370,8 @@ def choose_slot(
 
 async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Matrix:
     level = rotation_matrix(await parameters.read_vector(LEVEL))
-    gyro_mounting = await _read_mounting(parameters, "gyro", gyro)
-    accel_mounting = await _read_mounting(parameters, "accel", accel)
+    gyro_mounting = await _read_mounting(parameters, PREFIX["gyro"], gyro)
+    accel_mounting = await _read_mounting(parameters, PREFIX["accel"], accel)
     if not np.array_equal(gyro_mounting, accel_mounting):
         one, other = f"{PREFIX['gyro']}{gyro.number}_ROT", f"{PREFIX['accel']}{accel.number}_ROT"
         raise implausible(one, f"unlike {other}", "the same mounting")
@@ -323,9 +379,9 @@ async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Mat
     return matrix
 
 
-async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:
+async def _read_mounting(parameters: Parameters, prefix: str, slot: Slot) -> Matrix:
     """Read the rotation, (3, 3), from a sensor's axes to the vehicle's, without the level adjustment."""
-    own = await parameters.read_integer(f"{PREFIX[sensor]}{slot.number}_ROT")
+    own = await parameters.read_integer(f"{prefix}{slot.number}_ROT")
     internal = slot.bus == _SIMULATION_BUS or (slot.bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
     number = await parameters.read_integer("SENS_BOARD_ROT") if internal else own
     # PX4 applies no rotation for a number that it does not know.

@@ -110,7 +110,7 @@ POLL_S: Final = 1.1
 """Time, s, within which each module of PX4 reads a new value: modules read at most once a second
 (docs/reference/autopilots 9.2). After twice this time without a write, each module reads the next value at once."""
 
-_AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
+_AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$|ODIAG$)|\d$")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import Thermal
 from companion.autopilot.parameters.change import same_float32
+from companion.autopilot.telemetry.compass_fields import CompassFields
 from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.commands import Align, Calibrate, Cancel, Temperature, Undo
 from companion.component.service import MEASURED_PERCENT, Refusal
@@ -20,10 +21,11 @@ from companion.daemon.calibrating.manager import CalibrationManager, Preconditio
 from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
+from companion.daemon.job import ALIGNMENT, COMPASS, FACES, TEMPERATURE, TURN, Job
 from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.poses.alignment import ActiveAlignment, ActiveSixPosition, ByHand
+from companion.daemon.poses.compass_task import CompassTask
 from companion.daemon.poses.measuring import Estimator, Measuring
 from companion.daemon.poses.session import PoseSession, PoseTask
 from companion.daemon.poses.tasks import SixPositionTask, TurnTask, ZeroTask
@@ -43,11 +45,12 @@ HEARD_WITHIN_S: Final = 5.0
 """Longest time that an undo waits for the first heartbeat of the autopilot."""
 ALIGN_TIMEOUT_S: Final = 900.0
 """Default time limit of an alignment: one that nobody finishes must not block calibrations for ever."""
-_KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
+_KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces", "compass"], str]] = {
     "zero": ALIGNMENT,
     "tilts": ALIGNMENT,
     "turn": TURN,
     "faces": FACES,
+    "compass": COMPASS,
 }
 
 
@@ -66,6 +69,7 @@ class Calibrating(Subsystem):
         self.estimator = Estimator(core, self.alignment, self.faces, own)
         self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
+        self._fields = CompassFields(core.vehicle)
         parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
@@ -205,10 +209,13 @@ class Calibrating(Subsystem):
         on_turn = action == "turn"
         request = AlignmentRequest(
             action,
-            asked.headings or (HEADINGS if on_turn else 2),
-            write=asked.write and action in ("turn", "faces"),
+            asked.headings or (HEADINGS if action in ("turn", "compass") else 2),
+            write=asked.write and action in ("turn", "faces", "compass"),
             level=asked.level and on_turn,
+            heading_deg=asked.heading if action == "compass" else None,
         )
+        if action != "compass" and request.headings not in (2, HEADINGS):
+            return Refusal("other", f"headings: found {request.headings}; allowed for {action}: 2 or 4")
         if self._core.config.vehicle.platform == "deck":
             if _KINDS[action] == ALIGNMENT:
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
@@ -221,10 +228,16 @@ class Calibrating(Subsystem):
         task: PoseTask
         if request.action == "faces":
             task = SixPositionTask(request, self._imus, self.faces)
+        elif request.action == "compass":
+            task = CompassTask(self._core, request, self.estimator, self._fields)
         elif request.action == "turn":
             task = TurnTask(self._core, request, self._imus, self.faces)
         else:
             task = ZeroTask(self._core, request, self.alignment)
+        if isinstance(task, CompassTask):
+            await task.prepare()
+            async with self._fields.asked():
+                return await self.stands.run(job, task)
         result = await self.stands.run(job, task)
         if request.write and request.action == "faces":
             self.memory.forgotten()  # the new scales end them; a calibration need not warn of that

@@ -24,6 +24,7 @@ from companion.estimation.means.windows import Window
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.align_record import (
     AlignmentRecord,
+    CompassRecord,
     FacesImuRecord,
     FacesRecord,
     GradienterSettings,
@@ -196,10 +197,16 @@ class ByHand:
 
     async def keep(self, job: Job, result: JobResult) -> None:
         record = job.product
-        if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
+        if result.outcome == "cancelled" or not isinstance(
+            record, AlignmentRecord | FacesRecord | TurnRecord | CompassRecord
+        ):
             return
         board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
-        parts = [board, *([] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus])]
+        parts = [board]
+        if isinstance(record, CompassRecord):
+            parts += [one.written for one in record.compasses]
+        elif not isinstance(record, AlignmentRecord):
+            parts += [imu.written for imu in record.imus]
         kept = [(name, one) for part in parts for name, one in part.items() if one.outcome in ("verified", "stored")]
         done = Done(
             what="level" if board else record.kind,

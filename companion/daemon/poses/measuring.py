@@ -146,6 +146,10 @@ class Estimator:
         )
         return found, where, otherwise
 
+    def sides(self, window: Window) -> FallbackPose:
+        """Return the six-position calibrations that give the tilt without a gradienter."""
+        return FallbackPose(sides=self._faces.sides(window) if self._core.config.gradienter is None else {})
+
     async def _otherwise(self, window: Window) -> FallbackPose:
         core, heading = self._core, self._own.heading() if self._core.config.compass is None else None
         try:
@@ -154,5 +158,4 @@ class Estimator:
                 heading = None
         except AutopilotError:
             heading = None
-        sides = self._faces.sides(window) if core.config.gradienter is None else {}
-        return FallbackPose(sides=sides, heading=heading)
+        return msgspec.structs.replace(self.sides(window), heading=heading)

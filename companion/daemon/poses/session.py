@@ -146,6 +146,14 @@ class PoseTask(abc.ABC):
     def changes(self) -> dict[str, list[Change]]:
         return {}
 
+    async def write(self, writes: AlignmentWrites, job: Job, last: Window, log: WriteLog) -> None:
+        await writes.write_accelerometers(job, last, self.changes(), log)
+
+    def unsteady(self, window: Window) -> str | None:
+        """Return why a pose must be measured again where the aircraft stands, or None."""
+        del window
+        return None
+
     async def keep(self, record: HandRecord) -> None:
         """Save the result and make it the active one; a StorageError leaves the previous one active."""
         del record
@@ -194,7 +202,7 @@ class PoseSession:
         level: dict[str, WrittenParameter] = {}
         try:
             if request.write and shortfall is None:
-                await self._writes.write_accelerometers(job, last, task.changes(), log)
+                await task.write(self._writes, job, last, log)
             elif request.level and task.board is not None:
                 level = await self._writes.write_level(job, task.board, last, log)
         finally:
@@ -270,6 +278,10 @@ class PoseSession:
         if (leaned := leaned_deg(np.array(forces))) >= LEANED_DEG:
             state.since_s = now_s
             self._object(state, f"it leaned by {leaned:.2g} degrees: hands off, firm ground")
+            return False
+        if (unsteady := task.unsteady(window)) is not None:
+            state.since_s = now_s
+            self._object(state, unsteady)
             return False
         if objection is not None:
             state.moved, state.act = False, "TURN IT"

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import output_step
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
+from companion.autopilot.telemetry.compass_fields import SELECTED, CompassFields, MeanField
 from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
@@ -37,11 +38,33 @@ from companion.storage.changes import Origin
 MOST_DEG: Final = 10.0
 SEEN_DEG: Final = 0.1  # Smallest step that is visible in an autopilot's attitude, which wanders by hundredths
 SEEN_SHARE: Final = 0.2
+SEEN_GAUSS: Final = 0.004  # Largest change of a compass' field at rest: digits, noise, and PX4's own bias estimate
+FOLLOWS_SHARE: Final = 0.05
 WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5  # Time until written parameters are in use: both firmwares read them once a second
 LATEST_S: Final = 4.0  # Largest age of attitude messages: a busy link delays them, old estimates have wandered
 POLL_S: Final = 0.25
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
+
+
+class CompassStep(NamedTuple):
+    """Planned changes of one compass, and the step (3,) of its corrected field that they must cause, gauss."""
+
+    number: int
+    changes: Sequence[Change]
+    step_gauss: Array
+
+    @property
+    def name(self) -> str:
+        return f"compass {self.number}"
+
+    @property
+    def shows(self) -> bool:
+        return float(np.linalg.norm(self.step_gauss)) > 3.0 * SEEN_GAUSS
+
+    def fits(self, made_gauss: Array) -> bool:
+        off = float(np.linalg.norm(made_gauss - self.step_gauss))
+        return off < SEEN_GAUSS + FOLLOWS_SHARE * float(np.linalg.norm(self.step_gauss))
 
 
 class AlignmentWrites:
@@ -74,6 +97,50 @@ class AlignmentWrites:
                 # One verified step of the output confirms offsets and scales together.
                 plan.mark(log, names.accel_scale, "verified")
         await self.path.settle(job, plan, last, log)
+
+    async def write_compasses(
+        self, job: Job, found: Sequence[CompassStep], fields: CompassFields, last: Window, log: WriteLog
+    ) -> None:
+        """Write new corrections of compasses; `last`: window of the last pose, in which the aircraft still stands."""
+        watched = SELECTED if self._vehicle.kind.corrected_field is not None else None
+        before = {step.number: fields.mean(step.number if watched is None else watched, last.start_s) for step in found}
+        changes = [change for step in found for change in step.changes]
+        await self.path.begin(job, len(changes))
+
+        async def apply() -> list[Change]:
+            written = await self._writer.apply(changes)
+            for step in found:
+                log.written[step.name] = {each.parameter: written[each.parameter] for each in step.changes}
+            return changes
+
+        async def verify() -> None:
+            job.progress(WRITTEN_PERCENT, "checking the compasses for the new correction")
+            since_s = asyncio.get_running_loop().time() + USED_AFTER_S
+            seen = []
+            for step in found:
+                was, number = before[step.number], step.number if watched is None else watched
+                now = await self._field(job, fields, number, since_s)
+                made = None if was is None or now is None else now.mean_gauss - was.mean_gauss
+                seen += [step] if made is not None and step.fits(made) else []
+                if watched is None and made is not None and step not in seen:
+                    raise AutopilotError(f"{step.name}'s field did not follow, or the aircraft moved")
+            if watched is not None and not seen and any(step.shows for step in found) and all(before.values()):
+                raise AutopilotError("the compass field did not follow, or the aircraft moved")
+            for step in seen:
+                log.written[step.name] = {
+                    name: msgspec.structs.replace(one, outcome="verified" if step.shows else one.outcome)
+                    for name, one in log.written[step.name].items()
+                }
+
+        await self.path.commit(changes, Origin("compass", log.started), [], apply, verify)
+        for event in (Event.VERIFIED, Event.CONCLUDED):
+            self._core.machine.on(event)
+
+    async def _field(self, job: Job, fields: CompassFields, number: int, since_s: float) -> MeanField | None:
+        loop = asyncio.get_running_loop()
+        while (now := fields.mean(number, since_s)) is None and loop.time() < since_s + WITHIN_S:
+            await job.pause(POLL_S)
+        return now
 
     async def write_level(self, job: Job, board: Mounting, last: Window, log: WriteLog) -> dict[str, WrittenParameter]:
         if math.degrees(max(abs(board.roll_rad), abs(board.pitch_rad))) > MOST_DEG:

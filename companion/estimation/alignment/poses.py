@@ -40,15 +40,19 @@ BY_EYE_SIGMA_DEG: Final = 10.0
 
 
 class AlignmentRequest(NamedTuple):
-    action: Literal["zero", "tilts", "turn", "faces"]
+    action: Literal["zero", "tilts", "turn", "faces", "compass"]
     headings: int = 2
-    """Headings to measure. 2: half a turn, then another in the same direction to the start. 4: every quarter turn."""
+    """Headings to measure. 2: half a turn, then another in the same direction to the start. 4: every quarter turn. For
+    a compass: any number, each after an equal part of a turn."""
     write: bool = False  # Write offsets (and scales, if six positions determine them) to the autopilot
     level: bool = False  # Write the tilt of the board as the autopilot's level
+    heading_deg: float | None = None  # True heading of the first pose, if somebody knows it
 
     @property
     def on_spot(self) -> int:
         """Number of poses at the marked place. A "turn", or two headings without tilts, ends with the first again."""
+        if self.action == "compass":
+            return self.headings
         if self.headings == 2 and self.action != "tilts":
             return 3
         return HEADINGS + (self.action == "turn")
@@ -94,7 +98,7 @@ def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> PoseReq
         return PoseRequest("tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", up)
     turn_deg = asked_turn_deg(request, poses)
     words = "turn it by 180 degrees, onto its marks" if len(poses) == 1 else "turn it the same way to its first marks"
-    if request.on_spot >= HEADINGS:
+    if request.on_spot >= HEADINGS or request.action == "compass":
         words = f"turn it by {turn_deg:.0f} degrees on its spot"
     return PoseRequest(words, turn_deg=turn_deg)
 
@@ -102,6 +106,8 @@ def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> PoseReq
 def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> float:
     if len(poses) >= request.on_spot:
         return 0.0
+    if request.action == "compass":
+        return 360.0 / request.headings
     return _to_next_deg(poses, poses[-1]) if request.on_spot >= HEADINGS else 180.0
 
 
@@ -112,6 +118,8 @@ def objection(request: AlignmentRequest, poses: Sequence[HeldPose], now: HeldPos
         return f"tilted by {askew_deg:.0f} degrees: stand it on its base" if askew_deg > MOST_ASKEW_DEG else None
     first, number = poses[0], len(poses)
     if number < request.on_spot:
+        if request.action == "compass":
+            return _part_of_turn(360.0 / request.headings, now.heading_deg - poses[-1].heading_deg)
         turned_deg = now.heading_deg - first.heading_deg
         if request.on_spot >= HEADINGS and number < HEADINGS:
             return _quarter(poses, now)
@@ -154,6 +162,14 @@ def _to_next_deg(poses: Sequence[HeldPose], now: HeldPose) -> float:
 
 def _apart_deg(one: Array, other: Array) -> float:
     return math.degrees(math.acos(float(np.clip(one @ other, -1.0, 1.0))))
+
+
+def _part_of_turn(wanted_deg: float, turned_deg: float) -> str | None:
+    off_deg = wanted_deg - abs(turned_deg)
+    if abs(off_deg) <= min(TURN_TOLERANCE_DEG, wanted_deg / 2.0):
+        return None
+    way = "on" if off_deg > 0.0 else "back"
+    return f"{abs(turned_deg):.0f} degrees, not {wanted_deg:.0f}: turn it {way} by {abs(off_deg):.0f}"
 
 
 def _azimuth(level: Array, up: Array) -> float:

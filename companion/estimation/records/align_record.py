@@ -196,7 +196,43 @@ class TurnRecord(SpotRecord, frozen=True, kw_only=True):
     board: BoardRecord | None = None  # None without a six-position calibration
 
 
-HandRecord = AlignmentRecord | FacesRecord | TurnRecord
+class CompassFiguresRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Correction of one of the autopilot's compasses, in vehicle axes (FRD): soft @ (raw + offset).
+
+    `heading_sigma_deg`: one sigma of its heading, all round, on the level and leaned by 10 degrees. `scatter_mgauss`:
+    of the field from pose to pose. `strength`: horizontal field over the Earth's.
+    """
+
+    number: int
+    device_id: int
+    offset_mgauss: Vector
+    offset_sigma_mgauss: Vector
+    soft_diagonal: Vector
+    soft_beside: Vector  # xy, xz, yz
+    heading_sigma_deg: float
+    heading_sigma_leaned_deg: float
+    heading_before_deg: float  # Largest heading error, all round, that the present correction leaves
+    scatter_mgauss: float
+    strength: float
+    written: dict[str, WrittenParameter] = {}
+
+
+class CompassRecord(msgspec.Struct, frozen=True, kw_only=True):
+    format_version: int = FORMAT_VERSION
+    kind: Literal["compass"] = "compass"
+    measured_at: str
+    field_gauss: float
+    inclination_deg: float
+    declination_deg: float
+    tilt_deg: float  # Largest of all poses
+    heading_deg: float  # True heading of the first pose, as found
+    heading_sigma_deg: float
+    turns_deg: tuple[float, ...]
+    compasses: tuple[CompassFiguresRecord, ...]
+    warnings: tuple[str, ...] = ()
+
+
+HandRecord = AlignmentRecord | FacesRecord | TurnRecord | CompassRecord
 
 
 def stand_record(stand: PoseMeans, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
@@ -282,6 +318,9 @@ def completed(
 ) -> HandRecord:
     """Add warnings and written parameters to a record: `written` by name of the IMU, `level` for the board's tilt."""
     replace = msgspec.structs.replace
+    if isinstance(record, CompassRecord):
+        found = tuple(replace(one, written=written.get(f"compass {one.number}", {})) for one in record.compasses)
+        return replace(record, compasses=found, warnings=warnings)
     if isinstance(record, AlignmentRecord):
         return replace(record, warnings=warnings)
     imus = tuple(replace(imu, written=written.get(imu.name, {})) for imu in record.imus)

@@ -32,7 +32,7 @@ RECORD = AlignmentRecord(
 )
 
 
-@pytest.mark.parametrize("words", [[], ["zero", "--show"], ["zero", "--headings", "3"], ["zero", "--timeout", "-1"]])
+@pytest.mark.parametrize("words", [[], ["zero", "--show"], ["zero", "--headings", "5"], ["zero", "--timeout", "-1"]])
 def test_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         cli.main(["align", *words])

@@ -25,7 +25,7 @@ WRONG = [
     ),
     ("calibrate", "what", "nothing", '"both", "gyros", "accelerometers"'),
     ("calibrate", "reboot", 1, "true or false"),
-    ("align", "headings", 3, "2, 4"),
+    ("align", "headings", 5, "2, 3, 4, 6, 8"),
     ("history", "limit", 0, "a whole number from 1 to 1000000"),
     ("record", "file", 5, "a path"),
 ]
@@ -69,4 +69,4 @@ def test_pages_and_brokers_may_not_ask_for_everything() -> None:
     assert by[Interface.MQTT] == {"calibrate", "cancel", "undo"}
     assert by[Interface.PAGE] == {"calibrate", "align", "cancel", "undo", "answer"}
     assert set(ALL["calibrate"].fields(Interface.PAGE)) == {"what"}
-    assert set(ALL["align"].fields(Interface.PAGE)) == {"action", "headings", "write", "level"}
+    assert set(ALL["align"].fields(Interface.PAGE)) == {"action", "headings", "heading", "write", "level"}

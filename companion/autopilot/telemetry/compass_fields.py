@@ -1,0 +1,96 @@
+"""Fields of the autopilot's compasses, from its IMU messages, while an alignment of them runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections import defaultdict, deque
+from collections.abc import AsyncIterator
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.firmware.firmwares import FIRMWARES
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.physics.frames import Array
+
+SELECTED: Final = 0
+"""Number of the corrected field of the compass in use, if a firmware sends it beside the raw ones."""
+RATE_HZ: Final = 5.0
+LISTEN_S: Final = 1.0
+LEAST: Final = 5
+_KEPT: Final = 8192
+_MILLIGAUSS: Final = 1e-3
+_CUT_GAUSS: Final = 0.5 * _MILLIGAUSS
+"""Mean share that is lost by cutting milligauss off toward zero; the sigma of what is cut off is 0.29 mG."""
+_DIGIT_SIGMA_GAUSS: Final = 0.29 * _MILLIGAUSS
+_STEP_GAUSS: Final = 0.006
+_STEP_SIGMAS: Final = 5.0
+
+
+class MeanField(NamedTuple):
+    """Mean field of a compass with one sigma, gauss, (3,) each, and its largest change between thirds of the time."""
+
+    mean_gauss: Array
+    sigma_gauss: Array
+    change_gauss: float
+    """0 if it may be chance."""
+
+
+class CompassFields:
+    """Collects the messages with fields; `asked` requests those that do not come by themselves."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._seen: dict[int, deque[tuple[float, Array]]] = defaultdict(lambda: deque(maxlen=_KEPT))
+        self._listens = False
+        messages = {message for firmware in FIRMWARES for message in firmware.compass_messages.values()}
+        messages |= {each for firmware in FIRMWARES if (each := firmware.corrected_field) is not None}
+        for message in messages:
+            vehicle.hear(message, self._on_message)
+
+    @contextlib.asynccontextmanager
+    async def asked(self) -> AsyncIterator[None]:
+        """Request the messages that do not arrive; restore the firmware's own rates at the end."""
+        self._seen.clear()
+        self._listens = True
+        await asyncio.sleep(LISTEN_S)
+        kind, commands = self._vehicle.kind, self._vehicle.commands
+        wanted = {**kind.compass_messages, **({} if kind.corrected_field is None else {SELECTED: kind.corrected_field})}
+        missing = [message for number, message in wanted.items() if number not in self._seen]
+        for message in missing:
+            commands.request_message_interval(message.id, RATE_HZ)
+        try:
+            yield
+        finally:
+            for message in missing:
+                commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message.id, 0.0)  # the firmware's own rate
+            self._listens = False
+
+    def mean(self, number: int, since_s: float, until_s: float = math.inf) -> MeanField | None:
+        """Return the mean field of a compass over a time; None: too few messages."""
+        taken = [field for t_s, field in self._seen[number] if since_s <= t_s <= until_s]
+        if len(taken) < LEAST:
+            return None
+        fields = np.array(taken)
+        scatter = fields.std(axis=0, ddof=1)
+        sigma = np.hypot(scatter / math.sqrt(len(fields)), _DIGIT_SIGMA_GAUSS)
+        thirds = np.array([third.mean(axis=0) for third in np.array_split(fields, 3)])
+        change = float(np.ptp(thirds, axis=0).max())
+        chance = _STEP_SIGMAS * float(scatter.max()) * math.sqrt(3.0 / len(fields))
+        return MeanField(fields.mean(axis=0), sigma, change if change > max(chance, _STEP_GAUSS) else 0.0)
+
+    def _on_message(self, message: Any, t_s: float) -> None:
+        if not self._listens:
+            return
+        kind = self._vehicle.kind
+        field = np.array([message.xmag, message.ymag, message.zmag], dtype=np.float64)
+        if not np.isfinite(field).all() or not field.any():
+            return
+        if type(message) is kind.corrected_field:
+            self._seen[SELECTED].append((t_s, field))
+        for number, of in kind.compass_messages.items():
+            if type(message) is of:
+                self._seen[number].append((t_s, field * _MILLIGAUSS + _CUT_GAUSS * np.sign(field)))

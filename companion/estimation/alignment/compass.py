@@ -1,0 +1,227 @@
+"""Hard and soft iron of a compass, from poses on the ground in which nobody has to know a heading.
+
+A firmware corrects the raw field r of a compass to D (r + c), in the vehicle's axes (FRD): the offset c is hard iron,
+the symmetric matrix D is soft iron and scale. In pose k the corrected field is the Earth's,
+
+    D (r_k + c) = L(up_k) (h cos psi_k, -h sin psi_k, d)
+
+with the horizontal and the vertical field h and d of WMM2025, the tilt L from gravity, and the magnetic heading psi_k,
+which is unknown in the first pose and then counted by the gyros. A symmetric D turns no field by a common angle, so
+that four headings on level ground determine the heading, c, and the horizontal part of D. A figure that the poses leave
+open keeps the sigma of its prior.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.align_model import LeastSquares, fit, response
+from companion.physics.earth import MagneticField
+from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.units import DEG
+
+FIGURES: Final = 9
+OFFSET: Final = slice(0, 3)
+_DIAGONAL, _BESIDE, _HEADING, _FIELD, _TURN_SCALE, _TURNS = slice(3, 6), slice(6, 9), 9, slice(10, 12), 12, 13
+
+_SOFT_SIGMA: Final = 0.03
+"""Prior sigma of each element of D; soft iron is 5 % at most."""
+_SPOT_SIGMA_GAUSS: Final = 0.003
+"""Sigma by which the field of ordinary ground differs from the model's."""
+_SCATTER_GAUSS: Final = 0.001
+"""Prior of the scatter of the field between poses: the compass moves on its turn, and each tilt has an error."""
+_SCATTER_WEIGHT: Final = 3.0
+"""Number of readings that this prior is worth; the readings of the poses show how much the field really scatters."""
+TURN_SCALE: Final = 0.01
+"""Prior sigma of the scale of the gyro that counts the turns, as in `align_model.Priors`."""
+_STEP_LIMIT_GAUSS: Final = 2.0
+_GUESSES: Final = np.arange(0.0, 360.0, 10.0) * DEG
+_TURNS_WITH_IT: Final = 8.0
+"""Variance of a bent field that turns with the aircraft, over that of its scatter beyond the prior's."""
+SCATTER_LIMIT_GAUSS: Final = 0.0016
+"""Scatter of the field between poses above which iron near the spot must be bending the field."""
+STRENGTH_LIMIT: Final = 0.1
+"""Largest relative deviation of the horizontal field that soft iron and a scale may explain."""
+
+
+class CompassFigures(NamedTuple):
+    """Correction of a compass: `soft @ (raw + offset)`, in vehicle axes (FRD), gauss."""
+
+    offset_gauss: Array  # (3,)
+    soft: Matrix  # (3, 3), symmetric
+
+
+class CompassPose(NamedTuple):
+    """Means of one pose: unit vector up (3,) and raw field (3,) with sigma (3,), in vehicle axes (FRD)."""
+
+    up: Array
+    raw_gauss: Array
+    sigma_gauss: Array
+    turn_rad: float = 0.0  # About the vehicle's z axis, clockwise from above, since the previous pose
+    turn_sigma_rad: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CompassEstimate:
+    """Estimate of a compass' figures, with the covariance (9, 9) of offset x y z, gauss, and D xx yy zz xy xz yz.
+
+    `heading_rad`: magnetic heading of the first pose. `off_gauss` (poses, 3): measured minus expected raw field.
+    `scatter_gauss`: one sigma of the field from pose to pose. `strength`: horizontal field over the model's.
+    """
+
+    figures: CompassFigures
+    covariance: Matrix
+    earth: MagneticField
+    heading_rad: float
+    heading_sigma_rad: float
+    off_gauss: Matrix
+    scatter_gauss: float
+    strength: float
+
+    @property
+    def offset_sigma_gauss(self) -> Array:
+        return np.asarray(np.sqrt(np.diag(self.covariance)[OFFSET]))
+
+    @property
+    def strength_is_wrong(self) -> bool:
+        return abs(self.strength - 1.0) > STRENGTH_LIMIT
+
+    @property
+    def bent(self) -> str | None:
+        """Return what shows that iron near the spot bends the field, as text; None: nothing does."""
+        if self.strength_is_wrong:
+            much = "strong" if self.strength > 1.0 else "weak"
+            return f"field {100.0 * abs(self.strength - 1.0):.0f} % too {much} here"
+        if self.scatter_gauss > SCATTER_LIMIT_GAUSS:
+            return f"field differs by {1e3 * self.scatter_gauss:.0f} mG from pose to pose"
+        return None
+
+    def errors_rad(self, of: CompassFigures) -> Array:
+        """Return the heading errors (36,), every 10 degrees on the level, of a compass that had the figures `of`."""
+        level = _level_field(_GUESSES, self.earth.horizontal_gauss, self.earth.down_gauss)
+        raw = level @ np.linalg.inv(self.figures.soft) - self.figures.offset_gauss
+        ahead, right, _ = ((raw + of.offset_gauss) @ of.soft).T
+        return np.asarray(np.angle(np.exp(1j * (np.arctan2(-right, ahead) - _GUESSES))))
+
+    def sigma_rad(self, lean_deg: float = 0.0) -> float:
+        """Return one sigma of the heading after the correction, rms over all headings and the sides of a lean."""
+        leans = {(lean_deg, 0.0), (-lean_deg, 0.0), (0.0, lean_deg), (0.0, -lean_deg)}
+        tilts = np.array([body_from_ned(roll * DEG, pitch * DEG, 0.0) for roll, pitch in sorted(leans)])
+        level = _level_field(_GUESSES[:, None], self.earth.horizontal_gauss, self.earth.down_gauss)
+        uncorrected = np.einsum("ij,tjk,hnk->hti", np.linalg.inv(self.figures.soft), tilts, level)
+        by = np.zeros((*uncorrected.shape, FIGURES))
+        by[..., OFFSET] = self.figures.soft
+        x, y, z = np.moveaxis(uncorrected, -1, 0)
+        by[..., 0, 3], by[..., 1, 4], by[..., 2, 5] = x, y, z
+        by[..., 0, 6], by[..., 1, 6], by[..., 0, 7], by[..., 2, 7], by[..., 1, 8], by[..., 2, 8] = y, x, z, x, z, y
+        east = np.stack([np.sin(_GUESSES), np.cos(_GUESSES), 0.0 * _GUESSES], axis=-1)  # magnetic east, in level axes
+        gradient = np.einsum("hj,tij,htif->htf", east, tilts, by) / self.earth.horizontal_gauss
+        variance = np.einsum("htf,fg,htg->ht", gradient, self.covariance, gradient)
+        return math.sqrt(float(variance.mean()))
+
+
+def compass(
+    poses: Sequence[CompassPose],
+    earth: MagneticField,
+    before: CompassFigures,
+    tilt_sigma_rad: float,
+    heading: tuple[float, float] | None = None,
+) -> CompassEstimate:
+    """Estimate the correction of one compass.
+
+    Args:
+        poses: at least two, or one with a `heading`.
+        earth: Earth's field at the place.
+        before: present correction; its D is the mean of the prior.
+        tilt_sigma_rad: of the tilt that all poses have in common.
+        heading: magnetic heading of the first pose and its sigma, rad; None: unknown.
+
+    Raises:
+        CalibrationRefusedError: no compass has these readings.
+    """
+    tilts = np.array([body_from_ned(*roll_pitch_from_up(pose.up), 0.0) for pose in poses])
+    raw, noise = np.array([pose.raw_gauss for pose in poses]), np.array([pose.sigma_gauss for pose in poses])
+    turns = np.array([_azimuth_turned(before, pose.turn_rad) for before, pose in zip(tilts, poses[1:], strict=False)])
+
+    def expected(at: Floats) -> Floats:
+        turned = np.cumsum(turns * (1.0 + at[:, _TURN_SCALE, None]) + at[:, _TURNS:], axis=1)
+        headings = at[:, _HEADING, None] + np.concatenate([np.zeros((len(at), 1)), turned], axis=1)
+        level = _level_field(headings, *np.moveaxis(at[:, _FIELD, None], 1, 0))
+        field = np.einsum("pij,mpj->mpi", tilts, level)
+        soft = response(at[:, _DIAGONAL] - 1.0, at[:, _BESIDE])
+        return np.asarray(np.linalg.solve(soft[:, None], field[..., None])[..., 0] - at[:, None, OFFSET])
+
+    start = np.zeros(_TURNS + len(turns))
+    start[_DIAGONAL], start[_BESIDE] = np.diag(before.soft), before.soft[[0, 0, 1], [1, 2, 2]]
+    start[_FIELD] = earth.horizontal_gauss, earth.down_gauss
+    guesses = np.tile(start, (len(_GUESSES), 1))
+    guesses[:, _HEADING] = _GUESSES if heading is None else heading[0]
+    off = expected(guesses) - raw
+    guesses[:, OFFSET] = off.mean(axis=1)
+    best = int(np.argmin(off.var(axis=1).sum(axis=1)))
+
+    of_strength, of_dip = earth.strength_sigma_gauss, earth.strength_gauss * earth.inclination_sigma_deg * DEG
+    spot = math.sqrt(_SPOT_SIGMA_GAUSS**2 + of_strength**2 + of_dip**2)
+    heading_sigma = math.pi if heading is None else heading[1]
+    prior = np.array(
+        [
+            *[_STEP_LIMIT_GAUSS] * 3,
+            *[_SOFT_SIGMA] * 6,
+            heading_sigma,
+            spot,
+            spot,
+            TURN_SCALE,
+            *(pose.turn_sigma_rad for pose in poses[1:]),
+        ]
+    )
+    free = [0, 1, 2, *([_HEADING] if heading is None else [])]
+
+    def solved(scatter_gauss: float) -> LeastSquares:
+        sigma = np.hypot(noise, scatter_gauss)
+        try:
+            return fit(lambda at: ((raw - expected(at)) / sigma).reshape(len(at), -1), guesses[best], prior, free)
+        except (ValueError, np.linalg.LinAlgError):
+            raise CalibrationRefusedError("these readings are no compass': does it turn with the aircraft?") from None
+
+    first = solved(_SCATTER_GAUSS)
+    readings = _SCATTER_WEIGHT + 3 * len(poses) - len(free)
+    scatter = _SCATTER_GAUSS * math.sqrt((_SCATTER_WEIGHT + float(first.residual @ first.residual)) / readings)
+    found = solved(scatter)
+    values = found.values
+    covariance = found.covariance[:FIGURES, :FIGURES].copy()
+    # A field that turns with the aircraft looks like hard iron, and so does a tilt error.
+    turns_with_it = np.array([earth.down_gauss * tilt_sigma_rad, earth.down_gauss * tilt_sigma_rad, 0.0])
+    covariance[OFFSET, OFFSET] += np.diag(turns_with_it**2 + _TURNS_WITH_IT * max(scatter**2 - _SCATTER_GAUSS**2, 0.0))
+    soft = response(values[_DIAGONAL] - 1.0, values[_BESIDE])
+    return CompassEstimate(
+        figures=CompassFigures(values[OFFSET], soft),
+        covariance=covariance,
+        earth=earth,
+        heading_rad=float(values[_HEADING]),
+        heading_sigma_rad=math.sqrt(found.covariance[_HEADING, _HEADING]),
+        off_gauss=raw - expected(values[None])[0],
+        scatter_gauss=scatter,
+        strength=float(
+            values[_FIELD][0] / earth.horizontal_gauss * np.diag(before.soft @ np.linalg.inv(soft))[:2].mean()
+        ),
+    )
+
+
+def _azimuth_turned(tilt: Matrix, turn_rad: float) -> float:
+    """Return by how much the azimuth of a tilted aircraft's nose changes in a turn about its own z axis."""
+    ahead, right, _ = tilt
+    nose = ahead * math.cos(turn_rad) + right * math.sin(turn_rad)
+    turned = math.atan2(nose[1], nose[0]) - math.atan2(ahead[1], ahead[0])
+    return turn_rad + math.remainder(turned - turn_rad, math.tau)
+
+
+def _level_field(headings: Floats, horizontal: Floats | float, down: Floats | float) -> Floats:
+    """Return the Earth's field in the axes of a level aircraft, (..., 3), at magnetic headings in rad."""
+    level = np.stack([horizontal * np.cos(headings), -horizontal * np.sin(headings), down + 0.0 * headings], axis=-1)
+    return np.asarray(level)

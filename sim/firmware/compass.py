@@ -1,0 +1,45 @@
+"""A magnetometer of the autopilot, with hard and soft iron, in the Earth's field."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sim.earth import Array
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class SimCompass:
+    """Magnetometer in vehicle axes (FRD) with iron: reading = soft^-1 field - hard, so soft (reading + hard) is right.
+
+    `soft` is symmetric, 3x3. `spot` returns the field (3,), NED, milligauss, that iron in the ground adds at an
+    attitude (body from NED). `unplugged`: no reading.
+    """
+
+    hard_mgauss: Sequence[float] = (0.0, 0.0, 0.0)
+    soft: Array = dataclasses.field(default_factory=lambda: np.eye(3))
+    spot: Callable[[Array], Array] | None = None
+    noise_mgauss: float = 0.0
+    unplugged: bool = False
+
+    def reading(self, body_from_ned: Array, field_ned: Array, random: np.random.Generator) -> Array:
+        """Return a reading in milligauss."""
+        if self.unplugged:
+            return np.zeros(3)
+        field = field_ned if self.spot is None else field_ned + self.spot(body_from_ned)
+        noise = self.noise_mgauss * random.standard_normal(3) if self.noise_mgauss else 0.0
+        read: Array = np.linalg.solve(self.soft, body_from_ned @ field) - np.asarray(self.hard_mgauss) + noise
+        return read
+
+
+Three = Array | Sequence[float]
+
+
+def corrected(reading: Array, offset: Three, diagonal: Three, beside: Three) -> Array:
+    """Return D (reading + offset), with the diagonal of D and its elements xy, xz and yz; all zero: no D."""
+    xy, xz, yz = beside
+    soft = np.diag(np.array(diagonal)) + np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
+    found: Array = (soft if np.any(diagonal) else np.eye(3)) @ (reading + np.asarray(offset))
+    return found

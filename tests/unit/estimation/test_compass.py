@@ -1,0 +1,61 @@
+"""Hard and soft iron of a compass against the truth, by formulas of `sim` and by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+
+import numpy as np
+import pytest
+
+from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.compass import CompassFigures, CompassPose, compass
+from companion.physics.earth import MagneticField, magnetic_field
+from sim.accuracy import compasses
+from sim.accuracy.figures import covered, rms, stack
+
+EARTH = magnetic_field(47.4, 8.5, 400.0, datetime.date(2026, 6, 1))
+NO_IRON = CompassFigures(np.zeros(3), np.eye(3))
+UP = np.array([0.0, 0.0, -1.0])
+
+
+def at(heading_deg: float, earth: MagneticField = EARTH, turned_deg: float = 0.0) -> CompassPose:
+    """A level pose of a compass with an offset of 100 mG to the right."""
+    h, heading = earth.horizontal_gauss, math.radians(heading_deg)
+    raw = np.array([h * math.cos(heading), -h * math.sin(heading) - 0.1, earth.down_gauss])
+    return CompassPose(UP, raw, np.full(3, 3e-4), math.radians(turned_deg), 0.003)
+
+
+def test_four_headings_leave_less_than_half_a_degree_and_sigma_says_so() -> None:
+    runs = [compasses.board(7, number) for number in range(40)]
+    case = compasses.CASES.index((4, 0.0, compasses.QUIET))
+    level, sigma = stack(runs, "level")[:, case], stack(runs, "level_sigma")[:, case]
+    assert math.degrees(rms(level).value) < 0.5
+    assert covered(level, sigma, 2.0).value > 0.88
+    assert not stack(runs, "named")[:, case].any()
+    bent = compasses.CASES.index((4, 0.0, compasses.BENT))
+    assert stack(runs, "named")[:, bent].mean() > 0.75
+
+
+def test_one_pose_and_a_typed_heading_carry_its_error() -> None:
+    found = compass([at(30.0)], EARTH, NO_IRON, 0.001, (math.radians(31.0), math.radians(2.0)))
+    assert found.figures.offset_gauss == pytest.approx([0.0, 0.1, 0.0], abs=EARTH.horizontal_gauss * math.radians(1.1))
+    assert math.degrees(found.heading_sigma_rad) == pytest.approx(2.0, abs=0.1)
+    assert math.degrees(found.sigma_rad()) > 2.0
+
+
+def test_a_field_far_too_strong_is_named() -> None:
+    strong = dataclasses.replace(EARTH, strength_gauss=1.2 * EARTH.strength_gauss)
+    found = compass([at(heading, strong, 90.0) for heading in (0.0, 90.0, 180.0, 270.0)], EARTH, NO_IRON, 0.001)
+    assert found.strength == pytest.approx(1.2, abs=0.01)
+    assert found.bent == "field 20 % too strong here"
+
+
+def test_readings_that_do_not_turn_with_the_aircraft_are_no_compass() -> None:
+    still = [at(0.0, turned_deg=90.0) for _ in range(4)]
+    try:
+        found = compass(still, EARTH, NO_IRON, 0.001)
+    except CalibrationRefusedError:
+        return
+    assert found.bent is not None
