@@ -42,6 +42,7 @@ FIRMWARE_COMMANDS = {
     "ardupilot": "a real ArduPilot SITL binary on this aircraft, and the devices",
     "px4": "a real PX4 SITL binary on this aircraft, and the devices",
     "residuals": "what each calibration leaves in a real autopilot, as a table",
+    "compasses": "heading error that each compass calibration leaves on a real autopilot, as a table",
 }
 """Commands that `sim.sitl.cli` handles."""
 

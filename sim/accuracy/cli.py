@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Final
 
 SECTIONS: Final = (
-    "white", "floors", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "power-up",
-    "mid-warm-up", "compasses",
+    "white", "floors", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "compasses", "power-up",
+    "mid-warm-up",
 )  # fmt: skip
 HELP: Final = "errors and sigmas of the estimator, beside the physical bound"
 

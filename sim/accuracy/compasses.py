@@ -117,9 +117,10 @@ def _errors(
 
 def section(runs: list[CompassRun]) -> Section:
     """Return the table and the claims."""
+    iron = f"{1e3 * HARD_GAUSS:.0f} mG of hard and {100.0 * SOFT:.0f} % of soft iron"
     lines = [
-        f"{len(runs)} boards with {1e3 * HARD_GAUSS:.0f} mG of hard and {100.0 * SOFT:.0f} % of soft iron:",
-        "heading error all round, rms and sigma in deg, share within 2 sigma; leaned by 10 deg; iron of the spot named",
+        f"{len(runs)} boards with {iron}: heading error all round, rms and sigma",
+        "in deg, share within 2 sigma; the same leaned by 10 deg; iron of the spot named",
         "",
     ]
     claims = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import asyncio
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,8 +17,6 @@ from sim.firmware.faults import Faults
 from sim.imu_model import Bias, ImuModel
 
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-FIELD_MILLIGAUSS = (280.0, 450.0)
-"""Horizontal and vertical component of the Earth's magnetic field."""
 
 
 class AutopilotDouble(abc.ABC):
@@ -56,9 +53,6 @@ class AutopilotDouble(abc.ABC):
         self.boots = 0
         self.writes: list[Write] = []
         """All received PARAM_SET in order, obeyed or not; integers are stored as numbers."""
-        declination = math.radians(aircraft.site.declination_deg)
-        north, down = FIELD_MILLIGAUSS
-        self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
         self.compasses = [SimCompass()]
         self.channels = channels
         self._port, self.ground = channels

@@ -36,7 +36,7 @@ def pressure_hpa(height_m: float) -> float:
 def magnetic_body(double: AutopilotDouble, t_s: float, index: int = 0) -> Array:
     """Return the reading of compass `index`, or of the last one, in body axes, in milligauss."""
     sensor = double.compasses[min(index, len(double.compasses) - 1)]
-    return sensor.reading(double.aircraft.body_from_ned(t_s), double.field_ned, double.random)
+    return sensor.reading(double.aircraft.body_from_ned(t_s), 1e3 * double.aircraft.site.field_ned_gauss, double.random)
 
 
 def system_time(double: AutopilotDouble, loop_s: float) -> Message:

@@ -1,4 +1,4 @@
-"""`python -m sim ardupilot | px4 | residuals`: a real firmware on the virtual aircraft, until Ctrl-C."""
+"""`python -m sim ardupilot | px4 | residuals | compasses`: a real firmware on the virtual aircraft, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
 
 def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) -> SitlVehicle:
     """Return the firmware that the options name, not started."""
-    if arguments.command == "px4" or (arguments.command == "residuals" and arguments.binary.name.startswith("px4")):
+    if arguments.command == "px4" or (arguments.command not in SERVING and arguments.binary.name.startswith("px4")):
         return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
     links = {"companion": arguments.udp, "ground": arguments.ground} if arguments.command == "ardupilot" else {}
     return ArduPilotSitl(arguments.binary, scenario, folder, gyr_cal=arguments.gyr_cal, **links)
@@ -124,6 +124,10 @@ def main(argv: Sequence[str]) -> int:
                     own=not arguments.companion_only, companion=not arguments.own_only,
                 )
             )  # fmt: skip
+        if arguments.command == "compasses":
+            from sim.sitl import compasses
+
+            return asyncio.run(compasses.report(vehicle, folder))
         hands = hands_of(arguments, scenario)
         return asyncio.run(
             run_until_stopped(

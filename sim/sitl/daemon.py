@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import random
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Self
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.companion_process import CompanionProcess
+from sim.hands import AHEAD_S, Hands
 from sim.scenario import Scenario
 from sim.serve import configuration, serve
 from sim.sitl.process import LOOPBACK, free_udp_port
@@ -129,6 +131,28 @@ async def devices(scenario: Scenario, folder: Path) -> AsyncIterator[Path]:
     finally:
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
+
+
+async def obeyed(daemon: CompanionProcess, hands: Hands, vehicle: SitlVehicle, *words: str) -> str:
+    """Run a command of the companion to its end, and move the aircraft as it asks; return what it printed.
+
+    Raises:
+        RuntimeError: the command failed.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *daemon.command(*words), env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+    )  # fmt: skip
+    assert process.stdout is not None
+    done, printed = "", []
+    while line := (await process.stdout.readline()).decode():
+        printed.append(line)
+        if "waiting for it to move" in line and line != done:
+            done = line
+            hands.follow(line, vehicle.now_s + AHEAD_S)
+    if await process.wait() != 0:
+        raise RuntimeError(f"companion {' '.join(words)}: {''.join(printed)}")
+    return "".join(printed)
 
 
 @contextlib.asynccontextmanager

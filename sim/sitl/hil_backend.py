@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.earth import STANDARD_GRAVITY_M_S2, body_from_ned
+from sim.firmware.compass import SimCompass
 from sim.firmware.messages import pressure_hpa
 from sim.imu_model import ImuModel
 from sim.sitl.samples import Sample, SampleBlocks
@@ -135,7 +136,6 @@ class HilBackend:
         aircraft: the truth.
         imus: one or two models; the first becomes sensor 0, which the firmware reads through 16 bits.
         port: TCP port on 127.0.0.1 (the firmware wants 4560 plus its instance); 0 takes a free one, see `port`.
-        field_gauss: horizontal (towards magnetic north) and vertical part of the Earth's field.
         seed: seed of the noise of magnetometer, barometer and GNSS.
     """
 
@@ -145,7 +145,6 @@ class HilBackend:
         imus: Sequence[ImuModel],
         *,
         port: int = 0,
-        field_gauss: tuple[float, float] = (0.28, 0.45),
         seed: int = 0,
     ) -> None:
         if not 1 <= len(imus) <= 2:
@@ -155,9 +154,7 @@ class HilBackend:
         first = imus[0].in_steps(FIFO_STEPS[0], FIFO_STEPS[3])
         self.blocks = SampleBlocks(aircraft, [first, *imus[1:]])
         self._wanted_port = port
-        declination = math.radians(aircraft.site.declination_deg)
-        north, down = field_gauss
-        self._field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
+        self.compass = SimCompass()
         self._random = np.random.default_rng([seed, 7])
         self._server: asyncio.Server | None = None
         self._driving: asyncio.Task[None] | None = None
@@ -254,8 +251,8 @@ class HilBackend:
         magnetic: list[float] | None = None
         barometer: tuple[float, float, float] | None = None
         if number % SLOW_EVERY == 0:
-            field = body_from_ned(*sample.angles_rad) @ self._field_ned
-            noise = self._random.standard_normal(4)
+            attitude, noise = body_from_ned(*sample.angles_rad), self._random.standard_normal(4)
+            field = self.compass.reading(attitude, 1e3 * self._aircraft.site.field_ned_gauss, self._random) * 1e-3
             magnetic = (field + _MAGNETIC_NOISE_GAUSS * noise[:3]).tolist()
             height = self._aircraft.site.height_m
             pressure = pressure_hpa(height) + _PRESSURE_NOISE_HPA * float(noise[3])

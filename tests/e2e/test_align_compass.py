@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +13,16 @@ from companion.commands import Align
 from companion.component.service import JobResult, Refusal
 from companion.estimation.records.align_record import CompassRecord
 from sim.aircraft import Pose
-from sim.earth import Array, body_from_ned
-from sim.firmware.compass import SimCompass, corrected
+from sim.earth import Array
+from sim.firmware.compass import SimCompass
 from sim.hands import Hands
+from sim.scenario import site_at
+from sim.sitl.compasses import HARD_MGAUSS, NAMES, SOFT, heading_errors_deg
 from tests.e2e.test_align import follow
 from tests.e2e.test_calibration import started
 from tests.support.rig import Rig
 
-FIELD_NED_MGAUSS = (275.6, -33.9, 471.4)
-"""WMM2025 at the rig's place, from NOAA's calculator."""
-SOFT = np.array([[1.04, 0.02, -0.03], [0.02, 0.97, 0.015], [-0.03, 0.015, 1.02]])
-HARD_MGAUSS = (110.0, -80.0, 60.0)
-NAMES = {
-    "ardupilot": [[f"COMPASS_{what}_{axis}" for axis in "XYZ"] for what in ("OFS", "DIA", "ODI")],
-    "px4": [[f"CAL_MAG0_{axis}{what}" for axis in "XYZ"] for what in ("OFF", "SCALE", "ODIAG")],
-}
-MILLIGAUSS = {"ardupilot": 1.0, "px4": -1e3}
+SITE = site_at(40.0, 116.0, 50.0)
 
 
 def rig(
@@ -36,7 +30,6 @@ def rig(
 ) -> tuple[Rig, Hands]:
     pose = Pose(pitch_deg=slope[0], roll_deg=slope[1], heading_deg=40.0)
     made = Rig(folder, pose=pose, seed=1, firmware=firmware, imu_rate_hz=10.0, **more)  # type: ignore[arg-type]
-    made.autopilot.field_ned = np.array(FIELD_NED_MGAUSS)
     made.autopilot.compasses = [SimCompass(HARD_MGAUSS, SOFT, noise_mgauss=1.0)]
     return made, Hands(made.aircraft, placement_deg=0.1, seed=1)
 
@@ -45,17 +38,8 @@ def values(made: Rig, firmware: str) -> list[list[float]]:
     return [[made.autopilot.parameter(name) for name in names] for names in NAMES[firmware]]
 
 
-def heading_errors_deg(found: list[list[float]], unit_mgauss: float) -> Array:
-    """Error of the heading that these parameters give, every 10 degrees on the level."""
-    offset, diagonal, beside = found
-    errors = []
-    for heading in np.radians(np.arange(0.0, 360.0, 10.0)):
-        raw = np.linalg.solve(SOFT, body_from_ned(0.0, 0.0, heading) @ FIELD_NED_MGAUSS) - HARD_MGAUSS
-        field = corrected(raw, [unit_mgauss * one for one in offset], diagonal, beside)
-        declination = math.atan2(FIELD_NED_MGAUSS[1], FIELD_NED_MGAUSS[0])
-        off = math.atan2(-field[1], field[0]) + declination - heading
-        errors.append(math.degrees(math.remainder(off, 2.0 * math.pi)))
-    return np.array(errors)
+def errors_deg(found: list[list[float]], firmware: str) -> Array:
+    return heading_errors_deg(np.array(found), firmware, 1e3 * SITE.field_ned_gauss, (0.0, 0.0))
 
 
 async def aligned(made: Rig, hands: Hands, **asked: Any) -> tuple[JobResult, CompassRecord | None]:
@@ -70,12 +54,12 @@ async def test_iron_is_found_at_four_headings_written_seen_and_undone_to_the_bit
     async with made.running():
         await made.ready()
         old = values(made, firmware)
-        before_deg = heading_errors_deg(old, MILLIGAUSS[firmware])
+        before_deg = errors_deg(old, firmware)
         assert np.abs(before_deg).max() > 20.0
         result, record = await aligned(made, hands, write=True)
         assert result.outcome == "done", result
         assert record is not None
-        left_deg = heading_errors_deg(values(made, firmware), MILLIGAUSS[firmware])
+        left_deg = errors_deg(values(made, firmware), firmware)
         (found,) = record.compasses
         assert np.sqrt(np.mean(np.square(left_deg))) < min(1.0, 2.0 * found.heading_sigma_deg)
         assert found.heading_before_deg == pytest.approx(np.abs(before_deg).max(), abs=1.0)
@@ -86,3 +70,56 @@ async def test_iron_is_found_at_four_headings_written_seen_and_undone_to_the_bit
         assert not isinstance(undone, Refusal)
         assert (await undone.finished).outcome == "done"
         assert values(made, firmware) == old
+
+
+async def test_iron_under_the_spot_is_named_and_not_written(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    bent = np.diag([60.0, -60.0, 0.0])  # milligauss at 0.3 m, so 200 mG/m
+    made.autopilot.compasses[0].spot = lambda body_from_ned: bent @ body_from_ned.T @ (1.0, 0.0, 0.0)
+    async with made.running():
+        await made.ready()
+        old = values(made, "ardupilot")
+        result, record = await aligned(made, hands, write=True)
+        assert result.outcome == "failed"
+        assert "nothing was written: compass 1: heading only good to" in result.reason
+        assert "mG from pose to pose" in result.reason
+        assert record is not None
+        assert any("iron near the spot" in words for words in record.warnings)
+        assert values(made, "ardupilot") == old
+
+
+async def test_a_car_that_drives_by_and_a_plug_that_comes_off_are_named_and_nothing_is_lost(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    async with made.running():
+        await made.ready()
+        job = started(made.service.calibrating.start_alignment(Align(action="compass"), "test"))
+        following = asyncio.create_task(follow(made, hands, job))
+        (compass,) = made.autopilot.compasses
+        for trouble, words in (("car", "the field of compass 1 changes by"), ("plug", "no field of compass 1 arrives")):
+            while "measuring, 6 of" not in job.words:
+                await asyncio.sleep(0.5)
+            compass.spot = (lambda _: np.array([40.0, 0.0, 0.0])) if trouble == "car" else None
+            compass.unplugged = trouble == "plug"
+            while words not in (stands := made.service.calibrating.stands.state).objection:  # type: ignore[union-attr]
+                await asyncio.sleep(0.5)
+            compass.spot, compass.unplugged = None, False
+            assert stands is not None
+            while stands.objection:
+                await asyncio.sleep(0.5)
+        assert (await following).outcome == "done"
+        assert isinstance(job.product, CompassRecord)
+        assert job.product.heading_deg == pytest.approx(40.0, abs=1.5)
+
+
+async def test_armed_in_the_middle_nothing_is_written(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    async with made.running():
+        await made.ready()
+        old = values(made, "ardupilot")
+        job = started(made.service.calibrating.start_alignment(Align(action="compass", write=True), "test"))
+        following = asyncio.create_task(follow(made, hands, job))
+        while not job.words.startswith("3 of"):
+            await asyncio.sleep(0.5)
+        made.autopilot.arm()
+        assert "armed during the alignment" in (await following).reason
+        assert values(made, "ardupilot") == old

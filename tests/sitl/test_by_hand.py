@@ -19,6 +19,7 @@ from sim.hands import AHEAD_S, PLACEMENT_DEG, PROPPED_DEG, SIDES, Hands
 from sim.imu_model import MG
 from sim.scenario import demo
 from sim.sitl.ardupilot import ArduPilotSitl
+from sim.sitl.daemon import obeyed
 from sim.sitl.ground import GroundStation
 from sim.sitl.px4 import Px4Sitl
 from sim.sitl.residuals import SETTLE_S, ground_station, mean_reading
@@ -60,19 +61,7 @@ class ByHandBench:
         self.companion = CompanionProcess(folder)
 
     async def type(self, *words: str) -> None:
-        """Run a command of the companion to its end, and move the aircraft as it asks."""
-        process = await asyncio.create_subprocess_exec(
-            *self.companion.command(*words), env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-        )  # fmt: skip
-        assert process.stdout is not None
-        obeyed, printed = "", []
-        while line := (await process.stdout.readline()).decode():
-            printed.append(line)
-            if "waiting for it to move" in line and line != obeyed:
-                obeyed = line
-                self.hands.follow(line, self.vehicle.now_s + AHEAD_S)
-        assert await process.wait() == 0, f"companion {' '.join(words)}: {''.join(printed)}"
+        await obeyed(self.companion, self.hands, self.vehicle, *words)
 
     async def values(self, names: list[str]) -> list[float]:
         """Parameters by name."""

@@ -344,7 +344,7 @@ for (const button of document.querySelectorAll("button.hold")) {
       if (button.disabled) { say(`${name}: not possible just now, hold it again`, true); return; }
       if (navigator.vibrate) navigator.vibrate(80);
       const body = JSON.parse(button.dataset.body || "{}");
-      if ($("write").checked && ["faces", "turn"].includes(body.action) && !body.level) body.write = true;
+      if ($("write").checked && ["faces", "turn", "compass"].includes(body.action) && !body.level) body.write = true;
       act(name + (body.write ? " with WRITE" : ""), path, body);
     }, HOLD_MS);
   };

@@ -152,7 +152,7 @@ def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatc
     said: list[str] = []
     found = report(2, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS
-    assert len(said) == 9
+    assert len(said) == 10
     assert all(len(line) <= 100 for section in found.values() for line in section.lines)
 
 
