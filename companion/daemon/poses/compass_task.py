@@ -49,6 +49,8 @@ class CompassTask(SamePlaceTask):
         self.fit_from = 1 if request.heading_deg is not None else 2
         self._compasses: dict[int, CompassCalibration] = {}
         self._found: dict[int, CompassEstimate] = {}
+        self._heard: set[int] = set()
+        self._left_out: list[str] = []
         self._tilts: list[Truth] = []
         self._sides = NOTHING
 
@@ -67,11 +69,15 @@ class CompassTask(SamePlaceTask):
             raise why
 
     def unsteady(self, window: Window) -> str | None:
-        for number in list(self._compasses):
-            field = self._fields.mean(number, window.start_s, window.end_s)
-            if field is None:
+        fields = {number: self._fields.mean(number, window.start_s, window.end_s) for number in self._compasses}
+        self._heard |= {number for number, field in fields.items() if field is not None}
+        for number, field in fields.items():
+            if field is None and self._heard and number not in self._heard:
+                self._left_out.append(f"compass {number} left out: no field of it arrives")
+                del self._compasses[number]
+            elif field is None:
                 return f"no field of compass {number} arrives: is it connected?"
-            if field.change_gauss:
+            elif field.change_gauss:
                 return f"the field of compass {number} changes by {1e3 * field.change_gauss:.0f} mG: iron moves nearby"
         return None
 
@@ -117,6 +123,7 @@ class CompassTask(SamePlaceTask):
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> CompassRecord:
         assert local.field is not None
+        log.warnings += self._left_out
         for number, found in self._found.items():
             log.warnings += self._compasses[number].warnings
             if found.bent is not None:
@@ -186,12 +193,13 @@ class CompassTask(SamePlaceTask):
             if field is None:
                 raise CalibrationRefusedError(f"no field of compass {number} arrives: is it connected?")
             raw, old = calibration.raw_gauss(field.mean_gauss), calibration.figures
-            step = now.soft @ (raw + now.offset_gauss) - old.soft @ (raw + old.offset_gauss)
-            steps.append(CompassStep(number, calibration.changes(now), step))
+            right = now.soft @ (raw + now.offset_gauss)
+            step = right - old.soft @ (raw + old.offset_gauss)
+            steps.append(CompassStep(number, calibration.changes(now), right, step))
             again = await self._core.vehicle.kind.read_compass(self._core.parameters, number)
             if (again.device_id, again.offset) != (calibration.device_id, calibration.offset):
                 raise CalibrationRefusedError(f"compass {number} was changed in between: align again")
-        await writes.write_compasses(job, steps, self._fields, last, log)
+        await writes.write_compasses(job, steps, self._fields, log)
 
     def summary(self) -> str:
         worst_deg = max(found.sigma_rad() for found in self._found.values()) / DEG

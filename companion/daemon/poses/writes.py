@@ -48,10 +48,11 @@ REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the 
 
 
 class CompassStep(NamedTuple):
-    """Planned changes of one compass, and the step (3,) of its corrected field that they must cause, gauss."""
+    """Planned changes of one compass, its corrected field (3,) after them, and the step (3,) to that field, gauss."""
 
     number: int
     changes: Sequence[Change]
+    field_gauss: Array
     step_gauss: Array
 
     @property
@@ -62,8 +63,9 @@ class CompassStep(NamedTuple):
     def shows(self) -> bool:
         return float(np.linalg.norm(self.step_gauss)) > 3.0 * SEEN_GAUSS
 
-    def fits(self, made_gauss: Array) -> bool:
-        off = float(np.linalg.norm(made_gauss - self.step_gauss))
+    def fits(self, field_gauss: Array) -> bool:
+        # PX4's EKF forgets the bias that it had learned as soon as a correction changes.
+        off = float(np.linalg.norm(field_gauss - self.field_gauss))
         return off < SEEN_GAUSS + FOLLOWS_SHARE * float(np.linalg.norm(self.step_gauss))
 
 
@@ -99,12 +101,11 @@ class AlignmentWrites:
         await self.path.settle(job, plan, last, log)
 
     async def write_compasses(
-        self, job: Job, found: Sequence[CompassStep], fields: CompassFields, last: Window, log: WriteLog
+        self, job: Job, found: Sequence[CompassStep], fields: CompassFields, log: WriteLog
     ) -> None:
-        """Write new corrections of compasses; `last`: window of the last pose, in which the aircraft still stands."""
-        watched = SELECTED if self._vehicle.kind.corrected_field is not None else None
-        before = {step.number: fields.mean(step.number if watched is None else watched, last.start_s) for step in found}
+        """Write new corrections of compasses while the aircraft stands in its last pose, and see them in the field."""
         changes = [change for step in found for change in step.changes]
+        selected_only = self._vehicle.kind.corrected_field is not None
         await self.path.begin(job, len(changes))
 
         async def apply() -> list[Change]:
@@ -118,18 +119,18 @@ class AlignmentWrites:
             since_s = asyncio.get_running_loop().time() + USED_AFTER_S
             seen = []
             for step in found:
-                was, number = before[step.number], step.number if watched is None else watched
-                now = await self._field(job, fields, number, since_s)
-                made = None if was is None or now is None else now.mean_gauss - was.mean_gauss
-                seen += [step] if made is not None and step.fits(made) else []
-                if watched is None and made is not None and step not in seen:
+                now = await self._field(job, fields, SELECTED if selected_only else step.number, since_s)
+                if now is not None and step.fits(now.mean_gauss):
+                    seen.append(step)
+                elif now is not None and not selected_only:
                     raise AutopilotError(f"{step.name}'s field did not follow, or the aircraft moved")
-            if watched is not None and not seen and any(step.shows for step in found) and all(before.values()):
+            if selected_only and now is not None and not seen:
                 raise AutopilotError("the compass field did not follow, or the aircraft moved")
             for step in seen:
+                written = log.written[step.name].items()
                 log.written[step.name] = {
                     name: msgspec.structs.replace(one, outcome="verified" if step.shows else one.outcome)
-                    for name, one in log.written[step.name].items()
+                    for name, one in written
                 }
 
         await self.path.commit(changes, Origin("compass", log.started), [], apply, verify)
