@@ -61,7 +61,9 @@ def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
         return None
     t_s = double.aircraft.time_at(loop_s)
     sample_s, output = double.imu_output(index, loop_s)
-    magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s, index)]
+    magnetic = [0, 0, 0]
+    if index < len(double.compasses):
+        magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s, index)]
     temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
     boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s) + _PUBLISHED_AFTER_S)
     fields = (*in_integers(output), *magnetic, temperature)
