@@ -100,7 +100,8 @@ def config_path(options: argparse.Namespace) -> Path:
 
 def own_name(options: argparse.Namespace) -> str:
     path = config_path(options)
-    return "companion" if path == config.DEFAULT_PATH else f"companion -c {shlex.quote(str(path))}"
+    program = "companion" if shutil.which("companion") else shlex.quote(sys.argv[0])
+    return program if path == config.DEFAULT_PATH else f"{program} -c {shlex.quote(str(path))}"
 
 
 def how_to_start(options: argparse.Namespace) -> str:

@@ -57,7 +57,7 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         watch, job = Watch(made), faced(made, write=True)
         result = await follow(made, hands, job)
         assert result.outcome == "done", result
-        assert result.reason.endswith("written")
+        assert result.reason.endswith("written; now: companion calibrate")
         big = (await watch.stop())[-6:-1]
         assert big == ["TURN IT", "HOLD STILL", "MEASURING", "WRITING", "CHECKING"]
         status = made.service.status()
@@ -108,7 +108,10 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
             assert shown["undone_at"] is not None
             assert shown["in_force"] is False
         (words,) = [line for line in status_lines(made.service.status()) if line.startswith("by hand, ")]
-        assert re.search(r" UTC: faces: accel bias known to .*: written; 6 parameters written, undone 20", words)
+        assert re.search(
+            r" UTC: faces: accel bias known to .*: written; now: companion calibrate; 6 parameters written, undone 20",
+            words,
+        )
 
 
 async def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:

@@ -148,11 +148,11 @@ class Readiness:
         if self._manager.state.is_writing:
             yield self._during_write(now_s)
         glance = self._collector.glance(now_s)
-        if glance.obstacle is not None and not glance.moving:
-            yield ArmAnswer("refuse", glance.obstacle.words)
-        if (reading := self.in_force.reading()) is not None:
+        if (reading := self.in_force.reading()) is not None:  # meanwhile no sample of the IMU counts
             reading = f"{Why.UNDONE.value}; {reading}" if self.in_force.undone else reading
             yield ArmAnswer("wait", reading, against=reading)
+        if glance.obstacle is not None and not glance.moving:
+            yield ArmAnswer("refuse", glance.obstacle.words)
         if findings := self.in_force.findings(now_s):
             first, remedy = findings[0], self._automatic.why_not()
             if not self.in_force.measured and all(finding.why in _CHECKED_NEXT for finding in findings):

@@ -46,11 +46,13 @@ class CompassTask(SamePlaceTask):
         super().__init__(core, request)
         self._estimator, self._fields = estimator, fields
         self.imus_alone = core.config.gradienter is None  # type: ignore[misc]
-        self.fit_from = 1 if request.heading_deg is not None else 2
+        self.fit_from = 1
         self._compasses: dict[int, CompassCalibration] = {}
         self._found: dict[int, CompassEstimate] = {}
         self._heard: set[int] = set()
         self._left_out: list[str] = []
+        self._latest: dict[int, MeanField] = {}
+        self._means: list[dict[int, MeanField]] = []  # Of each pose, by compass
         self._tilts: list[Truth] = []
         self._sides = NOTHING
 
@@ -79,6 +81,8 @@ class CompassTask(SamePlaceTask):
                 return f"no field of compass {number} arrives: is it connected?"
             elif field.change_gauss:
                 return f"the field of compass {number} changes by {1e3 * field.change_gauss:.0f} mG: iron moves nearby"
+            else:
+                self._latest[number] = field
         return None
 
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
@@ -93,6 +97,9 @@ class CompassTask(SamePlaceTask):
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         if local.field is None:
             raise CalibrationRefusedError("the Earth's field is unknown without position and date: wait for GNSS")
+        self._means.append(dict(self._latest))
+        if len(state.poses) == 1 and self.request.heading_deg is None:
+            return []
         gradienter, warnings = self._estimator.alignment.model(), list[str]()
         self._tilts = [truth_of(one, gradienter, None, local, warnings, self._sides) for one in state.windows]
         tilt_sigma_rad = math.sqrt(max(float(np.diag(tilt.up_covariance)[:2].max()) for tilt in self._tilts))
@@ -110,16 +117,16 @@ class CompassTask(SamePlaceTask):
                     pose.heading_sigma_deg * DEG,
                 )
                 for tilt, field, pose, before in zip(
-                    self._tilts, self._means(number, state), state.poses, [state.poses[0], *state.poses], strict=False
+                    self._tilts,
+                    (means[number] for means in self._means),
+                    state.poses,
+                    [state.poses[0], *state.poses],
+                    strict=False,
                 )
             ]
             self._found[number] = compass(poses, local.field, calibration.figures, tilt_sigma_rad, heading)
         worst_deg = max(found.sigma_rad() for found in self._found.values()) / DEG
         return [f"Heading good to {worst_deg:.1f} degrees so far"] if len(state.poses) < self.total else []
-
-    def _means(self, number: int, state: SessionState) -> list[MeanField]:
-        means = [self._fields.mean(number, window.start_s, window.end_s) for window in state.windows]
-        return [mean for mean in means if mean is not None]
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> CompassRecord:
         assert local.field is not None
@@ -189,10 +196,7 @@ class CompassTask(SamePlaceTask):
         steps = []
         for number, found in self._found.items():
             calibration, now = self._compasses[number], found.figures
-            field = self._fields.mean(number, last.start_s, last.end_s)
-            if field is None:
-                raise CalibrationRefusedError(f"no field of compass {number} arrives: is it connected?")
-            raw, old = calibration.raw_gauss(field.mean_gauss), calibration.figures
+            raw, old = calibration.raw_gauss(self._means[-1][number].mean_gauss), calibration.figures
             right = now.soft @ (raw + now.offset_gauss)
             step = right - old.soft @ (raw + old.offset_gauss)
             steps.append(CompassStep(number, calibration.changes(now), right, step))

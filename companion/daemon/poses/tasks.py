@@ -382,7 +382,7 @@ class SixPositionTask(PoseTask):
     def summary(self) -> str:
         bias_mg = max(float(found.sigma[BIAS].max()) for found in self._by_imu.values()) / MG
         scale = max(float(found.sigma[SCALE].max()) for found in self._by_imu.values())
-        end = "written" if self.request.write else NOT_WRITTEN
+        end = "written; now: companion calibrate" if self.request.write else NOT_WRITTEN
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:

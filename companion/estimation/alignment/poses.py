@@ -165,11 +165,11 @@ def _apart_deg(one: Array, other: Array) -> float:
 
 
 def _part_of_turn(wanted_deg: float, turned_deg: float) -> str | None:
-    off_deg = wanted_deg - abs(turned_deg)
-    if abs(off_deg) <= min(TURN_TOLERANCE_DEG, wanted_deg / 2.0):
+    """Object to a turn of less than half of what a compass needs: any other is as good, as its angle is counted."""
+    left_deg = wanted_deg - abs(turned_deg)
+    if left_deg < wanted_deg / 2.0:
         return None
-    way = "on" if off_deg > 0.0 else "back"
-    return f"{abs(turned_deg):.0f} degrees, not {wanted_deg:.0f}: turn it {way} by {abs(off_deg):.0f}"
+    return f"{abs(turned_deg):.0f} degrees, not {wanted_deg:.0f}: turn it on by {left_deg:.0f}"
 
 
 def _azimuth(level: Array, up: Array) -> float:
