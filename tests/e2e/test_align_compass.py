@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from companion.commands import Align
 from companion.component.service import JobResult, Refusal
 from companion.estimation.records.align_record import CompassRecord
 from sim.aircraft import Pose
+from sim.devices import HMR3300
 from sim.earth import Array
 from sim.firmware.compass import SimCompass
 from sim.hands import Hands
@@ -125,3 +127,13 @@ async def test_armed_in_the_middle_nothing_is_written(tmp_path: Path) -> None:
         made.autopilot.arm()
         assert "armed during the alignment" in (await following).reason
         assert values(made, "ardupilot") == old
+
+
+async def test_our_own_compass_that_contradicts_is_named(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    made.devices["compass"] = HMR3300(made.aircraft, seed=1, heading_error_deg=25.0)
+    async with made.running():
+        await made.ready()
+        _, record = await aligned(made, hands, headings=2)
+        assert record is not None
+        assert any(re.search(r"own compass reads 6\d deg, this alignment 4\d", words) for words in record.warnings)
