@@ -291,7 +291,7 @@ class ActiveCalibration:
     def _leave_out(self, key: Key, state: _TriadState) -> None:
         state.present = None
         if state.held is Why.NEVER and state.judged and len(self._judged) > 1:
-            logger.warning("%s %s cannot be known from its integer readings and is not judged", key[1], key[0])
+            logger.warning("%s %s is not judged: the last calibration could not measure it", key[1], key[0])
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:

@@ -68,7 +68,7 @@ def test_a_tilt_sensor_turned_about_z_is_named(deg: int, pitch_deg: float, roll_
     taken = rotation_matrix(f"ROTATION_YAW_{deg}").T @ real
     biased = real + np.array([6.0, -8.0, 10.0]) * MG
     found = implausible("imu", np.zeros(3), biased, taken, np.eye(3), REMEDY)
-    assert found["accel"] == f"accel imu: reads as if the gradienter were turned by {deg} deg about z"
+    assert found["accel"] == f"accel imu: reads as if the gradienter were turned by {deg} deg more about z"
 
 
 def test_a_bias_beyond_any_parts_is_named_by_triad() -> None:
