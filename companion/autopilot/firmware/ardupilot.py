@@ -82,7 +82,7 @@ _CUSTOM_NAMES: Final = {
 _COMPASS_SLOTS: Final = ("", "2", "3")
 _COMPASS_LEARN: Final = "COMPASS_LEARN"
 _COMPASS_OFFSET: Final = Range(-2000.0, 2000.0, unit="mG")
-_COMPASS_SCALE: Final = Range(0.85, 1.4)  # ArduPilot ignores a scale outside (AP_Compass.h)
+_COMPASS_SCALE: Final = Range(1.0 / 1.5, 1.5)  # ArduPilot ignores a scale outside (AP_Compass_config.h)
 
 
 def _compass_names(slot: str) -> tuple[Names, Names, Names]:

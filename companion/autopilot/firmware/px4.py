@@ -104,6 +104,7 @@ _RIVALS: Final = (
 
 
 _MAG: Final = "CAL_MAG"
+_CUSTOM: Final = 100  # CAL_MAGn_ROT: by the angles CAL_MAGn_ROLL, PITCH and YAW
 _MAG_AUTOCAL: Final = "SENS_MAG_AUTOCAL"
 _MAG_OFFSET: Final = Range(-2.0, 2.0, unit="gauss")
 
@@ -384,6 +385,9 @@ async def _read_mounting(parameters: Parameters, prefix: str, slot: Slot) -> Mat
     own = await parameters.read_integer(f"{prefix}{slot.number}_ROT")
     internal = slot.bus == _SIMULATION_BUS or (slot.bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
     number = await parameters.read_integer("SENS_BOARD_ROT") if internal else own
+    if prefix == _MAG and number == _CUSTOM:
+        stem = f"{prefix}{slot.number}"
+        return rotation_matrix(await parameters.read_vector((f"{stem}_ROLL", f"{stem}_PITCH", f"{stem}_YAW")))
     # PX4 applies no rotation for a number that it does not know.
     if number is None or not 0 <= number < len(ROTATION_NAMES):
         number = 0
