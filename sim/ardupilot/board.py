@@ -6,17 +6,31 @@ import abc
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, Protocol
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.ardupilot.estimator import CoarseEstimator
-from sim.ardupilot.inertial import Calibrations, InertialPath
-from sim.ardupilot.parameters import NEWEST, ArduPilotParameters, Version, default_parameters, since
+from sim.ardupilot.inertial import Calibrations, InertialPath, orientation_matrix
+from sim.ardupilot.parameters import (
+    COMPASS_IDS,
+    COMPASS_SLOTS,
+    NEWEST,
+    ArduPilotParameters,
+    Version,
+    compass_external_name,
+    compass_names,
+    default_parameters,
+    since,
+)
 from sim.earth import Array
 from sim.firmware.channel import Channel, Stream
+from sim.firmware.compass import SimCompass, corrected
 from sim.firmware.double import AutopilotDouble
 from sim.imu_model import Bias, ImuModel
 
+_COMPASS_SCALES = (1.0 / 1.5, 1.5)
+"""Range of a COMPASS_SCALE that is used (`AP_Compass_config.h`)."""
 LOOP_RATE_HZ = {"copter": 400.0, "plane": 50.0}
 
 
@@ -42,6 +56,7 @@ class ArduPilotBoard(AutopilotDouble):
         aircraft: the truth.
         imus: one to three models; the first is IMU 1. Their `mounting_deg` is the true orientation of the board, which
             AHRS_ORIENTATION (default none) is meant to undo.
+        compasses: one to three, numbered as their parameters; the order in messages is that of COMPASS_PRIOn_ID.
         version: "4.3" to "4.8"; `sim.ardupilot.parameters` has the differences.
         vehicle: "copter" (loop 400 Hz) or "plane" (50 Hz: nothing above 40 Hz).
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
@@ -57,6 +72,7 @@ class ArduPilotBoard(AutopilotDouble):
         aircraft: VirtualAircraft,
         imus: Sequence[ImuModel],
         *,
+        compasses: Sequence[SimCompass] | None = None,
         system_id: int = 1,
         version: Version = NEWEST,
         vehicle: Literal["copter", "plane"] = "copter",
@@ -73,6 +89,7 @@ class ArduPilotBoard(AutopilotDouble):
             aircraft,
             imus,
             channels,
+            compasses=compasses,
             up_s=up_s,
             seed=seed,
             tunes_go_on=False,
@@ -86,6 +103,7 @@ class ArduPilotBoard(AutopilotDouble):
         self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]
         self.calibrations = Calibrations(self._paths, self.parameters, self.random)
         self._frozen: dict[int, Array] = {}
+        self.boot_compasses()
 
     def exchange_imu(self, model: ImuModel, device_id: int) -> None:
         """Replace the sensor of IMU 1: its id comes with the restart, the offsets stay (`register_accel`)."""
@@ -118,6 +136,33 @@ class ArduPilotBoard(AutopilotDouble):
         self._frozen[index] = output
         return output
 
+    def boot_compasses(self) -> None:
+        """Connect each compass to its slot of parameters, in the order of COMPASS_PRIOn_ID; a boot reads both."""
+        stored = self.parameters.values
+        ids = COMPASS_IDS[: len(self.compasses)] if stored["COMPASS_ENABLE"] else ()
+        slots = {stored[f"COMPASS_DEV_ID{slot}"]: slot for slot in COMPASS_SLOTS}
+        order = (stored[f"COMPASS_PRIO{number}_ID"] for number in (1, 2, 3))
+        self.compass_slots = [(ids.index(own), slots[own]) for own in order if own in ids and own in slots]
+        """Number (0..) and slot ("", "2", "3") of each compass, by priority."""
+
+    def compass_correction(self, slot: str) -> tuple[Array, Array, Array]:
+        """Return offsets, milligauss, diagonal, and elements beside it (3,) of a slot."""
+        offset, diagonal, beside = (self.parameters.vector(compass_names(slot, what)) for what in ("OFS", "DIA", "ODI"))
+        return np.array(offset), np.array(diagonal), np.array(beside)
+
+    def compass_field(self, priority: int, t_s: float) -> Array:
+        """Return the corrected field (3,) in vehicle FRD, milligauss, of the compass of this priority; none: zero."""
+        if priority >= len(self.compass_slots):
+            return np.zeros(3)
+        number, slot = self.compass_slots[priority]
+        reading, used = self.compass_reading(number, t_s), self.parameters.effective
+        if not reading.any():
+            return reading
+        mounting = f"COMPASS_ORIENT{slot}" if used[compass_external_name(slot)] else "AHRS_ORIENTATION"
+        raw, scale = orientation_matrix(self.parameters, mounting) @ reading, used[f"COMPASS_SCALE{slot}"]
+        scale = scale if _COMPASS_SCALES[0] <= scale <= _COMPASS_SCALES[1] else 1.0
+        return scale * corrected(raw, *self.compass_correction(slot))
+
     def update_estimator(self, loop_s: float) -> None:
         """Advance the estimator to this time; call it before anything changes the output."""
         error = self.residual(1, loop_s)
@@ -146,7 +191,9 @@ class ArduPilotBoard(AutopilotDouble):
                 self.answer(channel, mavlink.MAVLink_statustext_message(severity, chunk, text_id, number))
 
     def _new_store(self, overrides: Mapping[str, float], *, auxiliary: bool) -> ArduPilotParameters:
-        table = default_parameters(self.version, len(self.imus), auxiliary=auxiliary)
+        table = default_parameters(
+            self.version, len(self.imus), [one.external for one in self.compasses], auxiliary=auxiliary
+        )
         own = "MAV_SYSID" if since(self.version, "4.7") else "SYSID_THISMAV"
         table[own] = (float(self.system_id), table[own][1])
         table["SCHED_LOOP_RATE"] = (LOOP_RATE_HZ[self.vehicle], table["SCHED_LOOP_RATE"][1])

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.inertial import AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
-from sim.ardupilot.messages import BUILDERS
-from sim.ardupilot.parameters import Version, since
+from sim.ardupilot.messages import BUILDERS, autopilot_version
+from sim.ardupilot.parameters import Version, compass_names, since
+from sim.earth import body_from_ned
 from sim.firmware.channel import Command
+from sim.firmware.compass import soft_matrix
 
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_ACCEPTED,
@@ -40,6 +43,7 @@ class CommandServer:
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
             mavlink.MAV_CMD_SET_EKF_SOURCE_SET: self._set_source_set,
+            mavlink.MAV_CMD_FIXED_MAG_CAL_YAW: self._fix_compass_yaw,
         }
 
     def handle(self, command: Command) -> None:
@@ -93,14 +97,15 @@ class CommandServer:
         message_id = int(command.params[0])
         if not self._known(message_id):
             return FAILED
-        self._double.answer(command.channel, BUILDERS[message_id](self._double, command.loop_s))
+        message = BUILDERS[message_id](self._double, command.loop_s)
+        if message is not None:
+            self._double.answer(command.channel, message)
         return ACCEPTED
 
     def _request_capabilities(self, command: Command) -> int:
         if command.params[0] != 1.0:
             return FAILED
-        version = BUILDERS[mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION](self._double, command.loop_s)
-        self._double.answer(command.channel, version)
+        self._double.answer(command.channel, autopilot_version(self._double, command.loop_s))
         return ACCEPTED
 
     def _reboot(self, command: Command) -> int:
@@ -132,6 +137,25 @@ class CommandServer:
         if command.params[0] not in (1.0, 2.0, 3.0):
             return DENIED
         self._double.external_nav.choose(int(command.params[0]))
+        return ACCEPTED
+
+    def _fix_compass_yaw(self, command: Command) -> int:
+        """Set offsets by the Earth's field at this yaw and the estimated tilt, armed or not (`mag_cal_fixed_yaw`)."""
+        double, mask, t_s = self._double, int(command.params[1]), self._double.aircraft.time_at(command.loop_s)
+        roll, pitch, _ = double.estimated_angles_rad(command.loop_s)
+        body = body_from_ned(roll, pitch, math.radians(command.params[0]))
+        for priority, (_, slot) in enumerate(double.compass_slots):
+            in_use = double.parameters.effective[f"COMPASS_USE{priority + 1 if priority else ''}"]
+            if not in_use or (mask and not mask >> priority & 1):
+                continue
+            offset, diagonal, beside = double.compass_correction(slot)
+            uncorrected = np.linalg.solve(soft_matrix(diagonal, beside), double.compass_field(priority, t_s)) - offset
+            new = 1e3 * body @ double.aircraft.site.field_ned_gauss - uncorrected
+            for what, values in (("OFS", new.tolist()), ("DIA", (1.0, 1.0, 1.0)), ("ODI", (0.0, 0.0, 0.0))):
+                names = compass_names(slot, what)
+                for name, value in zip(names, values, strict=True):
+                    double.parameters.set(name, value)
+                double.announce(names)
         return ACCEPTED
 
     def _run_prearm_checks(self, command: Command) -> int:

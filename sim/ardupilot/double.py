@@ -35,7 +35,8 @@ class ArduPilotDouble(ArduPilotBoard):
     messages; answers need only the running loop. Time is the loop's clock.
 
     Not modelled: flight, notches, missions, learning of temperature calibrations (INS_TCALn_ENABLE = 2), calibration of
-    accelerometers and of the level, the 10 s that consistency checks must pass before arming. Nor the messages
+    accelerometers and of the level, the 10 s that consistency checks must pass before arming, the exchange of values
+    between slots of COMPASS parameters by which a boot brings them into the order of priority. Nor the messages
     LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, ODOMETRY, SETUP_SIGNING (`require_signatures` replaces it).
 
     Arguments are those of `ArduPilotBoard`.
@@ -129,6 +130,7 @@ class ArduPilotDouble(ArduPilotBoard):
     def _restarted(self, loop_s: float) -> None:
         self.parameters.set("STAT_BOOTCNT", self.parameters.values["STAT_BOOTCNT"] + 1)
         self.parameters.reload()
+        self.boot_compasses()
         self._router.forget()
         self._frozen.clear()
         self._boot_gyros(self.aircraft.time_at(loop_s))

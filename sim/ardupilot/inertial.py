@@ -37,9 +37,9 @@ _TCAL_REFERENCE_DEGC = 35.0
 _DAMPING = math.sqrt(0.5)
 
 
-def orientation_matrix(store: ArduPilotParameters) -> Array:
-    """Return the rotation from board to vehicle for AHRS_ORIENTATION (101, 102: custom); unknown numbers: none."""
-    number = int(store.effective["AHRS_ORIENTATION"])
+def orientation_matrix(store: ArduPilotParameters, name: str = "AHRS_ORIENTATION") -> Array:
+    """Return the rotation from board to vehicle for a parameter (101, 102: custom); unknown numbers: none."""
+    number = int(store.effective[name])
     if number in (101, 102):
         if not store.effective["CUST_ROT_ENABLE"]:
             return np.eye(3)

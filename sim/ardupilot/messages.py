@@ -8,15 +8,12 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import ArduPilotBoard
-from sim.ardupilot.parameters import NEWEST, compass_names
-from sim.earth import Array
-from sim.firmware.compass import corrected
+from sim.ardupilot.parameters import COMPASS_SLOTS, NEWEST
 from sim.firmware.messages import (
     SCALED_IMU,
     global_position_int,
     gps_raw_int,
     in_integers,
-    magnetic_body,
     pressure_hpa,
     sys_status,
     system_time,
@@ -24,7 +21,7 @@ from sim.firmware.messages import (
 from sim.firmware.numbers import truncated_16
 
 Message = mavlink.MAVLink_message
-Builder = Callable[["ArduPilotBoard", float], Message]
+Builder = Callable[["ArduPilotBoard", float], Message | None]
 
 
 def heartbeat(double: ArduPilotBoard, loop_s: float) -> Message:
@@ -38,10 +35,12 @@ def heartbeat(double: ArduPilotBoard, loop_s: float) -> Message:
 
 
 def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
-    """Build HIGHRES_IMU: floats of the first IMU, the barometer's temperature; the magnetic unit is wrong by 10^6."""
+    """Build HIGHRES_IMU: first IMU, first compass in use, barometer's temperature; before 4.8, 10^6 times the gauss."""
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
-    mx, my, mz = (_field(double, t_s, 0) * 1000.0).tolist()
+    uses = [double.parameters.effective[f"COMPASS_USE{slot}"] for slot in COMPASS_SLOTS]
+    unit = 0.001 if double.version == NEWEST else 1000.0
+    mx, my, mz = (double.compass_field(next((n for n, use in enumerate(uses) if use), 0), t_s) * unit).tolist()
     baro_degc = double.aircraft.temperature_degc(t_s) + 7.63
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz,
@@ -49,18 +48,10 @@ def highres_imu(double: ArduPilotBoard, loop_s: float) -> Message:
     )  # fmt: skip
 
 
-def _field(double: ArduPilotBoard, t_s: float, index: int) -> Array:
-    """Return the field of a compass as its parameters correct it, in milligauss; a missing one shows the last."""
-    number = "" if index == 0 or index >= len(double.compasses) else str(index + 1)
-    vectors = [double.parameters.vector(compass_names(number, what)) for what in ("OFS", "DIA", "ODI")]
-    field = magnetic_body(double, t_s, index)
-    return corrected(field, *vectors) if field.any() else field
-
-
 def _integers(double: ArduPilotBoard, index: int, loop_s: float) -> tuple[int, ...]:
     """Return xacc to zgyro of RAW and SCALED messages (mG, mrad/s), field in milligauss, temperature in 0.01 degC."""
     t_s = double.aircraft.time_at(loop_s)
-    mx, my, mz = (truncated_16(float(value)) for value in _field(double, t_s, index))
+    mx, my, mz = (truncated_16(float(value)) for value in double.compass_field(index, t_s))
     if index >= len(double.imus):
         return (0, 0, 0, 0, 0, 0, mx, my, mz, 0)  # the trap of SCALED_IMU3: sent, with a compass and no IMU
     temperature = truncated_16(double.imus[index].temperature_degc(t_s) * 100.0)
@@ -75,8 +66,10 @@ def raw_imu(double: ArduPilotBoard, loop_s: float) -> Message:
     )
 
 
-def scaled_imu(double: ArduPilotBoard, loop_s: float, index: int) -> Message:
-    """Build SCALED_IMU, SCALED_IMU2 or 3; a missing third IMU reads zero."""
+def scaled_imu(double: ArduPilotBoard, loop_s: float, index: int) -> Message | None:
+    """Build SCALED_IMU, SCALED_IMU2 or 3; a missing IMU or compass reads zero; None: neither exists."""
+    if index >= max(len(double.imus), len(double.compass_slots)):
+        return None
     return SCALED_IMU[index](double.boot_ms(loop_s), *_integers(double, index, loop_s))
 
 

@@ -7,6 +7,7 @@ for SYSID_THISMAV, MAVn_ for SRn_ and ARMING_SKIPCHK for ARMING_CHECK.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, Literal, get_args
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -68,14 +69,19 @@ def tcal_names(instance: int, kind: Literal["GYR", "ACC"]) -> list[tuple[str, st
     return [(base + x, base + y, base + z) for base in (f"{tcal_name(instance, kind)}{order}_" for order in (1, 2, 3))]
 
 
-def compass_names(number: str, what: Literal["OFS", "DIA", "ODI"]) -> tuple[str, str, str]:
-    """Return the names of a vector of compass "" (the first), "2" or "3"."""
-    x, y, z = (f"COMPASS_{what}{number}_{axis}" for axis in AXES)
+COMPASS_SLOTS: Final = ("", "2", "3")
+"""Numbers in the names of the parameters of a compass."""
+COMPASS_IDS: Final = (97539, 131874, 263178)
+"""Device ids of the compasses in ArduPilot's own simulation."""
+
+
+def compass_names(slot: str, what: str) -> tuple[str, str, str]:
+    x, y, z = (f"COMPASS_{what}{slot}_{axis}" for axis in AXES)
     return x, y, z
 
 
-COMPASS_ID: Final = 97539
-"""Device id of the first compass in ArduPilot's own simulation."""
+def compass_external_name(slot: str) -> str:
+    return f"COMPASS_EXTERN{slot}" if slot else "COMPASS_EXTERNAL"
 
 
 class ArduPilotParameters:
@@ -128,11 +134,13 @@ class ArduPilotParameters:
         return (name,)
 
 
-def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) -> dict[str, tuple[float, int]]:
+def default_parameters(
+    version: Version, imus: int, external: Sequence[bool], *, auxiliary: bool
+) -> dict[str, tuple[float, int]]:
     """Return the parameters that a companion needs, in a fixed order, for a calibrated board with `imus` IMUs.
 
     With `auxiliary`, from 4.4 on, there are names of IMU 4 and 5 too, and a gyro as IMU 4. Offsets of
-    0.001 m/s^2 mean "has been accelerometer-calibrated", as in ArduPilot's own simulator.
+    0.001 m/s^2 mean "has been accelerometer-calibrated", as in ArduPilot's own simulator. `external`: one per compass.
     """
     table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == NEWEST else 16, INT16)}
     old = not since(version, "4.7")
@@ -162,6 +170,7 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
         "EK3_IMU_MASK": (2 ** min(imus, 3) - 1, INT8),
         **{f"EK3_SRC1_{what}": (value, INT8) for what, value in EKF_SOURCES.items()},
         **{f"EK3_SRC{number}_{what}": (0, INT8) for number in (2, 3) for what in EKF_SOURCES},
+        "COMPASS_ENABLE": (1, INT8),
         "COMPASS_LEARN": (0, INT8),
         "COMPASS_DEC": (0.0, REAL32),
         "SCHED_LOOP_RATE": (400, INT16),
@@ -171,8 +180,9 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
         "LOG_DISARMED": (0, INT8),
         "STAT_BOOTCNT": (1, INT16),
     }
-    for slot in ("", "2", "3"):
-        device_id = COMPASS_ID if slot == "" else 0
+    for number, slot in enumerate(COMPASS_SLOTS):
+        device_id, outside = (COMPASS_IDS[number], external[number]) if number < len(external) else (0, False)
+        table |= {compass_external_name(slot): (int(outside), INT8), f"COMPASS_ORIENT{slot}": (0, INT8)}
         table |= {f"COMPASS_DEV_ID{slot}": (device_id, INT32), f"COMPASS_PRIO{slot or 1}_ID": (device_id, INT32)}
         table |= {f"COMPASS_USE{slot}": (1, INT8), f"COMPASS_SCALE{slot}": (0.0, REAL32)}
         table |= dict.fromkeys((*compass_names(slot, "OFS"), *compass_names(slot, "ODI")), (0.0, REAL32))

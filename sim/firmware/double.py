@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import abc
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
+from sim.earth import Array
 from sim.firmware.buzzer import Buzzer
 from sim.firmware.channel import Channel, Message, Write
 from sim.firmware.compass import SimCompass
@@ -17,6 +19,8 @@ from sim.firmware.faults import Faults
 from sim.imu_model import Bias, ImuModel
 
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+COMPASS_HZ = 10.0
+"""Rate at which a compass has new readings (ArduPilot: `update_batt_compass`); PX4's default is 15."""
 
 
 class AutopilotDouble(abc.ABC):
@@ -28,6 +32,7 @@ class AutopilotDouble(abc.ABC):
     Args:
         aircraft: the truth.
         imus: the models; the first is IMU 1.
+        compasses: the magnetometers; None: one on the board, without iron.
         channels: the companion's port and the ground station's.
         up_s: time since the autopilot's boot at the beginning of the simulation.
         tunes_go_on: `goes_on` of `Buzzer`.
@@ -39,6 +44,7 @@ class AutopilotDouble(abc.ABC):
         imus: Sequence[ImuModel],
         channels: tuple[Channel, Channel],
         *,
+        compasses: Sequence[SimCompass] | None,
         up_s: float,
         seed: int,
         tunes_go_on: bool,
@@ -53,7 +59,8 @@ class AutopilotDouble(abc.ABC):
         self.boots = 0
         self.writes: list[Write] = []
         """All received PARAM_SET in order, obeyed or not; integers are stored as numbers."""
-        self.compasses = [SimCompass()]
+        self.compasses = (SimCompass(mounting=imus[0].mounting),) if compasses is None else tuple(compasses)
+        self._compass_readings: dict[int, tuple[int, Array]] = {}
         self.channels = channels
         self._port, self.ground = channels
         self.random = np.random.default_rng([seed, 4])
@@ -169,6 +176,18 @@ class AutopilotDouble(abc.ABC):
     def unix_s(self, loop_s: float) -> float:
         """Return the date that the autopilot knows."""
         return self.aircraft.unix_s + self.aircraft.time_at(loop_s)
+
+    def compass_reading(self, index: int, t_s: float) -> Array:
+        """Return the newest reading (3,) of compass `index` (0..) in its own axes, milligauss; no compass: zero."""
+        if index >= len(self.compasses):
+            return np.zeros(3)
+        sensor, number = self.compasses[index], math.floor(t_s * COMPASS_HZ + 1e-6)
+        last = self._compass_readings.get(index)
+        if last is None or (last[0] != number and not sensor.stuck):
+            field_ned = 1e3 * self.aircraft.site.field_ned_gauss
+            last = number, sensor.reading(self.aircraft.body_from_ned(t_s), field_ned, self.random)
+            self._compass_readings[index] = last
+        return last[1]
 
     def now_s(self) -> float:
         return asyncio.get_running_loop().time()

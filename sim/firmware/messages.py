@@ -33,12 +33,6 @@ def pressure_hpa(height_m: float) -> float:
     return float(1013.25 * (1.0 - height_m / 44330.8) ** 5.25588)
 
 
-def magnetic_body(double: AutopilotDouble, t_s: float, index: int = 0) -> Array:
-    """Return the reading of compass `index`, or of the last one, in body axes, in milligauss."""
-    sensor = double.compasses[min(index, len(double.compasses) - 1)]
-    return sensor.reading(double.aircraft.body_from_ned(t_s), 1e3 * double.aircraft.site.field_ned_gauss, double.random)
-
-
 def system_time(double: AutopilotDouble, loop_s: float) -> Message:
     """Build SYSTEM_TIME; GNSS supplies the date."""
     return mavlink.MAVLink_system_time_message(int(double.unix_s(loop_s) * 1e6), double.boot_ms(loop_s))

@@ -11,11 +11,19 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.earth import Array
-from sim.firmware.compass import corrected
+from sim.firmware.compass import SimCompass
 from sim.firmware.double import AutopilotDouble
-from sim.firmware.messages import magnetic_body
 from sim.imu_model import Bias, ImuModel
-from sim.px4.parameters import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, PX4Parameters, default_parameters
+from sim.px4.calibration import MagCalibration
+from sim.px4.parameters import (
+    EXTERNAL_COMPASS_IDS,
+    EXTERNAL_IDS,
+    SIMULATED_COMPASS_IDS,
+    SIMULATED_IDS,
+    SLOTS,
+    PX4Parameters,
+    default_parameters,
+)
 from sim.px4.port import NORMAL_RATES, ONBOARD_RATES, PX4Port
 from sim.px4.vehicle_imu import VehicleImu, VehicleImuSample
 
@@ -39,6 +47,7 @@ class PX4Board(AutopilotDouble):
         aircraft: the truth.
         imus: one to four models in the order of their uORB instances; the first is IMU 1. Their `mounting_deg` is the
             true orientation of the board, which SENS_BOARD_ROT (default none) or CAL_x_ROT is meant to undo.
+        compasses: one to four in the order of their uORB instances; compass n has the slot CAL_MAGn_.
         version: "1.18": PARAM_ERROR. "1.16": silence instead.
         vehicle: "copter" or "plane".
         parameters: values that differ from the defaults, such as {"IMU_GYRO_CAL_EN": 0}; set before the first boot.
@@ -57,6 +66,7 @@ class PX4Board(AutopilotDouble):
         aircraft: VirtualAircraft,
         imus: Sequence[ImuModel],
         *,
+        compasses: Sequence[SimCompass] | None = None,
         system_id: int = 1,
         version: Version = "1.18",
         vehicle: Literal["copter", "plane"] = "copter",
@@ -89,12 +99,16 @@ class PX4Board(AutopilotDouble):
             aircraft,
             imus,
             self.ports,
+            compasses=compasses,
             up_s=up_s,
             seed=seed,
             tunes_go_on=True,
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
         self.console = console
+        self._mag_ids = [
+            (EXTERNAL_COMPASS_IDS if one.external else SIMULATED_COMPASS_IDS)[n] for n, one in enumerate(self.compasses)
+        ]
         ids = [EXTERNAL_IDS[n] if n in external else SIMULATED_IDS[n] for n in range(len(imus))]
         table = default_parameters()
         self.parameters = self._new_store(table, parameters or {}, ids, slots or range(len(imus)))
@@ -105,7 +119,9 @@ class PX4Board(AutopilotDouble):
         self.primary_imu = 0
         """Number of the IMU that flies the aircraft, which HIGHRES_IMU shows."""
         self._frozen: dict[int, VehicleImuSample] = {}
-        self._compass = [np.zeros(3), np.ones(3), np.zeros(3)]
+        self.mag_bias_gauss = np.zeros(3)
+        """Bias (3,) of the selected compass that EKF2 has learned, vehicle FRD; a new correction deletes it."""
+        self.mags: list[MagCalibration] = self.new_mags()
 
     def residual(self, instance: int, loop_s: float) -> Bias:
         """Error left in the output of IMU `instance` (1..) after offsets and scales: output minus truth, FRD."""
@@ -122,17 +138,30 @@ class PX4Board(AutopilotDouble):
         return sample
 
     def compass_output(self, t_s: float) -> Array:
-        """Return the field of the first compass as its parameters correct it, in milligauss."""
-        used = [
-            np.array([self.parameters[f"CAL_MAG0_{axis}{what}"] for axis in "XYZ"])
-            for what in ("OFF", "SCALE", "ODIAG")
-        ]
-        for number, (now, least) in enumerate(zip(used, (0.005, 0.01, 0.01), strict=True)):
-            # Magnetometer.cpp: a small step of a vector is not taken into use.
-            if np.linalg.norm(now - self._compass[number]) > least:
-                self._compass[number] = now
-        offset, scale, beside = self._compass
-        return corrected(magnetic_body(self, t_s), -1e3 * offset, scale, beside)
+        """Return the corrected field (3,) in vehicle FRD, gauss, of the enabled compass with the highest priority."""
+        best = max((mag for mag in self.mags if mag.enabled), key=lambda mag: mag.priority, default=None)
+        if best is None:
+            return np.zeros(3)
+        return best.correct(1e-3 * self.compass_reading(self.mags.index(best), t_s)) - self.mag_bias_gauss
+
+    def restart_sensors(self) -> None:
+        """Read the calibrations as at a boot."""
+        for imu in self.vehicle_imus:
+            imu.restart()
+        self.mags, self.mag_bias_gauss = self.new_mags(), np.zeros(3)
+
+    def update_mags(self) -> None:
+        """Read the calibrations of the compasses again, unless armed."""
+        for mag in () if self.armed else self.mags:
+            before = mag.count
+            mag.parameters_update()
+            if mag.count != before:
+                self.mag_bias_gauss = np.zeros(3)
+
+    def new_mags(self) -> list[MagCalibration]:
+        """Return the corrections as somebody who begins now reads them."""
+        sensors = zip(self._mag_ids, self.compasses, strict=True)
+        return [MagCalibration(own, self.parameters, external=one.external) for own, one in sensors]
 
     def update_estimators(self, loop_s: float) -> None:
         """Advance the estimators to this time; call it before anything changes the output."""
@@ -161,6 +190,8 @@ class PX4Board(AutopilotDouble):
         for device_id, slot in zip(ids, slots, strict=True):
             if slot is not None:
                 table |= {f"CAL_GYRO{slot}_ID": device_id, f"CAL_ACC{slot}_ID": device_id}
+        for number, (own, one) in enumerate(zip(self._mag_ids, self.compasses, strict=True)):
+            table |= {f"CAL_MAG{number}_ID": own, f"CAL_MAG{number}_ROT": 0 if one.external else -1}
         table["MAV_SYS_ID"] = self.system_id
         table["MAV_TYPE"] = 2 if self.vehicle == "copter" else 1
         store = PX4Parameters(table)

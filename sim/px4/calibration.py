@@ -13,13 +13,16 @@ from typing import Literal
 import numpy as np
 
 from sim.earth import Array, mounting_matrix
+from sim.firmware.compass import soft_matrix
 from sim.firmware.numbers import rotation_matrix
 from sim.px4.parameters import SLOTS, PX4Parameters
 
-Kind = Literal["GYRO", "ACC"]
+Kind = Literal["GYRO", "ACC", "MAG"]
 _PRIORITY, _EXTERNAL_PRIORITY = 50, 75
 THRESHOLD = 0.01
 """Smallest change of offset (rad/s, m/s^2) or scale: a new vector must be farther than this from the one in use."""
+_MAG_THRESHOLD_GAUSS = 0.005
+_CUSTOM_ROTATION = 100
 
 
 class SensorCalibration:
@@ -52,9 +55,15 @@ class SensorCalibration:
         return self.slot is not None
 
     @property
+    def priority(self) -> float:
+        """Return CAL_x_PRIO, 0 to 100, or its default."""
+        stored = -1 if self.slot is None else self._store[f"CAL_{self.kind}{self.slot}_PRIO"]
+        return stored if 0 <= stored <= 100 else _EXTERNAL_PRIORITY if self.external else _PRIORITY
+
+    @property
     def enabled(self) -> bool:
         """True if the sensor is enabled; CAL_x_PRIO 0 disables it."""
-        return self.slot is None or self._store[f"CAL_{self.kind}{self.slot}_PRIO"] != 0
+        return self.priority > 0
 
     def correct(self, raw: Array) -> Array:
         """Correct a reading (3) in sensor axes, and rotate it into vehicle axes."""
@@ -77,19 +86,20 @@ class SensorCalibration:
         number = int(store[f"CAL_{self.kind}{self.slot}_ROT"]) if self.external else int(store["SENS_BOARD_ROT"])
         self._set_rotation(max(number, 0))
         self.set_offset(np.array(store.vector(self.slot, self.kind, "OFF")))
-        if self.kind == "ACC":
+        if self.kind != "GYRO":
             scale = np.array(store.vector(self.slot, self.kind, "SCALE"))
             if _far(self.scale, scale) and np.isfinite(scale).all() and (scale > 0.0).all():
                 self.scale = scale
                 self.count += 1
 
     def set_offset(self, offset: Array) -> bool:
-        """Use an offset if its difference to the one in use is longer than 0.01.
+        """Use an offset if its difference to the one in use is longer than 0.01; of a magnetometer, 5 mG.
 
         A gyro without an offset uses any offset; an accelerometer never uses one below 0.01.
         """
         first = self.kind == "GYRO" and self.count == 0
-        if (first or _far(self.offset, offset)) and np.isfinite(offset).all():
+        threshold = _MAG_THRESHOLD_GAUSS if self.kind == "MAG" else THRESHOLD
+        if (first or _far(self.offset, offset, threshold)) and np.isfinite(offset).all():
             self.offset = offset.astype(np.float32).astype(np.float64)
             self.count += 1
             return True
@@ -113,7 +123,7 @@ class SensorCalibration:
             store.set(f"{prefix}ROT", -1)
         for axis, offset, scale in zip("XYZ", self.offset, self.scale, strict=True):
             store.set(f"{prefix}{axis}OFF", float(offset))
-            if self.kind == "ACC":
+            if self.kind != "GYRO":
                 store.set(f"{prefix}{axis}SCALE", float(scale))
         return True
 
@@ -122,10 +132,44 @@ class SensorCalibration:
         self.rotation = level @ rotation_matrix(number)
 
 
+class MagCalibration(SensorCalibration):
+    """Correction of a magnetometer in gauss: R S (raw - OFF), S with SCALE on the diagonal, ODIAG (xy, xz, yz) beside.
+
+    Facts: PX4 `Magnetometer.cpp`. Not modelled: the currents' share (CAL_MAGn_COMP).
+    """
+
+    def __init__(self, device_id: int, store: PX4Parameters, *, external: bool) -> None:
+        self.beside = np.zeros(3)
+        super().__init__("MAG", device_id, store, external=external)
+
+    @property
+    def soft(self) -> Array:
+        return soft_matrix(self.scale, self.beside)
+
+    def correct(self, raw: Array) -> Array:
+        return np.asarray(self.rotation @ self.soft @ (raw - self.offset))
+
+    def reset(self) -> None:
+        super().reset()
+        self.beside = np.zeros(3)
+
+    def parameters_update(self) -> None:
+        super().parameters_update()
+        if self.slot is None:
+            return
+        beside = np.array(self._store.vector(self.slot, "MAG", "ODIAG"))
+        if _far(self.beside, beside) and np.isfinite(beside).all():
+            self.beside = beside
+            self.count += 1
+        if self.external and self._store[f"CAL_MAG{self.slot}_ROT"] == _CUSTOM_ROTATION:
+            angles = (self._store[f"CAL_MAG{self.slot}_{angle}"] for angle in ("ROLL", "PITCH", "YAW"))
+            self.rotation = self.rotation @ mounting_matrix(*angles)
+
+
 def find_slot(store: PX4Parameters, kind: Kind, device_id: int) -> int | None:
     """Return the first slot whose CAL_x_ID is this device's id."""
     return next((slot for slot in range(SLOTS) if store[f"CAL_{kind}{slot}_ID"] == device_id), None)
 
 
-def _far(used: Array, wanted: Array) -> bool:
-    return bool(np.linalg.norm(used - wanted) > THRESHOLD)
+def _far(used: Array, wanted: Array, threshold: float = THRESHOLD) -> bool:
+    return bool(np.linalg.norm(used - wanted) > threshold)

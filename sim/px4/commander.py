@@ -60,6 +60,7 @@ class Commander:
             mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
             mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: self._calibrate,
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
+            mavlink.MAV_CMD_FIXED_MAG_CAL_YAW: self._fix_compass_yaw,
         }
         self.restart()
 
@@ -199,6 +200,13 @@ class Commander:
             self._calibrations.gyros()
         elif command.params[3] != 0.0:
             return UNSUPPORTED
+        return ACCEPTED
+
+    def _fix_compass_yaw(self, command: Command) -> int:
+        if self._double.armed or self._double.calibrating:
+            return TEMPORARILY_REJECTED
+        yaw_deg = round(command.params[0]) if math.isfinite(command.params[0]) else 0
+        self._calibrations.compasses(math.radians(yaw_deg))
         return ACCEPTED
 
     def _reboot(self, command: Command) -> int:

@@ -70,8 +70,7 @@ class PX4Double(PX4Board):
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter value without an announcement; it is in use at once, however small the change."""
         self.parameters.preset(name, value)
-        for imu in self.vehicle_imus:
-            imu.restart()
+        self.restart_sensors()
         self._read_boot_parameters()
 
     def write_as_another_station(self, name: str, value: float) -> None:
@@ -130,8 +129,7 @@ class PX4Double(PX4Board):
     def _restarted(self, loop_s: float) -> None:
         self.parameters.load()
         self._frozen.clear()
-        for imu in self.vehicle_imus:
-            imu.restart()
+        self.restart_sensors()
         for part in (
             self._parameter_server,
             self.authorization,
@@ -165,6 +163,7 @@ class PX4Double(PX4Board):
     def _update_imus(self, now_s: float) -> None:
         """Update the IMUs' parameters; an estimator deletes its bias when an offset or scale changes."""
         self.update_estimators(now_s)
+        self.update_mags()
         for imu in self.vehicle_imus:
             gyro, accel = imu.gyro.count, imu.accel.count
             imu.gyro.parameters_update()

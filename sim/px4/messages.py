@@ -11,7 +11,6 @@ from sim.firmware.messages import (
     global_position_int,
     gps_raw_int,
     in_integers,
-    magnetic_body,
     pressure_hpa,
     sys_status,
     system_time,
@@ -48,7 +47,7 @@ def highres_imu(double: PX4Board, loop_s: float) -> Message:
     sample_s, output = double.imu_output(double.primary_imu, loop_s)
     double.update_estimators(loop_s)
     gx, gy, gz, ax, ay, az = (output - double.vehicle_imus[double.primary_imu].estimator.published).tolist()
-    mx, my, mz = (double.compass_output(t_s) * 0.001).tolist()
+    mx, my, mz = double.compass_output(t_s).tolist()
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(double.aircraft.loop_time_of(sample_s)), ax, ay, az, gx, gy, gz, mx, my, mz,
         pressure_hpa(height_m), 0.0, height_m, double.aircraft.temperature_degc(t_s) + 7.63, 4095, 0,
@@ -56,14 +55,16 @@ def highres_imu(double: PX4Board, loop_s: float) -> Message:
 
 
 def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
-    """Build SCALED_IMU, 2 or 3: corrected, without estimator, truncated to mG and mrad/s; None: no such IMU."""
-    if index >= len(double.imus):
-        return None
+    """Build SCALED_IMU, 2 or 3: IMU corrected, without estimator, truncated to mG and mrad/s; field raw, sensor's axes.
+
+    None: neither such an IMU nor such a compass exists.
+    """
     t_s = double.aircraft.time_at(loop_s)
+    magnetic = [truncated_16(float(value)) for value in double.compass_reading(index, t_s)]
+    if index >= len(double.imus):
+        fields = double.boot_ms(loop_s), *[0] * 6, *magnetic, 0
+        return SCALED_IMU[index](*fields) if index < len(double.compasses) else None
     sample_s, output = double.imu_output(index, loop_s)
-    magnetic = [0, 0, 0]
-    if index < len(double.compasses):
-        magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s, index)]
     temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
     boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s) + _PUBLISHED_AFTER_S)
     fields = (*in_integers(output), *magnetic, temperature)

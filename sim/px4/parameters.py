@@ -20,6 +20,8 @@ SIMULATED_IDS = (1310988, 1310996, 1311004, 1311012)
 """Device ids in PX4's own simulation: internal sensors."""
 EXTERNAL_IDS = (1311243, 1311499, 1311755, 1312011)
 """Device ids on a CAN bus: external sensors."""
+SIMULATED_COMPASS_IDS = (197388, 197644, 197900, 198156)
+EXTERNAL_COMPASS_IDS = (197131, 197387, 197643, 197899)
 LENGTH = 764
 """Number of parameters in the list; the real firmware has 920."""
 
@@ -38,12 +40,12 @@ def default_parameters() -> dict[str, float]:
     """Return the defaults by name: an int is an INT32, a float a REAL32."""
     table = dict(_FIXED)
     for slot in range(SLOTS):
-        for kind in ("GYRO", "ACC"):
+        for kind in ("GYRO", "ACC", "MAG"):
             table |= {f"CAL_{kind}{slot}_ID": 0, f"CAL_{kind}{slot}_PRIO": -1, f"CAL_{kind}{slot}_ROT": -1}
             table |= {f"CAL_{kind}{slot}_{axis}OFF": 0.0 for axis in "XYZ"}
-        table |= {f"CAL_MAG{slot}_ID": 197388 if slot == 0 else 0, f"CAL_MAG{slot}_PRIO": -1, f"CAL_MAG{slot}_ROT": -1}
-        for what, value in (("OFF", 0.0), ("SCALE", 1.0), ("ODIAG", 0.0)):
-            table |= {f"CAL_MAG{slot}_{axis}{what}": value for axis in "XYZ"}
+        table |= {f"CAL_MAG{slot}_{axis}SCALE": 1.0 for axis in "XYZ"}
+        table |= {f"CAL_MAG{slot}_{axis}ODIAG": 0.0 for axis in "XYZ"}
+        table |= {f"CAL_MAG{slot}_{angle}": 0.0 for angle in ("ROLL", "PITCH", "YAW")}
         table |= {f"CAL_ACC{slot}_{axis}SCALE": 1.0 for axis in "XYZ"}
     # Port 0 is TELEM1 with a ground station, port 1 TELEM2 with a companion: streams, and no forwarding there.
     for port, config, mode, rate, forward in ((0, 101, 0, 1200, 1), (1, 102, 2, 0, 0), (2, 0, 0, 0, 0)):

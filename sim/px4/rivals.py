@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.earth import STANDARD_GRAVITY_M_S2, Array, body_from_ned
 from sim.px4.board import PX4Board
 from sim.px4.calibration import SensorCalibration
 from sim.px4.vehicle_imu import VehicleImu
@@ -26,7 +26,7 @@ _INFO, _CRITICAL = mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_CRITICAL
 
 
 class CommandedCalibrations:
-    """PX4's own gyro calibration on command.
+    """PX4's own calibrations on command: of the gyros, and of the compasses by a known heading.
 
     The command is acknowledged at the start; the result is only sent as texts. It does not subtract the Earth's
     rotation, and changes nothing below the threshold of 0.01 rad/s.
@@ -42,6 +42,18 @@ class CommandedCalibrations:
         for percent in range(0, 101, 10):
             self._double.later(percent / 100.0 * 0.99, functools.partial(self._progress, percent))
         self._double.later(GYRO_TIME_S, lambda: self._finish_gyros(1))
+
+    def compasses(self, yaw_rad: float) -> None:
+        """Set offsets so that the field at this yaw and the estimated tilt is the Earth's; SCALE and ODIAG stay."""
+        double, now_s = self._double, self._double.now_s()
+        roll, pitch, _ = double.estimated_angles_rad(now_s)
+        field = body_from_ned(roll, pitch, yaw_rad) @ double.aircraft.site.field_ned_gauss
+        for index, own in enumerate(double.new_mags()):
+            raw = 1e-3 * double.compass_reading(index, double.aircraft.time_at(now_s))
+            own.set_offset(raw - np.linalg.solve(own.soft, own.rotation.T @ field))
+            own.save(index)
+        double.parameters_changed()
+        double.say(_INFO, "Mag quick calibration finished")
 
     def _progress(self, percent: int) -> None:
         self._double.say(_INFO, f"[cal] progress <{percent}>")

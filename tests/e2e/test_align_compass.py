@@ -31,8 +31,8 @@ def rig(
     folder: Path, firmware: str = "ardupilot", slope: tuple[float, float] = (2.0, -1.0), **more: Any
 ) -> tuple[Rig, Hands]:
     pose = Pose(pitch_deg=slope[0], roll_deg=slope[1], heading_deg=40.0)
+    more = {"compasses": [SimCompass(HARD_MGAUSS, SOFT, noise_mgauss=1.0)], **more}
     made = Rig(folder, pose=pose, seed=1, firmware=firmware, imu_rate_hz=10.0, **more)  # type: ignore[arg-type]
-    made.autopilot.compasses = [SimCompass(HARD_MGAUSS, SOFT, noise_mgauss=1.0)]
     return made, Hands(made.aircraft, placement_deg=0.1, seed=1)
 
 
