@@ -15,7 +15,7 @@ from companion.component.service import JobResult, Refusal
 from companion.estimation.records.align_record import CompassRecord
 from sim.aircraft import Pose
 from sim.devices import HMR3300
-from sim.earth import Array
+from sim.earth import Array, mounting_matrix
 from sim.firmware.compass import SimCompass
 from sim.hands import Hands
 from sim.scenario import site_at
@@ -137,3 +137,27 @@ async def test_our_own_compass_that_contradicts_is_named(tmp_path: Path) -> None
         _, record = await aligned(made, hands, headings=2)
         assert record is not None
         assert any(re.search(r"own compass reads 6\d deg, this alignment 4\d", words) for words in record.warnings)
+
+
+@pytest.mark.parametrize(
+    ("firmware", "parameters"),
+    [
+        ("ardupilot", {"COMPASS_SCALE": 0.7}),
+        ("px4", {"CAL_MAG0_ROT": 100.0, "CAL_MAG0_ROLL": 10.0, "CAL_MAG0_PITCH": -20.0, "CAL_MAG0_YAW": 35.0}),
+    ],
+)
+async def test_a_scale_and_a_turn_of_its_own_are_those_of_the_firmware(
+    tmp_path: Path, firmware: str, parameters: dict[str, float]
+) -> None:
+    scale = parameters.get("COMPASS_SCALE", 1.0)
+    turned = mounting_matrix(10.0, -20.0, 35.0) if firmware == "px4" else np.eye(3)
+    compass = SimCompass(HARD_MGAUSS, scale * SOFT, mounting=turned, external=firmware == "px4")
+    made, hands = rig(tmp_path, firmware, parameters=parameters, compasses=[compass])
+    async with made.running():
+        await made.ready()
+        result, record = await aligned(made, hands, write=True)
+        assert result.outcome == "done", result
+        assert record is not None
+        assert record.heading_deg == pytest.approx(40.0, abs=1.0)
+        (found,) = record.compasses
+        assert {one.outcome for one in found.written.values()} == {"verified"}
