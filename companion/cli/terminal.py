@@ -100,7 +100,8 @@ def config_path(options: argparse.Namespace) -> Path:
 
 def own_name(options: argparse.Namespace) -> str:
     path = config_path(options)
-    program = "companion" if shutil.which("companion") else shlex.quote(sys.argv[0])
+    in_path = shutil.which("companion") or Path(sys.argv[0]).name != "companion"
+    program = "companion" if in_path else shlex.quote(sys.argv[0])
     return program if path == config.DEFAULT_PATH else f"{program} -c {shlex.quote(str(path))}"
 
 
