@@ -10,7 +10,7 @@ WAITING ?= 6
 # Where it is set, every process of every test compiles the whole program anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo quick test long check format bench accuracy campaign pictures messages deb deb-test lock sbom audit clean
+.PHONY: help demo quick test long check format bench accuracy campaign firmware-watch pictures messages deb deb-test lock sbom audit clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about two minutes)'
@@ -22,6 +22,7 @@ help:
 	@echo 'make bench   speed, as ratios within one run'
 	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about ten minutes on two cores)'
 	@echo 'make campaign  every fault in every phase of a calibration (about 6 minutes on two cores)'
+	@echo 'make firmware-watch  SRC=TREE: what of a source tree of ArduPilot or PX4 differs for the companion'
 	@echo 'make pictures  those of the documents, from real runs (needs Chromium; about three minutes)'
 	@echo 'make messages  docs/messages.md from the catalogue in companion/messages'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
@@ -84,6 +85,10 @@ SEED ?= 7
 
 campaign: $(VENV)/.dev
 	@$(BIN)/python -m tests.campaign --seed $(SEED) --jobs $(JOBS)
+
+# SRC: a source tree, or a binary that is built already.
+firmware-watch: $(VENV)/.dev
+	@$(BIN)/python packaging/firmware_watch.py $(SRC)
 
 # Some of them alone: PICTURES='demo page report'.
 PICTURES ?=

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import struct
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion import autopilot as autopilots
+from companion.autopilot.firmware.firmwares import firmware_named
 from sim.earth import Array
 from sim.firmware.messages import SCALED_IMU
 from sim.imu_model import DEG_H, MG
+from sim.sitl.ground import Firmware
 from sim.sitl.residuals import truncated_mean
-from tests.sitl.craft import Autopilot, Craft, hush
+from tests.sitl.craft import Autopilot, Craft, DoubleAutopilot, hush
 
 HIGHRES = mavlink.MAVLink_highres_imu_message
 AHRS = mavlink.MAVLink_ahrs_message
@@ -23,6 +29,14 @@ FIRST_GYRO = {"ardupilot": "INS_GYROFFS_X", "px4": "CAL_GYRO1_XOFF"}
 FIRST_ACCEL = {"ardupilot": "INS_ACCOFFS_X", "px4": "CAL_ACC1_XOFF"}
 APPLIED_S = 2.5
 """PX4's consumers look at most once a second."""
+
+
+def used_names(firmware: Firmware) -> set[str]:
+    """Return the parameters that a write may change, and every text of the firmware code that may be such a name."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in Path(autopilots.__file__).parent.rglob("*.py"))
+    texts = {one.value for tree in trees for one in ast.walk(tree) if isinstance(one, ast.Constant)}
+    kind = firmware_named(firmware)
+    return {*kind.ranges, *kind.heading_names(), *(text for text in texts if isinstance(text, str) and text.isupper())}
 
 
 async def look(craft: Craft, seconds: float = 3.0) -> Array:
@@ -39,6 +53,7 @@ async def look(craft: Craft, seconds: float = 3.0) -> Array:
     return result
 
 
+@pytest.mark.firmware_watch
 def test_an_accelerometer_offset_is_taken_off_the_reading_without_a_reboot(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         name = FIRST_ACCEL[craft.firmware]
@@ -53,6 +68,7 @@ def test_an_accelerometer_offset_is_taken_off_the_reading_without_a_reboot(autop
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 def test_a_gyro_offset_is_taken_off_the_reading_without_a_reboot(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         await hush(craft)
@@ -90,6 +106,7 @@ def test_ardupilot_answers_a_write_at_once_and_it_shows_within_a_tenth_of_a_seco
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 @pytest.mark.only("ardupilot")
 def test_writing_x_of_a_vector_announces_y_and_z_too(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
@@ -106,6 +123,7 @@ def test_writing_x_of_a_vector_announces_y_and_z_too(autopilot: Autopilot) -> No
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 @pytest.mark.parametrize("name", ["INS_ACC1OFFS_X", "CAL_GYRO9_XOFF"])
 def test_an_unknown_name_is_answered_with_param_error_1_and_no_value(autopilot: Autopilot, name: str) -> None:
     async def main(craft: Craft) -> None:
@@ -141,9 +159,38 @@ def test_orientation_101_is_the_first_custom_rotation(autopilot: Autopilot) -> N
     autopilot.run(main, 240.0)
 
 
+@pytest.mark.firmware_watch
+def test_the_parameters_that_the_companion_uses_have_the_names_of_the_double(
+    autopilot: Autopilot, record_property: Callable[[str, object], None]
+) -> None:
+    async def listed(craft: Craft) -> set[str]:
+        return set(await craft.ground.whole_list())
+
+    async def lacks(craft: Craft, name: str) -> bool:
+        """Check a name of a group that is switched off, which the list leaves out."""
+        try:
+            await craft.ground.get(name)
+        except KeyError:
+            return True
+        return False
+
+    async def compare(craft: Craft) -> tuple[list[str], list[str]]:
+        found = await listed(craft)
+        return [name for name in expected if name not in found and await lacks(craft, name)], sorted(used & found)
+
+    known, used = DoubleAutopilot(autopilot.kind).run(listed), used_names(autopilot.firmware)
+    expected = sorted(used & known)
+    assert len(expected) > 30
+    missing, had = autopilot.run(compare)
+    record_property("missing", ", ".join(missing) or "none")
+    record_property("new", ", ".join(name for name in had if name not in known) or "none")
+    assert missing == []
+
+
 INTEGER = {"ardupilot": "INS_GYR_CAL", "px4": "IMU_GYRO_CAL_EN"}
 
 
+@pytest.mark.firmware_watch
 def test_an_integer_travels_as_a_number_on_ardupilot_and_as_bytes_on_px4(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         ground, loop = craft.ground, asyncio.get_running_loop()
@@ -167,6 +214,7 @@ def test_an_integer_travels_as_a_number_on_ardupilot_and_as_bytes_on_px4(autopil
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 @pytest.mark.only("ardupilot")
 def test_4_8_has_the_names_of_4_7_on_and_irregular_ones_for_the_first_imu(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
@@ -235,6 +283,7 @@ def test_offsets_are_taken_off_in_the_boards_axes_before_its_orientation(autopil
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 @pytest.mark.only("px4")
 def test_px4_answers_a_write_of_the_wrong_type_with_param_error_7(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:

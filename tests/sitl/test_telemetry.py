@@ -20,6 +20,7 @@ UNBIASED_INTEGERS = {"ardupilot": 1, "px4": 2}
 """PX4's simulator passes the first IMU through another 16 bits (autopilots 9.3)."""
 
 
+@pytest.mark.firmware_watch
 def test_scaled_imu_is_truncated_toward_zero(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         instance = UNBIASED_INTEGERS[craft.firmware]
@@ -45,6 +46,7 @@ def test_a_rate_below_one_mrad_s_reads_zero_most_of_the_time(autopilot: Autopilo
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 @pytest.mark.only("ardupilot")
 def test_highres_imu_of_ardupilot_is_the_calibrated_sensor_in_floats(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
@@ -57,6 +59,7 @@ def test_highres_imu_of_ardupilot_is_the_calibrated_sensor_in_floats(autopilot: 
     autopilot.run(main)
 
 
+@pytest.mark.firmware_watch
 @pytest.mark.only("px4")
 def test_highres_imu_of_px4_has_the_estimators_gyro_bias_taken_out(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:

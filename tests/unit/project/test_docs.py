@@ -127,9 +127,9 @@ def test_commands_are_understood(path: Path) -> None:
 
 
 def test_named_make_targets_exist() -> None:
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = {
-        name for path in DOCUMENTS for name in re.findall(r"(?:^ {4}|`|PX4_SITL=\S+ )make ([a-z]+)", path.read_text())
+        name for path in DOCUMENTS for name in re.findall(r"(?:^ {4}|`|PX4_SITL=\S+ )make ([a-z-]+)", path.read_text())
     }
     assert named
     assert named <= targets
