@@ -139,6 +139,7 @@ class Status(Command, frozen=True, tag="status"):
 class Monitor(Command, frozen=True, tag="monitor"):
     help = "watch the daemon until Ctrl-C"
     pose: Annotated[bool, Field("attitude, and records as they end, too", by=Interface.MQTT)] = False
+    samples: Annotated[bool, Field("with `pose`: mean readings of the autopilot's IMUs, too", by=Interface(0))] = False
 
 
 class Calibrate(Command, frozen=True, tag="calibrate"):

@@ -6,11 +6,14 @@ Each command is answered by its subsystem; the status is merged from the parts o
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+from collections import deque
 from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
+import numpy as np
 
 from companion.commands import ALL, Monitor, Status
 from companion.component.component import MavlinkComponent
@@ -30,7 +33,7 @@ from companion.estimation.records.record import ImuRecord
 from companion.formats import Object
 from companion.messages import message
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad
+from companion.samples import ImuSample, Triad
 
 if TYPE_CHECKING:
     from companion.daemon.interfaces.child import Child, StartChild
@@ -38,10 +41,18 @@ if TYPE_CHECKING:
 LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
+MOST_SAMPLES: Final = 1000
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet", "interrupt": "Ctrl-C's"}
 """Names of interfaces in requests, and in texts for people, as in "cancelled by mqtt cancel"."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
 """Status of the web page while its process reports nothing."""
+
+
+def _mean(samples: deque[ImuSample]) -> Object:
+    """Average the readings and empty the queue."""
+    rows = np.mean([(*sample.gyro_rad_s, *sample.accel_m_s2) for sample in samples], axis=0).tolist()
+    samples.clear()
+    return {"gyro_rad_s": rows[:3], "accel_m_s2": rows[3:]}
 
 
 class Interfaces(Subsystem):
@@ -108,23 +119,33 @@ class Interfaces(Subsystem):
         yield {"kind": "result", "status": await self.refresh()}
 
     async def _monitor(self, request: Monitor, _face: str) -> AsyncIterator[Object]:
-        """Stream the status every 0.5 s; with `pose`, also the attitude and any new state or record every 0.2 s."""
+        """Stream the status every 0.5 s; with `pose`, also the attitude and any new state or record every 0.2 s.
+
+        With `samples`, `imus` has the means of each autopilot IMU's readings since the last reply, in vehicle FRD.
+        """
         if not request.pose:
             while True:
                 yield {"kind": "progress", "status": await self.refresh()}
                 await asyncio.sleep(MONITOR_EVERY_S)
         shown, due_s, loop, record = "", 0.0, asyncio.get_running_loop(), None
-        while True:
-            reply: Object = {"kind": "progress", "pose": await self._pose.refresh()}
-            if self._manager.last is not record:
-                record = self._manager.last
-                reply["record"] = msgspec.to_builtins(record)
-            state = self._manager.state.shown
-            if state != shown or loop.time() >= due_s:
-                reply["status"] = self.all_status()
-                shown, due_s = state, loop.time() + MONITOR_EVERY_S
-            yield reply
-            await asyncio.sleep(POSE_EVERY_S)
+        read: dict[str, deque[ImuSample]] = {}
+        with contextlib.ExitStack() as stack:
+            for name, imu in self._devices.imus.items() if request.samples else ():
+                read[name] = deque(maxlen=MOST_SAMPLES)
+                stack.callback(imu.on_sample.add(read[name].append))
+            while True:
+                reply: Object = {"kind": "progress", "pose": await self._pose.refresh()}
+                if request.samples:
+                    reply["imus"] = {name: _mean(samples) for name, samples in read.items() if samples}
+                if self._manager.last is not record:
+                    record = self._manager.last
+                    reply["record"] = msgspec.to_builtins(record)
+                state = self._manager.state.shown
+                if state != shown or loop.time() >= due_s:
+                    reply["status"] = self.all_status()
+                    shown, due_s = state, loop.time() + MONITOR_EVERY_S
+                yield reply
+                await asyncio.sleep(POSE_EVERY_S)
 
     async def refresh(self) -> Object:
         await self._pose.refresh()
