@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.aircraft import VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.firmware.compass import SimCompass
 from sim.imu_model import Bias
 from sim.motions import Motion
 from sim.scenario import DEMO_POSE, Scenario, demo
@@ -114,8 +115,10 @@ class DoubleCraft(Craft):
         self.models = scenario.flight_controller_imus
         self.double: Any
         if firmware == "ardupilot":
+            parameters = {"INS_GYR_CAL": 0.0} | _tiny_offsets()
+            compasses = [SimCompass() for _ in range(3)]  # as ArduPilot's own simulation has
             self.double = ArduPilotDouble(
-                self.aircraft, self.models, parameters={"INS_GYR_CAL": 0.0} | _tiny_offsets(), seed=1, up_s=60.0
+                self.aircraft, self.models, parameters=parameters, compasses=compasses, seed=1, up_s=60.0
             )
         else:
             self.double = px4_double()(self.aircraft, self.models, seed=1, up_s=60.0)
