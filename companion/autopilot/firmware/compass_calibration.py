@@ -56,6 +56,10 @@ class CompassCalibration:
     warnings: tuple[str, ...] = ()
 
     @property
+    def stored(self) -> tuple[int, Vector, Vector, Vector]:
+        return self.device_id, self.offset, self.diagonal, self.beside
+
+    @property
     def figures(self) -> CompassFigures:
         soft = np.diag(self.diagonal) + symmetric(np.array(self.beside)) if any(self.diagonal) else np.eye(3)
         turn = self.in_vehicle

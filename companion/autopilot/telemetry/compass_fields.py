@@ -12,8 +12,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.firmwares import FIRMWARES
 from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.links.mavlink.link import MavlinkLink, Message
 from companion.physics.frames import Array
 
 SELECTED: Final = 0
@@ -42,32 +42,29 @@ class MeanField(NamedTuple):
 class CompassFields:
     """Collects the messages with fields; `asked` requests those that do not come by themselves."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
+        self._link, self._vehicle = link, vehicle
         self._seen: dict[int, deque[tuple[float, Array]]] = defaultdict(lambda: deque(maxlen=_KEPT))
-        self._listens = False
-        messages = {message for firmware in FIRMWARES for message in firmware.compass_messages.values()}
-        messages |= {each for firmware in FIRMWARES if (each := firmware.corrected_field) is not None}
-        for message in messages:
-            vehicle.hear(message, self._on_message)
 
     @contextlib.asynccontextmanager
     async def asked(self) -> AsyncIterator[None]:
         """Request the messages that do not arrive; restore the firmware's own rates at the end."""
         self._seen.clear()
-        self._listens = True
-        await asyncio.sleep(LISTEN_S)
         kind, commands = self._vehicle.kind, self._vehicle.commands
         wanted = {**kind.compass_messages, **({} if kind.corrected_field is None else {SELECTED: kind.corrected_field})}
-        missing = [message for number, message in wanted.items() if number not in self._seen]
-        for message in missing:
-            commands.request_message_interval(message.id, RATE_HZ)
+        unsubscribe = [self._link.subscribe(message, self._on_message) for message in set(wanted.values())]
+        missing: list[type[Message]] = []
         try:
+            await asyncio.sleep(LISTEN_S)
+            missing += [message for number, message in wanted.items() if number not in self._seen]
+            for message in missing:
+                commands.request_message_interval(message.id, RATE_HZ)
             yield
         finally:
             for message in missing:
                 commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message.id, 0.0)  # the firmware's own rate
-            self._listens = False
+            for each in unsubscribe:
+                each()
 
     def mean(self, number: int, since_s: float, until_s: float = math.inf) -> MeanField | None:
         """Return the mean field of a compass over a time; None: too few messages."""
@@ -83,7 +80,7 @@ class CompassFields:
         return MeanField(fields.mean(axis=0), sigma, change if change > max(chance, _STEP_GAUSS) else 0.0)
 
     def _on_message(self, message: Any, t_s: float) -> None:
-        if not self._listens:
+        if not self._vehicle.sent(message):
             return
         kind = self._vehicle.kind
         field = np.array([message.xmag, message.ymag, message.zmag], dtype=np.float64)

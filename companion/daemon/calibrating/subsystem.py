@@ -69,7 +69,7 @@ class Calibrating(Subsystem):
         self.estimator = Estimator(core, self.alignment, self.faces, own)
         self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
-        self._fields = CompassFields(core.vehicle)
+        self._fields = CompassFields(core.link, core.vehicle)
         parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 

@@ -45,7 +45,7 @@ class CompassTask(SamePlaceTask):
     def __init__(self, core: Core, request: AlignmentRequest, estimator: Estimator, fields: CompassFields) -> None:
         super().__init__(core, request)
         self._estimator, self._fields = estimator, fields
-        self.imus_alone = core.config.gradienter is None  # type: ignore[misc]
+        self.imus_alone = core.config.gradienter is None
         self.fit_from = 1
         self._compasses: dict[int, CompassCalibration] = {}
         self._found: dict[int, CompassEstimate] = {}
@@ -98,10 +98,12 @@ class CompassTask(SamePlaceTask):
         if local.field is None:
             raise CalibrationRefusedError("the Earth's field is unknown without position and date: wait for GNSS")
         self._means.append(dict(self._latest))
-        if len(state.poses) == 1 and self.request.heading_deg is None:
-            return []
         gradienter, warnings = self._estimator.alignment.model(), list[str]()
         self._tilts = [truth_of(one, gradienter, None, local, warnings, self._sides) for one in state.windows]
+        if self._tilts[0].tilt_from is None:
+            raise CalibrationRefusedError("the tilt is known to 3 deg only: align faces first, or connect a gradienter")
+        if len(state.poses) == 1 and self.request.heading_deg is None:
+            return []
         tilt_sigma_rad = math.sqrt(max(float(np.diag(tilt.up_covariance)[:2].max()) for tilt in self._tilts))
         heading = None
         if (heading_deg := self.request.heading_deg) is not None:
@@ -131,15 +133,13 @@ class CompassTask(SamePlaceTask):
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> CompassRecord:
         assert local.field is not None
         log.warnings += self._left_out
+        log.warnings += dict.fromkeys(words for one in self._compasses.values() for words in one.warnings)
         for number, found in self._found.items():
-            log.warnings += self._compasses[number].warnings
             if found.bent is not None:
                 log.warnings.append(f"compass {number}: {found.bent}: iron near the spot, move by 5 m")
             if found.sigma_rad() > GOOD_DEG * DEG or found.strength_is_wrong:
                 self.shortfall = f"compass {number}: heading only good to {found.sigma_rad() / DEG:.1f} deg"
                 self.shortfall += "" if found.bent is None else f": {found.bent}: move by 5 m"
-        if self._tilts[0].tilt_from is None:
-            log.warnings.append("the tilt is only known to 3 deg: align faces first, or connect a gradienter")
         first = next(iter(self._found.values()))
         heading_deg = (first.heading_rad / DEG + local.declination_deg) % 360.0
         log.warnings += self._beside_own_compass(state.windows[0], local, heading_deg, first.heading_sigma_rad / DEG)
@@ -201,7 +201,7 @@ class CompassTask(SamePlaceTask):
             step = right - old.soft @ (raw + old.offset_gauss)
             steps.append(CompassStep(number, calibration.changes(now), right, step))
             again = await self._core.vehicle.kind.read_compass(self._core.parameters, number)
-            if (again.device_id, again.offset) != (calibration.device_id, calibration.offset):
+            if again.stored != calibration.stored:
                 raise CalibrationRefusedError(f"compass {number} was changed in between: align again")
         await writes.write_compasses(job, steps, self._fields, log)
 

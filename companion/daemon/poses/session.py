@@ -115,7 +115,7 @@ class SessionState:
 class PoseTask(abc.ABC):
     """Base class of the kinds of alignment: their poses, acceptance test, fit, record and estimate."""
 
-    imus_alone: ClassVar[bool] = True
+    imus_alone: bool = True
     """True: do not wait for samples of gradienter or compass, as either may stop sending when turned over."""
     if_armed: ClassVar[str | None] = None
     """Text of the error if the aircraft arms; None: the alignment continues once it is disarmed."""

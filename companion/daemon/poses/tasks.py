@@ -113,7 +113,7 @@ class SamePlaceTask(PoseTask):
 class ZeroTask(SamePlaceTask):
     """Measures the gradienter's zero; from tilted poses also its mounting relative to each IMU."""
 
-    imus_alone: ClassVar[bool] = False
+    imus_alone: bool = False
     if_armed: ClassVar[str | None] = ARMED
 
     def __init__(self, core: Core, request: AlignmentRequest, kept: ActiveAlignment) -> None:

@@ -120,12 +120,14 @@ class AlignmentWrites:
             seen = []
             for step in found:
                 now = await self._field(job, fields, SELECTED if selected_only else step.number, since_s)
-                if now is not None and step.fits(now.mean_gauss):
+                if now is None:
+                    continue
+                if step.fits(now.mean_gauss):
                     seen.append(step)
-                elif now is not None and not selected_only:
+                    if selected_only:
+                        break  # the others are not seen, however alike their fields are
+                elif not selected_only or step is found[-1]:
                     raise AutopilotError(f"{step.name}'s field did not follow, or the aircraft moved")
-            if selected_only and now is not None and not seen:
-                raise AutopilotError("the compass field did not follow, or the aircraft moved")
             for step in seen:
                 written = log.written[step.name].items()
                 log.written[step.name] = {
