@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -161,3 +162,14 @@ async def test_a_scale_and_a_turn_of_its_own_are_those_of_the_firmware(
         assert record.heading_deg == pytest.approx(40.0, abs=1.0)
         (found,) = record.compasses
         assert {one.outcome for one in found.written.values()} == {"verified"}
+
+
+async def test_without_a_known_tilt_the_first_pose_says_so(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    made.config = msgspec.structs.replace(made.config, gradienter=None)
+    del made.devices["gradienter"]
+    async with made.running():
+        await made.ready()
+        result, _ = await aligned(made, hands)
+        assert result.outcome == "failed"
+        assert "the tilt is known to 3 deg only: align faces first" in result.reason
