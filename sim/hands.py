@@ -27,9 +27,9 @@ PLACEMENT_DEG, PROPPED_DEG = 0.02, 4.0
 """Sigmas of the error when placing the aircraft on marks by careful hands, and when propping it up; degrees."""
 HANDS: Final = (
     "turn DEG: clockwise on its spot; tilt PITCH ROLL: nose up and right side down against its spot (tilt 20 0); hold"
-    " PITCH ROLL: against the horizon (hold 0 180: on its back); spot PITCH ROLL: onto another spot, which slopes so;"
-    " back: onto its spot; bump PITCH ROLL: the spot tips; grip SECONDS: a hand stays on it; wait SECONDS: before the"
-    " next line"
+    " PITCH ROLL: against the horizon (hold 0 180: on its back; hold 45 0: between level and nose up); spot PITCH"
+    " ROLL: onto another spot, which slopes so; back: onto its spot; bump PITCH ROLL: the spot tips; grip SECONDS: a"
+    " hand stays on it; wait SECONDS: before the next line"
 )
 """Typed lines, each with its meaning."""
 SIDES: Final = {

@@ -175,6 +175,7 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
     # Beside the ports, so that no root is needed to try.
     lines += ["", "[control]", f'socket = "{directory / "control.sock"}"']
     lines += ["", "[storage]", f'directory = "{directory / "state"}"']
+    lines += ["", "# A page for a browser: remove the # of these two lines.", "# [web]", '# bind = "127.0.0.1:8191"']
     if udp is None:
         site = scenario.aircraft.site
         lines += ["", "[vehicle]", f"latitude_deg = {site.latitude_deg}", f"longitude_deg = {site.longitude_deg}"]

@@ -255,7 +255,7 @@ def _number(value: float | None) -> str:
 def six_position_lines(imus: Sequence[Object]) -> list[str]:
     lines = []
     for imu in imus:
-        lines.append(f"{imu['name']}: faces alignment, {imu['measured_at'][:19]} UTC; its output has left")
+        lines.append(f"{imu['name']}: faces alignment, {imu['measured_at'][:19]} UTC; errors left in its output:")
         lines.append(_figure_line("accel bias", "mg", imu["bias_left_mg"], imu["bias_sigma_mg"], "+.3f"))
         lines.append(_figure_line("accel scale", "%", imu["scale_left"], imu["scale_sigma"], "+.4f", 0.01))
     return lines

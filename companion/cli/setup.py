@@ -338,7 +338,7 @@ class _Session:
         started = self._goes_on or await self._service(runs=runs)
         is_old = runs and not started and self.answer["state"] != "unchanged"
         command, runs = own_name(self._options), runs or started
-        steps = [*_next_steps(parsed, command, is_old=is_old, runs=runs, good=good, checks=checks)]
+        steps = [*next_steps(parsed, command, is_old=is_old, runs=runs, good=good, checks=checks)]
         self.answer["next"] = steps
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
 
@@ -374,7 +374,7 @@ class _Session:
         return not reason
 
 
-def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
+def next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
     """List the operator's next steps; `is_old`: the running daemon still uses the previous configuration."""
     is_service = command == "companion"
     if not good:
@@ -388,7 +388,7 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
         yield f"{command} run   (leave it running, and go on in another terminal)"
     if not checks:
         yield f"{command} check"
-    if parsed.gradienter is not None:
+    if parsed.gradienter is not None and not _zero_is_known(parsed):
         from companion.configured.models import tilt_sigma_deg  # takes a second on a small board
 
         sigma_deg = parsed.gradienter.sigma_deg or tilt_sigma_deg(parsed.gradienter.protocol)
@@ -398,6 +398,14 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
         yield f"{command} align faces --write   (once: accelerometers too, in about 12 poses, held by hand, 5 min)"
+
+
+def _zero_is_known(parsed: Config) -> bool:
+    from companion.daemon.poses.alignment import ActiveAlignment  # takes a second on a small board
+
+    alignment = ActiveAlignment(parsed, offload=asyncio.to_thread)
+    alignment.load()
+    return alignment.used is not None
 
 
 def _refuse_wrong(given: dict[str, str]) -> None:

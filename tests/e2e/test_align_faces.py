@@ -46,6 +46,10 @@ def read(rig: Rig, what: str) -> np.ndarray[Any, Any]:
     return np.array([rig.double.parameter(name) for name in offset_names(1, what)])  # type: ignore[arg-type]
 
 
+def accel_sigma_mg(rig: Rig) -> Any:
+    return rig.service.status()["arming"]["quality"]["accel"]["sigma"]
+
+
 async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path: Path) -> None:
     offsets = dict(zip(offset_names(1, "accel"), (0.1, -0.08, 0.05), strict=True))
     made, hands = rig(tmp_path, parameters=SCALES | offsets)
@@ -94,12 +98,16 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         assert done.outcome == "done"
         assert not re.search("scale", " ".join([*after.warnings, *after.imus[0].warnings]))
         assert made.service.status()["stands"] is None, "somebody has started something else"
+        left_mg = (read(made, "accel") - made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2) / MG
+        assert accel_sigma_mg(made) is not None
+        assert np.abs(left_mg).max() / 4.0 < accel_sigma_mg(made) < 0.3
         for what in ("calibration", "faces"):
             undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             result = await undone.finished
             assert result.reason.endswith(f"old values restored: {what}")
             assert {name: made.double.parameter(name) for name in gyros} == gyros
+        assert accel_sigma_mg(made) is None
         assert {name: made.double.parameter(name) for name in old} == old
         again = ByHand(made.service.core, made.service.devices.imus)
         again.load()

@@ -88,6 +88,7 @@ class ActiveCalibration:
         """Biases that an automatic calibration estimates: of gyros, and with a gradienter also of accelerometers."""
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
+        self._names, self._faces = names, calibrating.faces
         self.temperatures_degc: dict[str, float] = {}  # Temperatures of the IMUs at the last check of their output
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
@@ -158,9 +159,16 @@ class ActiveCalibration:
         return min(known) if known and len(known) == len(self._judged) else None
 
     def sigma(self, triad: Triad) -> float | None:
-        """Return the largest sigma of the active gyro or accel calibrations, rad/s or m/s^2; None if there is none."""
-        held = [state.held for (_, of), state in self._triads.items() if of == triad]
-        return max((max(each.sigma_use) for each in held if isinstance(each, Held)), default=None)
+        """Return the largest sigma of the active gyro or accel calibrations, rad/s or m/s^2; None if there is none.
+
+        Accelerometers count with the calibration or the written faces alignment, whichever has the smaller sigma.
+        """
+        held = {name: state.held for (name, of), state in self._triads.items() if of == triad}
+        found = {name: max(each.sigma_use) for name, each in held.items() if isinstance(each, Held)}
+        for name in self._names if triad == "accel" else ():
+            by_faces = self._faces.sigma_m_s2(name, self.temperatures_degc.get(name))
+            found |= {} if by_faces is None else {name: min(by_faces, found.get(name, math.inf))}
+        return max(found.values(), default=None)
 
     def record_of(self, name: str) -> ImuRecord | None:
         states = [state for key, state in self._triads.items() if key[0] == name and state.judged]

@@ -150,6 +150,13 @@ class ActiveSixPosition:
         found = {imu.name: self._now(imu.name, imu.temperature_degc) for imu in window.imus}
         return {name: now for name, now in found.items() if now is not None}
 
+    def sigma_m_s2(self, name: str, temperature_degc: float | None) -> float | None:
+        """Return the largest sigma of the biases of an accelerometer; None if its offsets do not remove them."""
+        now = self._now(name, temperature_degc)
+        if now is None or (np.abs(now.figures[BIAS]) > now.sigma[BIAS]).any():
+            return None
+        return float(now.sigma[BIAS].max())
+
     def _now(self, name: str, temperature_degc: float | None) -> Sides | None:
         calibration = self._imus[name].calibration if name in self._imus else None
         return None if calibration is None else self.known(name, calibration, temperature_degc)

@@ -329,9 +329,9 @@ def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
 def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
     """Mark triads with impossible means as useless, with cause and remedy as warnings; `up` is in vehicle axes."""
     means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
-    found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
-    hidden = imu.hidden | {triad: f"{words}; {local.remedies.any_bias}" for triad, words in found.items()}
-    return msgspec.structs.replace(imu, hidden=hidden, useless=imu.useless | found.keys())
+    expected, remedies = local.gravity_m_s2 * up, local.remedies
+    found = implausible(imu.name, *means, expected, np.array(imu.mounting), remedies.mounting, remedies.any_bias)
+    return msgspec.structs.replace(imu, hidden=imu.hidden | found, useless=imu.useless | found.keys())
 
 
 def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:

@@ -43,11 +43,12 @@ def implausible(
     expected_m_s2: Array,
     sensor_to_vehicle: Matrix,
     remedy: str,
+    any_bias: str,
 ) -> dict[Triad, str]:
     """Return, for each implausible triad of a motionless IMU, the reason why no bias explains its mean readings.
 
     The means and `expected_m_s2`, the specific force by the tilt sensor, are (3,), vehicle axes (FRD). `remedy`: text
-    on how to configure another mounting, with {} for the name of that mounting.
+    on how to configure another mounting, with {} for the name of that mounting; `any_bias`: how to accept a large bias.
     """
     if words := misplaced(name, force_m_s2, expected_m_s2, sensor_to_vehicle, remedy):
         return {"gyro": words, "accel": words}
@@ -58,12 +59,12 @@ def implausible(
     elif bias[axis := int(bias.argmax())] > MOST_ACCEL_M_S2:
         found["accel"] = (
             f"accel {name}: a bias of {bias[axis] / G:.2f} g on {_AXES[axis]}, more than any sensor has"
-            f" ({MOST_ACCEL_M_S2 / G:g}): scale, unit or tilt are wrong"
+            f" ({MOST_ACCEL_M_S2 / G:g}): scale, unit or tilt are wrong; {any_bias}"
         )
     if rate[axis := int(rate.argmax())] > MOST_GYRO_RAD_S:
         found["gyro"] = (
             f"gyro {name}: a bias of {rate[axis] / DEG:.0f} deg/s on {_AXES[axis]}, more than any sensor has"
-            f" ({MOST_GYRO_RAD_S / DEG:g}): deg/s for rad/s?"
+            f" ({MOST_GYRO_RAD_S / DEG:g}): deg/s for rad/s? {any_bias}"
         )
     return found
 

@@ -10,7 +10,9 @@ import pytest
 
 from companion import cli, config
 from companion.cli.client import pose_lines
+from companion.cli.setup import next_steps
 from companion.estimation.records.align_record import AlignmentRecord, GradienterSettings
+from companion.storage.records import alignment_in
 
 CONFIG = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "a"\nsource = "autopilot"\n[control]\nsocket = "{}"\n'
 RECORD = AlignmentRecord(
@@ -63,3 +65,29 @@ def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:
     assert "    sigma_deg = 0.0125" in lines
     # 0.0125 deg of g.
     assert any("0.22 mg" in line for line in lines)
+
+
+def test_the_set_up_asks_for_a_zero_only_where_none_is_kept(tmp_path: Path) -> None:
+    gradienter = '[gradienter]\nport = "/dev/g"\nprotocol = "inclinometer_xy"\nlaw = "slope"\n'
+    gradienter += f'mounting = [0, 0, 90]\noffset_deg = [0.01, 0.02]\n[storage]\ndirectory = "{tmp_path}"\n'
+    parsed = config.parse(CONFIG.format(tmp_path / "none.sock") + gradienter, "file")
+
+    def steps() -> str:
+        return "\n".join(next_steps(parsed, "companion", is_old=False, runs=True, good=True, checks=True))
+
+    assert "align zero" in steps()
+    alignment_in(tmp_path).write(RECORD)
+    assert "align zero" not in steps()
+    alignment_in(tmp_path).write(
+        msgspec.structs.replace(
+            RECORD,
+            gradienter=GradienterSettings(
+                port="/dev/g",
+                protocol="inclinometer_xy",
+                law="axis",
+                mounting=(0.0, 0.0, 90.0),
+                offset_deg=(0.01, 0.02),
+            ),
+        )
+    )
+    assert "align zero" in steps()

@@ -149,7 +149,7 @@ def test_what_is_in_force_is_shown_with_its_sigma(tmp_path: Path) -> None:
     assert shown["bias_left_mg"] == pytest.approx(BIAS_MG)
     assert shown["scale_left"] == pytest.approx(ERROR)
     (first, bias, scale) = six_position_lines([shown])
-    assert first == "fc: faces alignment, 2026-01-01T00:00:00 UTC; its output has left"
+    assert first == "fc: faces alignment, 2026-01-01T00:00:00 UTC; errors left in its output:"
     assert "x +3.000 +- 0.030" in bias
     assert "x +0.4000 +- 0.0040" in scale
 
