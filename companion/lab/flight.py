@@ -18,7 +18,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_
 from companion.autopilot.parameters.change import Change, FirmwareName, Parameters, same_float32
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.noise.allan import PROFILES, noise_profile
-from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Stages, Term
+from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Split, Stages, Term
 from companion.estimation.records.record import Record
 from companion.estimation.solution.prior import curve_of
 from companion.lab import ardupilot_log, inertial, px4_log
@@ -193,6 +193,9 @@ async def _imu(
         ekf = _ekf(imu, in_air)
         if calibration is not None:
             warmth = _warmth(imu, calibration, biases, stages, in_air)
+    axes = tuple(inertial.split(ground, flown, _means(imu.vibration, flown[:, 0]), warmth, ekf))
+    if calibration is not None and (name := calibration.parameters.hover_bias):
+        notes += _hover_bias(name, boot.parameters_at(stages.armed_s), axes[-1])
     return ImuFlight(
         imu=imu.number,
         rate_hz=imu.rate_hz,
@@ -201,10 +204,20 @@ async def _imu(
         accel_id=imu.accel_id if calibration is None else calibration.accel_id,
         set_gyro_rad_s=None if calibration is None else calibration.gyro_offset_rad_s,
         set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
-        axes=tuple(inertial.split(ground, flown, _means(imu.vibration, flown[:, 0]), warmth, ekf)),
+        axes=axes,
         drift=drift,
         notes=tuple(notes),
     )
+
+
+def _hover_bias(name: str, values: Mapping[str, float], vertical: Split) -> Iterator[str]:
+    """Compare the hover bias that ArduPilot learned before this flight with the bias in the air; both are whole."""
+    learned = values.get(name, 0.0)
+    if learned and math.isfinite(learned):
+        used = "subtracted in flight" if values.get("ACC_ZBIAS_LEARN", 0.0) % 4.0 >= 2.0 else "not in use"
+        seen = vertical.in_flight
+        beside = "" if seen is None else f"; here in the air {seen.value / MG:+.1f} ± {seen.sigma / MG:.1f} mg"
+        yield f"accel z: {name}, learned in hover, {used}, is {learned / MG:+.1f} mg{beside}"
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation) -> Floats:

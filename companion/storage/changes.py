@@ -14,7 +14,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-from companion.autopilot.firmware.firmwares import CALIBRATION
+from companion.autopilot.firmware.firmwares import CALIBRATION, LEARNED
 from companion.autopilot.parameters.change import Change
 from companion.errors import StorageError
 from companion.formats import Object
@@ -119,6 +119,8 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def _joined(older: Changed | None, newer: Changed) -> Changed:
     """Join two changes of one parameter; return only the newer change if somebody else changed the value in between."""
+    if older is not None and older.after is not None and newer.parameter in LEARNED:
+        return msgspec.structs.replace(newer, before=newer.before + older.before - older.after)
     if older is None or older.after != newer.before:
         return newer
     via = newer.via

@@ -16,6 +16,7 @@ from sim.ardupilot.parameters import (
     COMPASS_IDS,
     COMPASS_SLOTS,
     NEWEST,
+    REAL32,
     ArduPilotParameters,
     Version,
     compass_external_name,
@@ -197,6 +198,8 @@ class ArduPilotBoard(AutopilotDouble):
         own = "MAV_SYSID" if since(self.version, "4.7") else "SYSID_THISMAV"
         table[own] = (float(self.system_id), table[own][1])
         table["SCHED_LOOP_RATE"] = (LOOP_RATE_HZ[self.vehicle], table["SCHED_LOOP_RATE"][1])
+        # Names of a later firmware (pull request 32471) exist only where a value is given.
+        table |= {name: (0.0, REAL32) for name in overrides if name.endswith("VRFB_Z")}
         store = ArduPilotParameters(table)
         for name, value in overrides.items():
             store.set(name, value)

@@ -159,3 +159,32 @@ async def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_a
         written = [rig.double.parameter(name) for name in offset_names(2, "gyro")]
         np.testing.assert_allclose(written, own_record.gyro_bias_rad_s, atol=1e-9)
         assert {w.outcome for w in record.imus[0].written.values()} == {"verified"}
+
+
+async def test_a_hover_bias_that_the_autopilot_learned_follows_the_offsets_and_an_undo(tmp_path: Path) -> None:
+    name, vibration_m_s2 = "INS_ACC_VRFB_Z", 0.15
+    values = {"AHRS_ORIENTATION": 8.0, "INS_ACCOFFS_Z": 0.08, name: 0.1, "INS_ACC2_VRFB_Z": 0.0}
+    async with Rig(tmp_path, **QUICK, mounting_deg=(180.0, 0.0, 0.0), parameters=values).running() as rig:
+        double, undo = rig.double, rig.service.calibrating.manager.start_undo
+
+        def unlearned_m_s2() -> float:
+            """Learned bias, less what the offsets leave: the vibration's own part."""
+            return float(double.parameter(name) - double.residual(1, rig.now_s).accel_m_s2[2])
+
+        await rig.ready()
+        residual_m_s2 = float(double.residual(1, rig.now_s).accel_m_s2[2])
+        assert abs(residual_m_s2) > 5.0 * MG
+        learned_m_s2 = residual_m_s2 + vibration_m_s2
+        double.set_parameter(name, learned_m_s2)
+        result, record = await calibrated(rig, What.ACCELEROMETERS)
+        assert result.outcome == "done", result
+        assert double.parameter(name) == pytest.approx(vibration_m_s2, abs=1.0 * MG)
+        assert unlearned_m_s2() == pytest.approx(vibration_m_s2, abs=0.05 * MG)
+        assert record.imus[0].written[name].before == pytest.approx(learned_m_s2)
+        # The next flight learns anew, and an undo keeps what it learned.
+        double.set_parameter(name, vibration_m_s2 + 0.03)
+        before_undo_m_s2 = unlearned_m_s2()
+        assert (await started(undo("test")).finished).outcome == "done"
+        assert unlearned_m_s2() == pytest.approx(before_undo_m_s2, abs=0.05 * MG)
+        assert double.parameter(name) == pytest.approx(learned_m_s2 + 0.03, abs=1.0 * MG)
+        assert double.parameter("INS_ACC2_VRFB_Z") == 0.0

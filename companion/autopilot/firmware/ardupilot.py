@@ -12,6 +12,10 @@ reading in the IMU's axes. Here d is a temperature minus 35 degC. Temperature an
 
 So a curve, CALTEMP and the offset belong together. Gyros and accelerometers have their own coefficients and CALTEMP,
 but share ENABLE, TMIN and TMAX.
+
+The hover bias INS_ACC_VRFB_Z (pull request 32471) is the whole vertical bias, from vibration and from what the offsets
+left, as Copter's EKF finds it in hover. While armed, the EKF subtracts it (ACC_ZBIAS_LEARN, bit 1); telemetry and log
+show readings before that.
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ from companion.autopilot.firmware.compass_calibration import (
 from companion.autopilot.firmware.imu_calibration import (
     DEGC_RANGE,
     DEVICE_ID_RANGE,
+    HOVER_BIAS,
     SWITCH_RANGE,
     ImuCalibration,
     ImuParameters,
@@ -107,6 +112,7 @@ class ArduPilotParameters(ImuParameters):
             accel_scale=_xyz(f"{ins}ACC{n}SCAL_"),
             gyro_id=f"{ins}GYR{n}_ID",
             accel_id=f"{ins}ACC{n}_ID",
+            hover_bias=f"{ins}ACC{n}_VRFB_Z",
         )
         self.use = f"{ins}USE{n}"
         self.gyro_caltemp, self.accel_caltemp = caltemp.format("GYR"), caltemp.format("ACC")
@@ -130,7 +136,7 @@ def _ranges() -> dict[str, Range]:
         # The firmware's own gyro calibration, which we start, sets CALTEMP and id, and an undo restores both.
         found |= {**offset_ranges(names), **dict.fromkeys(names.tcal, _TCAL_RANGE)}
         found |= dict.fromkeys((names.gyro_caltemp, names.accel_caltemp, names.tcal_low, names.tcal_high), DEGC_RANGE)
-        found |= {names.tcal_enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE}
+        found |= {names.tcal_enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE, names.hover_bias: HOVER_BIAS}
     for slot in _COMPASS_SLOTS:
         found |= compass_ranges(_compass_names(slot), _COMPASS_OFFSET)
     return found | dict.fromkeys(TRIM, _TRIM_RANGE)

@@ -12,6 +12,7 @@ from companion.autopilot.firmware.imu_calibration import (
     ACCEL_OFFSET,
     ACCEL_SCALE_RANGE,
     GYRO_OFFSET,
+    HOVER_BIAS,
     ImuCalibration,
     Range,
 )
@@ -29,6 +30,8 @@ OTHER: Final = OtherFirmware()
 CALIBRATION: Final[Mapping[str, Mapping[str, Range]]] = {str(one.name): one.ranges for one in FIRMWARES}
 """Range of every parameter that a calibration or its undo may write, by firmware and name. No other parameter is saved,
 or accepted from a file."""
+LEARNED: Final = frozenset(name for each in CALIBRATION.values() for name, one in each.items() if one is HOVER_BIAS)
+"""Parameters that the firmware learns in flight, from what our values left: an undo restores the difference only."""
 
 
 def firmware_named(name: FirmwareName | None) -> Firmware:

@@ -124,6 +124,7 @@ _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
 ACCEL_SCALE: Final = Range(*SCALES)
+HOVER_BIAS: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
 DEGC_RANGE: Final = Range(-300.0, 400.0, unit="deg C")  # -300: unknown; 400 admits a thermometer in kelvin
 DEVICE_ID_RANGE: Final = Range(0.0, 2.0**24, whole=True)
 SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
@@ -138,6 +139,8 @@ class ImuParameters:
     accel_scale: Names
     gyro_id: str
     accel_id: str
+    hover_bias: str = ""
+    """Bias of the vertical accelerometer that the firmware learns in hover, m/s^2, vehicle axes; empty: none."""
 
 
 def offset_ranges(names: ImuParameters) -> dict[str, Range]:
@@ -309,6 +312,18 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
     if not calibration.scale_unused_within or after != calibration.accel_scale:
         changes += vector_changes(names.accel_scale, calibration.accel_scale, after, far_axis, FAR_SCALE)
     return changes
+
+
+def hover_bias_changes(
+    calibration: ImuCalibration, changes: Sequence[Change], learned_m_s2: Mapping[str, float]
+) -> list[Change]:
+    """Plan a hover bias that leaves the vertical force in flight, output - hover bias, unchanged by `changes`.
+
+    The learned bias includes what the old offsets left: with new offsets, this would be subtracted twice.
+    """
+    name, (_, _, step) = calibration.parameters.hover_bias, output_step(calibration, changes, (0.0, 0.0, -1e3 * MG))[1]
+    before = learned_m_s2.get(name, 0.0)
+    return [Change(name, before, before + step)] if before and step and HOVER_BIAS.holds(before) else []
 
 
 def output_step(

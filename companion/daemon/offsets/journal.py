@@ -9,11 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Final
 
 import msgspec
 
+from companion.autopilot.firmware.firmwares import LEARNED
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError, same_float32
 from companion.autopilot.vehicle.gyro_calibration import wait_until_over
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
@@ -245,7 +246,7 @@ class Recovery:
             raise AutopilotError(why)
         step = self.journal.steps(self._vehicle.system_id)[0]
         name = step.origin.what or "last write"
-        ours, foreign = await self._sort(step)
+        ours, foreign = await self._sort(step, learned=LEARNED)
         if foreign and not force:
             effect = "restores the others" if ours else "skips this step"
             values = "; ".join(foreign)
@@ -267,8 +268,11 @@ class Recovery:
         self._owed.say()
         return step, written
 
-    async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:
-        """Split changes into those still active in the autopilot, and texts about values that others have replaced."""
+    async def _sort(self, changes: ChangeSet, learned: Collection[str] = ()) -> tuple[Sequence[Change], Sequence[str]]:
+        """Split changes into those still active in the autopilot, and texts about values that others have replaced.
+
+        A parameter of `learned` that has another value by now is changed back by the difference of our write.
+        """
         ours: list[Change] = []
         foreign: list[str] = []
         found = await self._read(changes.names)
@@ -284,6 +288,8 @@ class Recovery:
                 ours.append(Change(name, before, after, changed.via))
             elif any(same_float32(now, own) for own in changed.also):
                 ours.append(Change(name, before, now, changed.via))
+            elif name in learned and not foreign:
+                ours.append(Change(name, now + before - after, now))
             elif not same_float32(now, before):
                 foreign.append(f"{name} is {now:.6g}, we had set {after:.6g} (before: {before:.6g})")
         return ours, foreign

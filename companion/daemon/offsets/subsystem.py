@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import logging
+import re
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Final
 
+from companion.autopilot.firmware.imu_calibration import hover_bias_changes
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError, same_float32
 from companion.autopilot.parameters.verify import EffectVerdict
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
@@ -188,6 +191,7 @@ class Offsets(Subsystem):
         `before`: window measured under the old offsets. Outcomes are added to `log`. `go_on` replaces the job's own
         progress report. Returns the plan with the firmware's own changes; raises the errors of `commit`.
         """
+        plan = await self._with_hover_biases(plan)
         await self.begin(job, len(plan.changes))
         gyros = await self._firmware.prepare(plan.gyros, log.warnings.append)
         ours = {target.name for target in plan.targets}
@@ -222,6 +226,17 @@ class Offsets(Subsystem):
 
         await self.commit(plan.changes, Origin(job.short, log.started), imus, apply, verify, note)
         return plan
+
+    async def _with_hover_biases(self, plan: Plan) -> Plan:
+        if re.match(r"4\.[0-6]\.", self._vehicle.version or ""):
+            return plan  # ArduPilot to 4.6 learns none, and would be asked for seconds: it is silent about absent names
+        names = [target.calibration.parameters.hover_bias for target in plan.targets]
+        learned = await self._core.parameters.read_many(filter(None, names), optional=True)
+        targets = []
+        for target in plan.targets:
+            more = hover_bias_changes(target.calibration, target.changes, learned)
+            targets.append(dataclasses.replace(target, changes=(*target.changes, *more)))
+        return dataclasses.replace(plan, targets=tuple(targets))
 
     async def _problems(self, plan: Plan, before: Window, log: WriteLog, go_on: GoOn) -> list[str]:
         verdicts, unseen = await verify_effect(self._core, self._px4, plan, before, go_on, plan.boots)

@@ -75,6 +75,7 @@ def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
     assert one.accel_scale[2] == "INS_ACCSCAL_Z"
     assert (one.gyro_id, one.accel_id, one.use) == ("INS_GYR_ID", "INS_ACC_ID", "INS_USE")
     assert one.gyro_caltemp == "INS_GYR1_CALTEMP"
+    assert [each.hover_bias for each in (one, two)] == ["INS_ACC_VRFB_Z", "INS_ACC2_VRFB_Z"]
     assert two.gyro_offset[0] == "INS_GYR2OFFS_X"
     assert two.accel_offset[0] == "INS_ACC2OFFS_X"
     assert two.accel_scale[0] == "INS_ACC2SCAL_X"

@@ -146,6 +146,16 @@ def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
     asyncio.run(main())
 
 
+def test_an_undo_of_two_writes_takes_both_steps_off_a_value_that_was_learned_in_between() -> None:
+    name = "INS_ACC_VRFB_Z"
+    first, second = (ChangeSet(1, (Changed(name, *values),)) for values in ((0.2, 0.15), (0.18, 0.17)))
+    (joined,) = second.after(first).changes
+    assert joined.before == pytest.approx(0.23)
+    assert joined.after == 0.17
+    (replaced,) = ChangeSet(1, (Changed(NAMES[0], 0.18, 0.17),)).after(OLD).changes
+    assert replaced.before == 0.18
+
+
 def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: Path) -> None:
     async def main() -> None:
         journal = opened(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,21 @@ def test_a_flight_is_told_with_what_its_calibration_was_worth(
     # 300 deg/h alone: g w t^3 / 6.
     assert 60.0 < at_30["flown"]["median_m"] < 200.0
     assert at_30["before"]["median_m"] > 2.0 * at_30["flown"]["median_m"]
+
+
+@pytest.mark.parametrize(("learn", "words"), [(3.0, "subtracted in flight"), (1.0, "not in use")])
+def test_what_ardupilot_learned_in_hover_is_shown_beside_what_is_found(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], learn: float, words: str
+) -> None:
+    learned = {"INS_ACC_VRFB_Z": 8.5 * MG, "ACC_ZBIAS_LEARN": learn}
+    _, answer = said(capsys, dataflash(tmp_path / "1.bin", messages(flown, parameters(**learned))), *storage(tmp_path))
+    (imu,) = answer["flights"][0]["imus"]
+    (note,) = imu["notes"]
+    told = re.fullmatch(rf"accel z: INS_ACC_VRFB_Z, learned in hover, {words}, is \+8\.5 mg; "
+                        r"here in the air (.*) ± (.*) mg", note)  # fmt: skip
+    assert told is not None, note
+    found_mg, sigma_mg = map(float, told.groups())
+    assert abs(found_mg - (ACCEL_MG[2] + STEP_MG)) < 2.0 * sigma_mg < 3.0
 
 
 def test_a_flight_is_kept_once_however_often_and_in_whatever_file_it_is_read(
