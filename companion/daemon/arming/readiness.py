@@ -26,6 +26,7 @@ from companion.estimation.machine import State
 from companion.estimation.records.record import sigma_texts
 from companion.estimation.records.validity import Why
 from companion.physics.units import DEG_H, MG
+from companion.protocols.stream_health import SILENT_AFTER_S
 from companion.samples import Triad
 
 logger = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ _STEPS: Final[dict[State, str]] = {
 }
 _CHECKED_NEXT: Final[dict[Why, str]] = {Why.REBOOTED: "checking after restart", Why.UNSEEN: _STEPS[State.VERIFYING]}
 """Findings that the next window without motion can clear without a new calibration, with their messages."""
-_NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
+NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
 """Preconditions without which the arm gate refuses, whatever calibration is active."""
 _WAITS: Final = {
     Precondition.ARM_STATE_KNOWN: "no heartbeat from the autopilot",
@@ -66,7 +67,7 @@ class Readiness:
         self._min_still_s = core.config.calibration.min_still_s
         self.in_force, self._automatic, self.owed = in_force, automatic, owed
         self._answer = ArmAnswer("wait", "companion is starting")
-        self._answered_s = -math.inf
+        self._began_s, self._answered_s = math.inf, -math.inf
         self._countdown = -math.inf, math.inf
         """Latest countdown to a calibration: event-loop time of its computation, and seconds left at that time."""
         self._has_gated = False
@@ -116,6 +117,7 @@ class Readiness:
 
     def update(self) -> None:
         now_s = asyncio.get_running_loop().time()
+        self._began_s = min(self._began_s, now_s)
         self.in_force.poll(writing=self._writing)
         if self.at_arm == "gate":
             self._answer = self.judge(now_s)
@@ -140,7 +142,7 @@ class Readiness:
 
     def _reasons(self, now_s: float) -> Iterator[ArmAnswer]:
         """Yield the reasons against arming in the order in which they are reported; none: the aircraft may arm."""
-        if (unmet := self._manager.blocking_reason(_NEEDED)) is not None:
+        if (unmet := self._manager.blocking_reason(NEEDED)) is not None:
             wait = _WAITS.get(unmet[0])
             yield ArmAnswer("refuse", unmet[1]) if wait is None else ArmAnswer("wait", wait)
         if self.at_arm == "gate" and not self._wanted.push:
@@ -152,7 +154,8 @@ class Readiness:
             reading = f"{Why.UNDONE.value}; {reading}" if self.in_force.undone else reading
             yield ArmAnswer("wait", reading, against=reading)
         if glance.obstacle is not None and not glance.moving:
-            yield ArmAnswer("refuse", glance.obstacle.words)
+            is_starting = now_s < self._began_s + SILENT_AFTER_S
+            yield ArmAnswer("wait" if is_starting else "refuse", glance.obstacle.words)
         if findings := self.in_force.findings(now_s):
             first, remedy = findings[0], self._automatic.why_not()
             if not self.in_force.measured and all(finding.why in _CHECKED_NEXT for finding in findings):

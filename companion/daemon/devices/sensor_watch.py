@@ -135,8 +135,9 @@ class SensorWatch:
     def implausible(self) -> str | None:
         return next((words for plausible, words in self._troubles() if not plausible), None)
 
-    def worst(self) -> str | None:
-        return next((words for _, words in self._troubles()), None)
+    def named_in(self, reason: str) -> str | None:
+        """Return the trouble of a sensor that `reason` names; None: it names none with trouble."""
+        return next((words for _, words in self._troubles() if words.split(":")[0] in reason), None)
 
     def _troubles(self) -> list[tuple[bool, str]]:
         now_s = asyncio.get_running_loop().time()

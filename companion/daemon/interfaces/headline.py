@@ -7,6 +7,7 @@ from typing import Final, Literal
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import ArmAnswer
+from companion.daemon.arming.readiness import NEEDED
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
@@ -54,7 +55,8 @@ class Headlines:
             return self._working(job, now_s)
         if unmet is Precondition.ARM_STATE_KNOWN:
             return self._no_autopilot()
-        if manager.blocking_reason((Precondition.RESTORED,)) is not None:
+        # Armed or not: with another companion at work, nothing is restored.
+        if (first := manager.blocking_reason(NEEDED)) is not None and first[0] is Precondition.RESTORED:
             return "RESTORING", "an interrupted write is being restored", "busy"
         state, words = self._readiness.state(now_s)
         if unmet is Precondition.DISARMED:
@@ -118,9 +120,9 @@ class Headlines:
         if words == self._readiness.owed.words:
             return "NOT READY", words, "bad"
         held_back, todo = self._readiness.in_force.held_back, self._automatic.why_not()
-        if held_back is None and todo is None:
+        if (held_back is None and todo is None) or (answer.verdict == "refuse" and not answer.against):
             # Prefer the sensor's own trouble, which names a remedy, to its consequence that no samples arrive.
-            return "NOT CALIBRATED", self._devices.watch.worst() or answer.words, "bad"
+            return "NOT CALIBRATED", self._devices.watch.named_in(answer.words) or answer.words, "bad"
         words = words if held_back is not None or todo == words else f"{words}: {todo}"
         return self._failed() or ("NOT CALIBRATED", words, "bad")
 
