@@ -10,7 +10,7 @@ from typing import Final
 
 SECTIONS: Final = (
     "white", "floors", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "compasses", "power-up",
-    "mid-warm-up",
+    "mid-warm-up", "until-ready",
 )  # fmt: skip
 HELP: Final = "errors and sigmas of the estimator, beside the physical bound"
 

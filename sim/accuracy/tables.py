@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from sim.accuracy import by_hand, compasses, deck, temperature, turning, warmup
+from sim.accuracy import by_hand, compasses, deck, temperature, turning, until_ready, warmup
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -117,6 +117,13 @@ def _by_temperature(
         progress(f"mid-warm-up: {each} aircraft of each of {len(temperature.TRIED)} parts and rates")
         wanted = product(temperature.TRIED, temperature.RATES_K_MIN, [seed], range(each))
         found["mid-warm-up"] = temperature.mid_warm_up_section(many(temperature.mid_warm_up, [*wanted], jobs), each)
+    if "until-ready" in only:
+        each = max(runs // 50, 1)
+        progress(
+            f"until ready: {each} warm-ups of each of {len(temperature.TRIED)} parts in {len(until_ready.KNOWN)} cases"
+        )
+        boards = product(until_ready.KNOWN, temperature.TRIED, [seed], range(each))
+        found["until-ready"] = until_ready.section(many(until_ready.until_ready, [*boards], jobs), each)
     return found
 
 

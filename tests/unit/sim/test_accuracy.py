@@ -25,8 +25,8 @@ from tests.support.namespaces import has_shared_memory, run_again_with_mounts
 
 @pytest.mark.parametrize(
     ("runs", "sections"),
-    [(32, ("white",)), (60, ("floors", "tilt")), (160, ("integers",))],
-    ids=["white noise", "flicker and tilt", "integers"],
+    [(32, ("white",)), (60, ("floors", "tilt")), (160, ("integers",)), (150, ("until-ready",))],
+    ids=["white noise", "flicker and tilt", "integers", "until ready"],
 )
 def test_the_claims_hold_in_small(monkeypatch: pytest.MonkeyPatch, runs: int, sections: tuple[str, ...]) -> None:
     monkeypatch.setattr(tables, "FLOORED", ("icm42688p",))
@@ -152,7 +152,7 @@ def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatc
     said: list[str] = []
     found = report(2, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS
-    assert len(said) == 10
+    assert len(said) == 11
     assert all(len(line) <= 100 for section in found.values() for line in section.lines)
 
 
