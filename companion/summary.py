@@ -20,8 +20,10 @@ def headline(status: Object) -> str:
 
 def remedy(status: Object) -> str:
     """Return the remedy for the headline; empty if it asks for nothing."""
-    headline = status["headline"]
-    found = messages.explain(headline["reason"]) if headline["tone"] in ("bad", "wait") else None
+    headline, warm_up = status["headline"], status["arming"]["warm_up"]
+    # The countdown of a warm-up follows a reason, and does not replace that reason's remedy.
+    reason = headline["reason"].removesuffix(f"; {warm_up['words']}" if warm_up else "")
+    found = messages.explain(reason) if headline["tone"] in ("bad", "wait") else None
     return "" if found is None else found[1].remedy
 
 
@@ -42,6 +44,8 @@ def rows(status: Object) -> list[StatusRow]:
         found.append(_wrong("recordings", f"none at present: {recording['fault']}"))
     if gate is not None and gate["problem"]:
         found.append(_wrong("arming", gate["problem"]))
+    if (warm_up := status["arming"]["warm_up"]) is not None:
+        found.append(("ok", "warm-up", warm_up["words"], ""))
     if status["automatic"]["stopped"]:
         found.append(_wrong("by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
     return [*found, *(("warning", "warning", words, messages.remedy(words)) for words in status["warnings"])]

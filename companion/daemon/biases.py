@@ -61,7 +61,7 @@ class BiasMemory:
         self._sources = {imu.name: imu for imu in core.config.imu}
         self._host = this_boot() or os.urandom(8).hex()
         self._curves: dict[tuple[str, Triad], Curve | None] = {}
-        self._settling: dict[str, tuple[float, float] | None] = {}  # Warm-up time of each board and its sigma, s
+        self.settling: dict[str, tuple[float, float] | None] = {}  # Warm-up time of each board and its sigma, s
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], tuple[str, Point, int]] = {}
@@ -83,7 +83,7 @@ class BiasMemory:
             curves |= {(name, triad): prior.curve_of(seen, triad, profile.of(triad)) for triad in TRIADS}
             groups = by_power_up([point for point in seen if point.temperature_degc is not None])
             settles[name] = settling([[(p.temperature_degc or 0.0, p.k_s) for p in group] for group in groups])
-        self._curves, self._settling = curves, settles
+        self._curves, self.settling = curves, settles
 
     # --- bias over temperature
 
@@ -105,7 +105,7 @@ class BiasMemory:
         if curve is None or path is None:
             return None
         profile = noise_profile(self._profiles.of(name))
-        found = curve.along(path, self._settling.get(name), profile.of(triad))
+        found = curve.along(path, self.settling.get(name), profile.of(triad))
         (start, _), _, (end, _) = path.states
         shift, slope = (self._taken_off(name, triad, degc, end) for degc in (path.mean_degc, start))
         if not shift.any() and not slope.any():
@@ -138,7 +138,7 @@ class BiasMemory:
                 continue
             known = self._known.pop(name)
             self._curves = {key: curve for key, curve in self._curves.items() if key[0] != name}
-            self._settling.pop(name, None)
+            self.settling.pop(name, None)
             self._today = {key: each for key, each in self._today.items() if key[0] != name}
             if known.points:
                 found[name] = message("biases_no_longer_count", changed=f"imu {name}: {what}")

@@ -150,6 +150,7 @@ def default_parameters(
     table |= {"ARMING_REQUIRE": (1, INT8), "ARMING_ACCTHRESH": (0.75, REAL32)}
     table |= {f"AHRS_TRIM_{axis}": (0.0, REAL32) for axis in AXES}
     table |= {"AHRS_ORIENTATION": (0, INT8), "AHRS_EKF_TYPE": (3, INT8), "CUST_ROT_ENABLE": (0, INT8)}
+    table |= {"BRD_HEAT_TARG": (-1, INT8), "BRD_HEAT_LOWMGN": (0, INT8)}
     for number in (1, 2):
         table |= {f"CUST_ROT{number}_{angle}": (0.0, REAL32) for angle in ("ROLL", "PITCH", "YAW")}
     instances = (1, 2, 3, 4, 5) if auxiliary and since(version, "4.4") else (1, 2, 3)

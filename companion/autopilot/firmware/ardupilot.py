@@ -327,6 +327,7 @@ class ArduPilot(Firmware):
     # --- arming
 
     gate_parameters = (_GATE_SCRIPT,)
+    heater_parameters = {"target": "BRD_HEAT_TARG", "margin": "BRD_HEAT_LOWMGN"}
     gate_is_script = True
 
     async def find_gate_problem(

@@ -114,6 +114,7 @@ class Firmware:
     # --- arming
 
     gate_parameters: tuple[str, ...] = ()
+    heater_parameters: Mapping[str, str] = {}  # "target", degC, of the IMU heater; "margin" below it at arming, K
     gate_is_script = False  # the gate is a script on the flight controller, which gets the verdict
 
     async def find_gate_problem(

@@ -16,6 +16,7 @@ from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.arming.readiness import Readiness
+from companion.daemon.arming.warm_up import WarmUp
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import REREAD_EVERY_S, Core, Handler, RepeatedRead, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
@@ -128,6 +129,7 @@ class Arming(Subsystem):
         calibrating.manager.on_ended.add(self.in_force.on_ended)
         calibrating.manager.on_ended.add(self.automatic.on_ended)
         self.readiness = Readiness(core, offsets.owed, self.in_force, self.automatic)
+        self.warm_up = WarmUp(core, calibrating.memory)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core)
         core.vehicle.on_event.add(self._on_event)
@@ -146,6 +148,7 @@ class Arming(Subsystem):
         return {
             "arming": {
                 **self.readiness.status(),
+                "warm_up": self.warm_up.status(),
                 "setup": {"known": setup.known, "problem": setup.problem if setup.known else None},
                 "last": msgspec.to_builtins(self.armings.last),
             },
@@ -157,7 +160,7 @@ class Arming(Subsystem):
         tasks: list[Task] = [("gate-setup", self.gate_setup.reading.run)]
         if self._core.only_listening is None:
             tasks += [("readiness", self.readiness.run), ("automatic", self.automatic.run)]
-            tasks.append(("armings", self.armings.run))
+            tasks += [("warm-up", self.warm_up.run), ("armings", self.armings.run)]
         return tasks
 
     def _calibration(self) -> Object | None:

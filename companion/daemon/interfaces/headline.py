@@ -32,10 +32,12 @@ class Headlines:
     def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
-        self._devices, self._heading = devices, heading
+        self._devices, self._heading, self._warm_up = devices, heading, arming.warm_up
 
     def now(self) -> Object:
         word, reason, tone = self._now()
+        if (left := self._warm_up.words()) is not None and word.startswith(("HOLD STILL", "NOT ", "WAIT")):
+            reason = f"{reason}; {left}"
         good = tone == "good"
         devices = self._devices
         concern = devices.watch.implausible() or devices.signing.warning or self._heading.concern

@@ -18,7 +18,10 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
         "mqtt": {"good": True, "summary": "connected"},
         "fleet": None,
         "recording": {"fault": "disk full"},
-        "arming": {"setup": {"problem": "the script does not run"}},
+        "arming": {
+            "setup": {"problem": "the script does not run"},
+            "warm_up": {"words": "steady in 3.5 +- 1.0 min, imu fc warms 0.9 K/min"},
+        },
         "automatic": {"stopped": "an undo"},
         "warnings": ["the compass wanders"],
     }
@@ -26,6 +29,8 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
     assert remedy(status) == ""
     gone = {"word": "NO AUTOPILOT", "reason": "no heartbeat for 7 s: power? cable?", "tone": "bad"}
     assert "power" in remedy({**status, "headline": gone})
+    silent = {**gone, "reason": f"no data from imu fc yet; {status['arming']['warm_up']['words']}"}
+    assert remedy({**status, "headline": silent}) == "Check power, plug and wires."
     assert [row[:3] for row in rows(status)] == [
         ("wrong", "autopilot", "ArduPilot, disarmed"),
         ("ok", "imu", "200 Hz; bad frames: 4; reconnected: 2"),
@@ -34,6 +39,7 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
         ("ok", "mqtt", "connected"),
         ("wrong", "recordings", "none at present: disk full"),
         ("wrong", "arming", "the script does not run"),
+        ("ok", "warm-up", "steady in 3.5 +- 1.0 min, imu fc warms 0.9 K/min"),
         ("wrong", "by itself", "no calibration until asked: an undo"),
         ("warning", "warning", "the compass wanders"),
     ]
