@@ -145,72 +145,92 @@ def compass(
     Raises:
         CalibrationRefusedError: no compass has these readings.
     """
-    tilts = np.array([body_from_ned(*roll_pitch_from_up(pose.up), 0.0) for pose in poses])
-    raw, noise = np.array([pose.raw_gauss for pose in poses]), np.array([pose.sigma_gauss for pose in poses])
-    turns = np.array([_azimuth_turned(before, pose.turn_rad) for before, pose in zip(tilts, poses[1:], strict=False)])
+    model = _Model(poses, before)
+    start, prior = model.start(earth, before), _prior(poses, earth)
+    if heading is not None:
+        start[_HEADING], prior[_HEADING] = heading
+    start = model.guess(start, _GUESSES if heading is None else start[[_HEADING]])
+    found, scatter_gauss = model.solve(start, prior, [0, 1, 2, *([_HEADING] if heading is None else [])])
+    soft = model.soft(found.values[None])[0]
+    kept = np.diag(before.soft @ np.linalg.inv(soft))[:2].mean()
+    return CompassEstimate(
+        figures=CompassFigures(found.values[OFFSET], soft),
+        covariance=_covariance(found, earth, tilt_sigma_rad, scatter_gauss),
+        earth=earth,
+        heading_rad=float(found.values[_HEADING]),
+        heading_sigma_rad=math.sqrt(found.covariance[_HEADING, _HEADING]),
+        off_gauss=model.raw - model.expected(found.values[None])[0],
+        scatter_gauss=scatter_gauss,
+        strength=float(found.values[_FIELD][0] / earth.horizontal_gauss * kept),
+    )
 
-    def expected(at: Floats) -> Floats:
-        turned = np.cumsum(turns * (1.0 + at[:, _TURN_SCALE, None]) + at[:, _TURNS:], axis=1)
+
+class _Model:
+    """Raw fields of all poses as a function of the unknowns: offset, D, first heading, field h d, turn scale, turns."""
+
+    def __init__(self, poses: Sequence[CompassPose], before: CompassFigures) -> None:
+        self._tilts = np.array([body_from_ned(*roll_pitch_from_up(pose.up), 0.0) for pose in poses])
+        self.raw, self._noise = (np.array(each) for each in zip(*(pose[1:3] for pose in poses), strict=True))
+        turns = [_azimuth_turned(tilt, pose.turn_rad) for tilt, pose in zip(self._tilts, poses[1:], strict=False)]
+        self._turns = np.array(turns)
+
+    def start(self, earth: MagneticField, before: CompassFigures) -> Array:
+        """Return the mean of the prior; offset and heading are zero."""
+        start = np.zeros(_TURNS + len(self._turns))
+        start[_DIAGONAL], start[_BESIDE] = np.diag(before.soft), before.soft[[0, 0, 1], [1, 2, 2]]
+        start[_FIELD] = earth.horizontal_gauss, earth.down_gauss
+        return start
+
+    def guess(self, start: Array, headings_rad: Array) -> Array:
+        """Complete `start` with the heading, of these, at which one offset explains the poses best, and that offset."""
+        guesses = np.tile(start, (len(headings_rad), 1))
+        guesses[:, _HEADING] = headings_rad
+        off = self.expected(guesses) - self.raw
+        guesses[:, OFFSET] = off.mean(axis=1)
+        return np.asarray(guesses[np.argmin(off.var(axis=1).sum(axis=1))])
+
+    def expected(self, at: Floats) -> Floats:
+        """Return the raw fields (m, poses, 3) for m sets of unknowns (m, size)."""
+        turned = np.cumsum(self._turns * (1.0 + at[:, _TURN_SCALE, None]) + at[:, _TURNS:], axis=1)
         headings = at[:, _HEADING, None] + np.concatenate([np.zeros((len(at), 1)), turned], axis=1)
         level = _level_field(headings, *np.moveaxis(at[:, _FIELD, None], 1, 0))
-        field = np.einsum("pij,mpj->mpi", tilts, level)
-        soft = response(at[:, _DIAGONAL] - 1.0, at[:, _BESIDE])
-        return np.asarray(np.linalg.solve(soft[:, None], field[..., None])[..., 0] - at[:, None, OFFSET])
+        field = np.einsum("pij,mpj->mpi", self._tilts, level)
+        return np.asarray(np.linalg.solve(self.soft(at)[:, None], field[..., None])[..., 0] - at[:, None, OFFSET])
 
-    start = np.zeros(_TURNS + len(turns))
-    start[_DIAGONAL], start[_BESIDE] = np.diag(before.soft), before.soft[[0, 0, 1], [1, 2, 2]]
-    start[_FIELD] = earth.horizontal_gauss, earth.down_gauss
-    guesses = np.tile(start, (len(_GUESSES), 1))
-    guesses[:, _HEADING] = _GUESSES if heading is None else heading[0]
-    off = expected(guesses) - raw
-    guesses[:, OFFSET] = off.mean(axis=1)
-    best = int(np.argmin(off.var(axis=1).sum(axis=1)))
+    def soft(self, at: Floats) -> Floats:
+        return response(at[:, _DIAGONAL] - 1.0, at[:, _BESIDE])
 
-    of_strength, of_dip = earth.strength_sigma_gauss, earth.strength_gauss * earth.inclination_sigma_deg * DEG
-    spot = math.sqrt(_SPOT_SIGMA_GAUSS**2 + of_strength**2 + of_dip**2)
-    heading_sigma = math.pi if heading is None else heading[1]
-    prior = np.array(
-        [
-            *[_STEP_LIMIT_GAUSS] * 3,
-            *[_SOFT_SIGMA] * 6,
-            heading_sigma,
-            spot,
-            spot,
-            TURN_SCALE,
-            *(pose.turn_sigma_rad for pose in poses[1:]),
-        ]
-    )
-    free = [0, 1, 2, *([_HEADING] if heading is None else [])]
+    def solve(self, start: Array, prior: Array, free: Sequence[int]) -> tuple[LeastSquares, float]:
+        """Fit with the usual scatter of the field, then with the scatter that the residuals show; return that too."""
+        first = self._solve(start, prior, free, _SCATTER_GAUSS)
+        readings = _SCATTER_WEIGHT + self.raw.size - len(free)
+        ratio = (_SCATTER_WEIGHT + float(first.residual @ first.residual)) / readings
+        scatter_gauss = _SCATTER_GAUSS * math.sqrt(ratio)
+        return self._solve(start, prior, free, scatter_gauss), scatter_gauss
 
-    def solved(scatter_gauss: float) -> LeastSquares:
-        sigma = np.hypot(noise, scatter_gauss)
+    def _solve(self, start: Array, prior: Array, free: Sequence[int], scatter_gauss: float) -> LeastSquares:
+        sigma = np.hypot(self._noise, scatter_gauss)
         try:
-            return fit(lambda at: ((raw - expected(at)) / sigma).reshape(len(at), -1), guesses[best], prior, free)
+            return fit(lambda at: ((self.raw - self.expected(at)) / sigma).reshape(len(at), -1), start, prior, free)
         except (ValueError, np.linalg.LinAlgError):
             raise CalibrationRefusedError("these readings are no compass': does it turn with the aircraft?") from None
 
-    first = solved(_SCATTER_GAUSS)
-    readings = _SCATTER_WEIGHT + 3 * len(poses) - len(free)
-    scatter = _SCATTER_GAUSS * math.sqrt((_SCATTER_WEIGHT + float(first.residual @ first.residual)) / readings)
-    found = solved(scatter)
-    values = found.values
+
+def _prior(poses: Sequence[CompassPose], earth: MagneticField) -> Array:
+    """Return the prior sigma of every unknown; of offset and heading, which have none, the limit of a step."""
+    of_strength, of_dip = earth.strength_sigma_gauss, earth.strength_gauss * earth.inclination_sigma_deg * DEG
+    spot = math.sqrt(_SPOT_SIGMA_GAUSS**2 + of_strength**2 + of_dip**2)
+    figures = [*[_STEP_LIMIT_GAUSS] * 3, *[_SOFT_SIGMA] * 6]
+    return np.array([*figures, math.pi, spot, spot, TURN_SCALE, *(pose.turn_sigma_rad for pose in poses[1:])])
+
+
+def _covariance(found: LeastSquares, earth: MagneticField, tilt_sigma_rad: float, scatter_gauss: float) -> Matrix:
+    """Return the covariance (9, 9) of offset and D; a tilt error or a field that turns along looks like hard iron."""
     covariance = found.covariance[:FIGURES, :FIGURES].copy()
-    # A field that turns with the aircraft looks like hard iron, and so does a tilt error.
-    turns_with_it = np.array([earth.down_gauss * tilt_sigma_rad, earth.down_gauss * tilt_sigma_rad, 0.0])
-    covariance[OFFSET, OFFSET] += np.diag(turns_with_it**2 + _TURNS_WITH_IT * max(scatter**2 - _SCATTER_GAUSS**2, 0.0))
-    soft = response(values[_DIAGONAL] - 1.0, values[_BESIDE])
-    return CompassEstimate(
-        figures=CompassFigures(values[OFFSET], soft),
-        covariance=covariance,
-        earth=earth,
-        heading_rad=float(values[_HEADING]),
-        heading_sigma_rad=math.sqrt(found.covariance[_HEADING, _HEADING]),
-        off_gauss=raw - expected(values[None])[0],
-        scatter_gauss=scatter,
-        strength=float(
-            values[_FIELD][0] / earth.horizontal_gauss * np.diag(before.soft @ np.linalg.inv(soft))[:2].mean()
-        ),
-    )
+    by_tilt = np.array([earth.down_gauss * tilt_sigma_rad, earth.down_gauss * tilt_sigma_rad, 0.0])
+    bent = _TURNS_WITH_IT * max(scatter_gauss**2 - _SCATTER_GAUSS**2, 0.0)
+    covariance[OFFSET, OFFSET] += np.diag(by_tilt**2 + bent)
+    return np.asarray(covariance)
 
 
 def _azimuth_turned(tilt: Matrix, turn_rad: float) -> float:
