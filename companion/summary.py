@@ -35,6 +35,7 @@ def rows(status: Object) -> list[StatusRow]:
     if signing is not None:
         found.append(_row(signing["good"], f"signing ({signing['mode']})", signing["summary"]))
     found += [_row(device["good"], device["name"], device["summary"] + _counts(device)) for device in status["devices"]]
+    found += [("ok", one["name"], one["summary"], "") for one in status["compasses"]]
     if not status["ground_stations"]["good"]:
         found.append(_wrong("ground stations", status["ground_stations"]["summary"]))
     found += [

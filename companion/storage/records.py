@@ -138,13 +138,14 @@ def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
 class Done(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of one alignment, during which somebody placed or turned the aircraft."""
 
-    what: str  # "zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1
+    what: str  # "zero", "tilts", "turn", "level", "faces", "compass", or "gyro prediction" of version 0.1
     state: str  # "done", "failed", or "predicted" of version 0.1
     measured_at: str
     reason: str
     system_id: int | None
     written: dict[str, float]  # values in the autopilot, by parameter
     undone_at: str | None = None
+    heading_sigma_deg: dict[str, float] = {}  # by compass
 
 
 KEEP_DONE: Final = 50

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion import summary
 from companion.commands import Align
 from companion.component.service import JobResult, Refusal
 from companion.estimation.records.align_record import CompassRecord
@@ -138,6 +139,34 @@ async def test_our_own_compass_that_contradicts_is_named(tmp_path: Path) -> None
         _, record = await aligned(made, hands, headings=2)
         assert record is not None
         assert any(re.search(r"own compass reads 6\d deg, this alignment 4\d", words) for words in record.warnings)
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+async def test_the_status_says_how_good_a_heading_is_while_the_autopilot_has_the_values(
+    tmp_path: Path, firmware: str
+) -> None:
+    made, hands = rig(tmp_path, firmware)
+    made.devices["compass"] = HMR3300(made.aircraft, seed=1)
+    async with made.running():
+        await made.ready()
+        await asyncio.sleep(40.0)
+        status = made.service.status()
+        assert status["compasses"] == []
+        doubts = [words for words in status["warnings"] if "compass off by" in words]
+        about_deg, apart_deg = (float(word) for word in re.findall(r"([-+]?\d+) deg", "".join(doubts)))
+        all_round_deg = errors_deg(values(made, firmware), firmware)
+        assert about_deg == pytest.approx(np.sqrt(np.mean(np.square(all_round_deg))), rel=0.7)
+        assert apart_deg == pytest.approx(all_round_deg[4], abs=6.0)  # at 40 deg, where it stands
+        _, record = await aligned(made, hands, write=True)
+        assert record is not None
+        await asyncio.sleep(40.0)
+        sigma_deg = record.compasses[0].heading_sigma_deg
+        rows = {name: words for _, name, words, _ in summary.rows(made.service.status())}
+        assert rows["compass 1"] == f"heading good to {sigma_deg:.1f} deg, aligned {record.measured_at[:10]}"
+        assert not [words for words in made.service.status()["warnings"] if "compass" in words]
+        made.autopilot.write_as_another_station(NAMES[firmware][0][0], 0.0)
+        await asyncio.sleep(5.0)
+        assert made.service.status()["compasses"] == []
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ class Firmware:
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
     compass_messages: Mapping[int, type[Message]] = {}  # by compass (from 1), in milligauss
-    corrected_field: type[Message] | None = None  # field of the compass in use, gauss, if the others carry raw fields
+    raw_fields: bool = False  # True: `compass_messages` carry raw fields, in the axes of the sensors
 
     async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:
         """Read the correction that the autopilot applies to compass `number`; AutopilotError: it has none."""

@@ -205,7 +205,7 @@ class PX4(Firmware):
         2: mavlink.MAVLink_scaled_imu2_message,
         3: mavlink.MAVLink_scaled_imu3_message,
     }
-    corrected_field = mavlink.MAVLink_highres_imu_message
+    raw_fields = True
 
     async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:
         slots = await read_slots(parameters, _MAG)

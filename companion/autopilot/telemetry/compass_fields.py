@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import math
 from collections import defaultdict, deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,10 +17,12 @@ from companion.links.mavlink.link import MavlinkLink, Message
 from companion.physics.frames import Array
 
 SELECTED: Final = 0
-"""Number of the corrected field of the compass in use, if a firmware sends it beside the raw ones."""
+"""Number of the corrected field of the compass in use, which both firmwares send in HIGHRES_IMU, in gauss."""
+_CORRECTED: Final = mavlink.MAVLink_highres_imu_message
 RATE_HZ: Final = 5.0
 LISTEN_S: Final = 1.0
 LEAST: Final = 5
+_MOST_GAUSS: Final = 100.0  # ArduPilot before 4.8 sends 1e6 times the gauss in HIGHRES_IMU
 _KEPT: Final = 8192
 _MILLIGAUSS: Final = 1e-3
 _CUT_GAUSS: Final = 0.5 * _MILLIGAUSS
@@ -40,31 +42,39 @@ class MeanField(NamedTuple):
 
 
 class CompassFields:
-    """Collects the messages with fields; `asked` requests those that do not come by themselves."""
+    """Collects the messages with fields while `heard`; `asked` requests those that do not come by themselves."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self._link, self._vehicle = link, vehicle
         self._seen: dict[int, deque[tuple[float, Array]]] = defaultdict(lambda: deque(maxlen=_KEPT))
 
+    @contextlib.contextmanager
+    def heard(self) -> Iterator[dict[int, type[Message]]]:
+        """Collect the messages that arrive; yield the message of each compass."""
+        self._seen.clear()
+        kind = self._vehicle.kind
+        wanted = {**kind.compass_messages, **({SELECTED: _CORRECTED} if kind.compass_messages else {})}
+        with contextlib.ExitStack() as stack:
+            for message in set(wanted.values()):
+                stack.callback(self._link.subscribe(message, self._on_message))
+            yield wanted
+
     @contextlib.asynccontextmanager
     async def asked(self) -> AsyncIterator[None]:
-        """Request the messages that do not arrive; restore the firmware's own rates at the end."""
-        self._seen.clear()
-        kind, commands = self._vehicle.kind, self._vehicle.commands
-        wanted = {**kind.compass_messages, **({} if kind.corrected_field is None else {SELECTED: kind.corrected_field})}
-        unsubscribe = [self._link.subscribe(message, self._on_message) for message in set(wanted.values())]
-        missing: list[type[Message]] = []
-        try:
-            await asyncio.sleep(LISTEN_S)
-            missing += [message for number, message in wanted.items() if number not in self._seen]
-            for message in missing:
-                commands.request_message_interval(message.id, RATE_HZ)
-            yield
-        finally:
-            for message in missing:
-                commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message.id, 0.0)  # the firmware's own rate
-            for each in unsubscribe:
-                each()
+        """Collect messages; request those that do not arrive, and restore the firmware's own rates at the end."""
+        commands, missing = self._vehicle.commands, list[type[Message]]()
+        with self.heard() as wanted:
+            try:
+                await asyncio.sleep(LISTEN_S)
+                if not self._vehicle.kind.raw_fields:
+                    wanted.pop(SELECTED, None)
+                missing += [message for number, message in wanted.items() if number not in self._seen]
+                for message in missing:
+                    commands.request_message_interval(message.id, RATE_HZ)
+                yield
+            finally:
+                for message in missing:
+                    commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message.id, 0.0)  # the firmware's own rate
 
     def mean(self, number: int, since_s: float, until_s: float = math.inf) -> MeanField | None:
         """Return the mean field of a compass over a time; None: too few messages."""
@@ -86,8 +96,8 @@ class CompassFields:
         field = np.array([message.xmag, message.ymag, message.zmag], dtype=np.float64)
         if not np.isfinite(field).all() or not field.any():
             return
-        if type(message) is kind.corrected_field:
-            self._seen[SELECTED].append((t_s, field))
+        if type(message) is _CORRECTED:
+            self._seen[SELECTED].append((t_s, field * (1e-6 if np.abs(field).max() > _MOST_GAUSS else 1.0)))
         for number, of in kind.compass_messages.items():
             if type(message) is of:
                 self._seen[number].append((t_s, field * _MILLIGAUSS + _CUT_GAUSS * np.sign(field)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from functools import partial
 from typing import Final, Literal
 
@@ -19,12 +19,13 @@ from companion.component.service import MEASURED_PERCENT, Refusal
 from companion.daemon.biases import LOOK_K, BiasMemory
 from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.calibrating.run import CalibrationParts
-from companion.daemon.core import Core, Handler, Subsystem
+from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, COMPASS, FACES, TEMPERATURE, TURN, Job
 from companion.daemon.offsets.plan import ImuPlan, Plan, WriteLog
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.poses.alignment import ActiveAlignment, ActiveSixPosition, ByHand
+from companion.daemon.poses.compass_status import CompassStatus
 from companion.daemon.poses.compass_task import CompassTask
 from companion.daemon.poses.measuring import Estimator, Measuring
 from companion.daemon.poses.session import PoseSession, PoseTask
@@ -72,10 +73,15 @@ class Calibrating(Subsystem):
         self._fields = CompassFields(core.link, core.vehicle)
         parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
+        self.compasses = CompassStatus(core, self.by_hand)
+        self.manager.on_ended.add(lambda _job, _result: self.compasses.reading.again())
 
     def load(self) -> None:
         for part in (self.alignment, self.faces, self.by_hand, self.memory, self.manager):
             part.load()
+
+    def tasks(self) -> Sequence[Task]:
+        return [("compass-values", self.compasses.reading.run), ("compasses", self.compasses.run)]
 
     def commands(self) -> Mapping[str, Handler]:
         """Return the handlers; they raise RequestRefusedError, or another CompanionError after the start of a job."""
@@ -99,6 +105,8 @@ class Calibrating(Subsystem):
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
+            "compasses": self.compasses.rows,
+            "warnings": self.compasses.warnings,
             "stands": None if stands is None or stands.job is not manager.asked else stands.shown(),
             "last": None
             if last is None

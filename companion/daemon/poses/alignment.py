@@ -222,6 +222,9 @@ class ByHand:
             reason=result.reason,
             system_id=self._vehicle.system_id,
             written={name: one.after for name, one in kept},
+            heading_sigma_deg={f"compass {one.number}": one.heading_sigma_deg for one in record.compasses}
+            if isinstance(record, CompassRecord)
+            else {},
         )
         await self._write([*self._done, done][-KEEP_DONE:])
 
@@ -236,6 +239,12 @@ class ByHand:
             await self._offload(self._file.write, done)
         except StorageError as error:
             logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
+
+    @property
+    def last_compass(self) -> Done | None:
+        """Return the last alignment that wrote compasses of this autopilot, unless it was undone."""
+        here = [one for one in self._done if one.what == "compass" and one.written and one.undone_at is None]
+        return next((one for one in reversed(here) if one.system_id == self._vehicle.system_id), None)
 
     def history(self) -> list[Object]:
         return [self._shown(done) for done in reversed(self._done)]

@@ -105,7 +105,7 @@ class AlignmentWrites:
     ) -> None:
         """Write new corrections of compasses while the aircraft stands in its last pose, and see them in the field."""
         changes = [change for step in found for change in step.changes]
-        selected_only = self._vehicle.kind.corrected_field is not None
+        selected_only = self._vehicle.kind.raw_fields
         await self.path.begin(job, len(changes))
 
         async def apply() -> list[Change]:

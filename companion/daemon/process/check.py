@@ -242,7 +242,8 @@ def _devices(config: Config, status: Object) -> list[CheckLine]:
         shown = [device for device in devices if device["name"] not in names]
     else:
         shown = [*devices, ground]
-    return [CheckLine(one["name"], one["good"], one["summary"]) for one in shown]
+    found = [CheckLine(one["name"], one["good"], one["summary"]) for one in shown]
+    return found + [CheckLine(one["name"], good=True, words=one["summary"]) for one in status["compasses"]]
 
 
 def _autopilot(config: Config, vehicle: Object) -> CheckLine:

@@ -114,6 +114,7 @@ class Service:
             *([self._transport] if mavlink else []),
             *self.devices.tasks(ports=ports),
             *self.offsets.tasks(),
+            *self.calibrating.tasks(),
             *self.arming.tasks(),
             *self.heading.tasks(),
             *self.recorder.tasks(),
