@@ -177,10 +177,10 @@ class Align(Command, frozen=True, tag="align"):
         Field(by=by),
     ] = None
     headings: Annotated[
-        Literal[2, 3, 4, 6, 8] | None,
+        Literal[1, 2, 3, 4, 6, 8] | None,
         Field(
             "2 (default for zero): turn by 180 deg, then the same way to the start; 4 (default for turn and compass):"
-            " every 90 deg; compass also: 3, 6, 8",
+            " every 90 deg; compass also: 3, 6, 8, and 1 with --heading or a compass of the companion",
             by=by,
         ),
     ] = None

@@ -131,6 +131,29 @@ async def test_armed_in_the_middle_nothing_is_written(tmp_path: Path) -> None:
         assert values(made, "ardupilot") == old
 
 
+@pytest.mark.parametrize(("own", "asked"), [(True, {}), (False, {"heading": 41.0}), (False, {})])
+async def test_one_heading_suffices_where_it_is_known(tmp_path: Path, own: bool, asked: dict[str, float]) -> None:
+    made, hands = rig(tmp_path)
+    made.devices["compass"] = HMR3300(made.aircraft, seed=1)
+    if not own:
+        made.config = msgspec.structs.replace(made.config, compass=None)
+        del made.devices["compass"]
+    async with made.running():
+        await made.ready()
+        if not (own or asked):
+            refused = made.service.calibrating.start_alignment(Align(action="compass", headings=1), "test")
+            assert isinstance(refused, Refusal)
+            assert "without --heading or a compass" in refused.reason
+            return
+        result, record = await aligned(made, hands, headings=1, **asked)
+        assert record is not None, result
+        (found,) = record.compasses
+        heading_sigma_deg = record.heading_sigma_deg
+        assert abs(record.heading_deg - 40.0) < 2.0 * heading_sigma_deg
+        assert found.heading_sigma_deg > heading_sigma_deg > 1.0
+        assert np.abs(np.subtract(found.offset_mgauss, HARD_MGAUSS) / found.offset_sigma_mgauss).max() < 3.0
+
+
 async def test_our_own_compass_that_contradicts_is_named(tmp_path: Path) -> None:
     made, hands = rig(tmp_path)
     made.devices["compass"] = HMR3300(made.aircraft, seed=1, heading_error_deg=25.0)

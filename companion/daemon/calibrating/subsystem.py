@@ -224,6 +224,8 @@ class Calibrating(Subsystem):
         )
         if action != "compass" and request.headings not in (2, HEADINGS):
             return Refusal("other", f"headings: found {request.headings}; allowed for {action}: 2 or 4")
+        if request.headings == 1 and asked.heading is None and self._core.config.compass is None:
+            return Refusal("other", "headings: found 1; allowed without --heading or a compass: 2, 3, 4, 6, 8")
         if self._core.config.vehicle.platform == "deck":
             if _KINDS[action] == ALIGNMENT:
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")

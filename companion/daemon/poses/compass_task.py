@@ -102,13 +102,10 @@ class CompassTask(SamePlaceTask):
         self._tilts = [truth_of(one, gradienter, None, local, warnings, self._sides) for one in state.windows]
         if self._tilts[0].tilt_from is None:
             raise CalibrationRefusedError("the tilt is known to 3 deg only: align faces first, or connect a gradienter")
-        if len(state.poses) == 1 and self.request.heading_deg is None:
+        if len(state.poses) == 1 < self.total and self.request.heading_deg is None:
             return []
         tilt_sigma_rad = math.sqrt(max(float(np.diag(tilt.up_covariance)[:2].max()) for tilt in self._tilts))
-        heading = None
-        if (heading_deg := self.request.heading_deg) is not None:
-            sigma_deg = math.hypot(HEADING_SIGMA_DEG, local.declination_sigma_deg)
-            heading = (heading_deg - local.declination_deg) * DEG, sigma_deg * DEG
+        heading = self._known_heading(state.windows[0], local)
         for number, calibration in self._compasses.items():
             poses = [
                 CompassPose(
@@ -156,25 +153,40 @@ class CompassTask(SamePlaceTask):
             compasses=tuple(self._figures_record(number, found) for number, found in self._found.items()),
         )
 
-    def _beside_own_compass(self, window: Window, local: LocalEarth, heading_deg: float, sigma_deg: float) -> list[str]:
-        """Compare the heading found with that of the companion's own compass; return a warning if they contradict."""
+    def _known_heading(self, window: Window, local: LocalEarth) -> tuple[float, float] | None:
+        """Return the magnetic heading of the first pose and its sigma, rad, as typed, or for one pose as our own."""
+        if (heading_deg := self.request.heading_deg) is not None:
+            sigma_deg = HEADING_SIGMA_DEG
+        elif self.total > 1:
+            return None
+        else:
+            own = self._own_heading(window, local, [])
+            if own is None:
+                raise CalibrationRefusedError("one heading needs a compass, which sends nothing: add --heading")
+            heading_deg, sigma_deg = own
+        return (heading_deg - local.declination_deg) * DEG, math.hypot(sigma_deg, local.declination_sigma_deg) * DEG
+
+    def _own_heading(self, window: Window, local: LocalEarth, warnings: list[str]) -> tuple[float, float] | None:
+        """Return the true heading by the companion's own compass and its sigma, deg; None: it has none."""
         own = models.compass_model(self._core.config.compass)
         if own is None or window.heading is None:
-            return []
-        warnings: list[str] = []
+            return None
         seen = truth_of(window, self._estimator.alignment.model(), own, local, warnings, self._sides)
         if seen.heading_rad is None or seen.heading_sigma_rad is None:
+            return None
+        return seen.heading_rad / DEG, seen.heading_sigma_rad / DEG
+
+    def _beside_own_compass(self, window: Window, local: LocalEarth, heading_deg: float, sigma_deg: float) -> list[str]:
+        """Compare the heading found with that of the companion's own compass; return a warning if they contradict."""
+        warnings: list[str] = []
+        own = self._own_heading(window, local, warnings)
+        if own is None:
             return warnings
-        own_deg, limit = (
-            seen.heading_rad / DEG,
-            _OWN_COMPASS_SIGMAS * math.hypot(seen.heading_sigma_rad / DEG, sigma_deg),
-        )
-        if abs(wrap_deg(own_deg - heading_deg)) < limit:
-            return warnings
-        return [
-            *warnings,
-            f"the companion's own compass reads {own_deg % 360.0:.0f} deg, this alignment {heading_deg:.0f}",
-        ]
+        own_deg, limit_deg = own[0], _OWN_COMPASS_SIGMAS * math.hypot(own[1], sigma_deg)
+        if abs(wrap_deg(own_deg - heading_deg)) >= limit_deg:
+            words = f"the companion's own compass reads {own_deg % 360.0:.0f} deg, this alignment {heading_deg:.0f}"
+            warnings.append(words)
+        return warnings
 
     def _figures_record(self, number: int, found: CompassEstimate) -> CompassFiguresRecord:
         calibration, soft = self._compasses[number], found.figures.soft

@@ -25,7 +25,7 @@ WRONG = [
     ),
     ("calibrate", "what", "nothing", '"both", "gyros", "accelerometers"'),
     ("calibrate", "reboot", 1, "true or false"),
-    ("align", "headings", 5, "2, 3, 4, 6, 8"),
+    ("align", "headings", 5, "1, 2, 3, 4, 6, 8"),
     ("history", "limit", 0, "a whole number from 1 to 1000000"),
     ("record", "file", 5, "a path"),
 ]
