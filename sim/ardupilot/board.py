@@ -99,6 +99,7 @@ class ArduPilotBoard(AutopilotDouble):
         self.script = script
         self.parameters = self._new_store(parameters or {}, auxiliary=auxiliary)
         self.estimator = CoarseEstimator()
+        self.calibrates_compass = False
         self.airspeed_m_s = 0.0
         """Airspeed in the message VFR_HUD."""
         self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]

@@ -135,6 +135,13 @@ def script_floats(double: ArduPilotBoard, loop_s: float) -> Message:
     return mavlink.MAVLink_debug_float_array_message(double.boot_us(loop_s), b"CMP_IMU", 1, values)
 
 
+def mag_cal_progress(double: ArduPilotBoard, _loop_s: float) -> Message | None:
+    """Build MAG_CAL_PROGRESS, sent only while the onboard calibration of compass 1 runs."""
+    running = mavlink.MAG_CAL_RUNNING_STEP_ONE
+    shown = mavlink.MAVLink_mag_cal_progress_message(0, 1, running, 1, 20, [0] * 10, 0.0, 0.0, 0.0)
+    return shown if double.calibrates_compass else None
+
+
 BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
@@ -151,4 +158,5 @@ BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_AHRS: ahrs,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status_report,
     mavlink.MAVLINK_MSG_ID_VFR_HUD: vfr_hud,
+    mavlink.MAVLINK_MSG_ID_MAG_CAL_PROGRESS: mag_cal_progress,
 }

@@ -16,6 +16,7 @@ from companion.commands import Align
 from companion.component.service import JobResult, Refusal
 from companion.estimation.records.align_record import CompassRecord
 from sim.aircraft import Pose
+from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import HMR3300
 from sim.earth import Array, mounting_matrix
 from sim.firmware.compass import SimCompass
@@ -115,6 +116,27 @@ async def test_a_car_that_drives_by_and_a_plug_that_comes_off_are_named_and_noth
         assert (await following).outcome == "done"
         assert isinstance(job.product, CompassRecord)
         assert job.product.heading_deg == pytest.approx(40.0, abs=1.5)
+
+
+@pytest.mark.parametrize("until", ["6 s", "the last pose"])
+async def test_the_autopilots_own_calibration_of_a_compass_is_named_and_nothing_is_written(
+    tmp_path: Path, until: str
+) -> None:
+    made, hands = rig(tmp_path)
+    assert isinstance(made.autopilot, ArduPilotDouble)
+    async with made.running():
+        await made.ready()
+        old = values(made, "ardupilot")
+        job = started(made.service.calibrating.start_alignment(Align(action="compass", write=True), "test"))
+        following = asyncio.create_task(follow(made, hands, job))
+        while f"{1 if until == '6 s' else 4} of 4: measuring, 6 of" not in job.words:
+            await asyncio.sleep(0.5)
+        made.autopilot.calibrates_compass = True
+        while "is calibrating its own sensors" not in made.service.calibrating.stands.state.objection:  # type: ignore[union-attr]
+            await asyncio.sleep(0.5)
+        assert values(made, "ardupilot") == old
+        made.autopilot.calibrates_compass = False
+        assert (await following).outcome == "done"
 
 
 async def test_armed_in_the_middle_nothing_is_written(tmp_path: Path) -> None:

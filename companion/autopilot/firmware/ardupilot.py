@@ -268,6 +268,8 @@ class ArduPilot(Firmware):
         3: mavlink.MAVLink_scaled_imu3_message,
     }
 
+    compass_rival = mavlink.MAVLink_mag_cal_progress_message
+
     async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:
         priority, use = f"COMPASS_PRIO{number}_ID", f"COMPASS_USE{'' if number == 1 else number}"
         device_id, warnings = await parameters.read_integer(priority), []

@@ -80,6 +80,7 @@ class Firmware:
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
     compass_messages: Mapping[int, type[Message]] = {}  # by compass (from 1), in milligauss
+    compass_rival: type[Message] | None = None  # sent on request while the firmware itself calibrates a compass
     raw_fields: bool = False  # True: `compass_messages` carry raw fields, in the axes of the sensors
 
     async def read_compass(self, parameters: Parameters, number: int) -> CompassCalibration:

@@ -19,6 +19,8 @@ from companion.physics.frames import Array
 SELECTED: Final = 0
 """Number of the corrected field of the compass in use, which both firmwares send in HIGHRES_IMU, in gauss."""
 _CORRECTED: Final = mavlink.MAVLink_highres_imu_message
+_RIVAL: Final = -1
+_RIVAL_S: Final = 3.0  # Age of the latest message of a rival up to which it counts as running
 RATE_HZ: Final = 5.0
 LISTEN_S: Final = 1.0
 LEAST: Final = 5
@@ -47,6 +49,7 @@ class CompassFields:
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self._link, self._vehicle = link, vehicle
         self._seen: dict[int, deque[tuple[float, Array]]] = defaultdict(lambda: deque(maxlen=_KEPT))
+        self._rival_s = -math.inf
 
     @contextlib.contextmanager
     def heard(self) -> Iterator[dict[int, type[Message]]]:
@@ -54,6 +57,8 @@ class CompassFields:
         self._seen.clear()
         kind = self._vehicle.kind
         wanted = {**kind.compass_messages, **({SELECTED: _CORRECTED} if kind.compass_messages else {})}
+        if kind.compass_rival is not None:
+            wanted[_RIVAL] = kind.compass_rival
         with contextlib.ExitStack() as stack:
             for message in set(wanted.values()):
                 stack.callback(self._link.subscribe(message, self._on_message))
@@ -76,6 +81,11 @@ class CompassFields:
                 for message in missing:
                     commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message.id, 0.0)  # the firmware's own rate
 
+    @property
+    def rival_runs(self) -> bool:
+        """True while the autopilot's own calibration of a compass runs; it would replace what we write."""
+        return asyncio.get_running_loop().time() < self._rival_s + _RIVAL_S
+
     def mean(self, number: int, since_s: float, until_s: float = math.inf) -> MeanField | None:
         """Return the mean field of a compass over a time; None: too few messages."""
         taken = [field for t_s, field in self._seen[number] if since_s <= t_s <= until_s]
@@ -93,6 +103,9 @@ class CompassFields:
         if not self._vehicle.sent(message):
             return
         kind = self._vehicle.kind
+        if type(message) is kind.compass_rival:
+            self._rival_s = t_s
+            return
         field = np.array([message.xmag, message.ymag, message.zmag], dtype=np.float64)
         if not np.isfinite(field).all() or not field.any():
             return

@@ -35,6 +35,7 @@ GOOD_DEG: Final = 3.0
 """Largest sigma of a heading that is written; the firmwares' own compass calibrations warn at about this error."""
 MOST_TILT_DEG: Final = 15.0
 _OWN_COMPASS_SIGMAS: Final = 3.0
+RIVAL: Final = "cancel its compass calibration in the ground station"
 
 
 class CompassTask(SamePlaceTask):
@@ -71,6 +72,8 @@ class CompassTask(SamePlaceTask):
             raise why
 
     def unsteady(self, window: Window) -> str | None:
+        if self._fields.rival_runs:
+            return f"{self._core.vehicle.name} is calibrating its own sensors: {RIVAL}"
         fields = {number: self._fields.mean(number, window.start_s, window.end_s) for number in self._compasses}
         self._heard |= {number for number, field in fields.items() if field is not None}
         for number, field in fields.items():
@@ -205,6 +208,8 @@ class CompassTask(SamePlaceTask):
         )
 
     async def write(self, writes: AlignmentWrites, job: Job, last: Window, log: WriteLog) -> None:
+        if self._fields.rival_runs:
+            raise CalibrationRefusedError(f"{self._core.vehicle.name} is calibrating its own sensors: {RIVAL}")
         steps = []
         for number, found in self._found.items():
             calibration, now = self._compasses[number], found.figures
