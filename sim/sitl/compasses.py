@@ -13,7 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import Array, body_from_ned
 from sim.firmware.compass import SimCompass, corrected
-from sim.hands import Hands
+from sim.hands import AHEAD_S, SIDES, Hands
+from sim.motions import Turn
 from sim.sitl.daemon import companion_daemon, obeyed
 from sim.sitl.ground import GroundStation
 from sim.sitl.px4 import Px4Sitl
@@ -26,6 +27,14 @@ SOFT: Final = np.array([[1.05, 0.02, -0.03], [0.02, 0.95, 0.015], [-0.03, 0.015,
 HEADINGS: Final = (2, 4, 8)
 WRONG_DEG: Final = 3.0
 STORED_S: Final = 3.0
+DETECTED_S: Final = 4.0
+"""Time in which PX4 sees on which side the aircraft lies."""
+SPIN_S: Final = 16.0
+EDGES: Final = [(pitch, roll) for roll in (0.0, 180.0) for pitch in (45.0, -45.0)] + [
+    (0.0, roll) for roll in (45.0, -45.0, 135.0, -135.0)
+]
+"""Pitch and roll between two sides. ArduPilot wants 300 samples 6.3 deg apart (CompassCalibrator.cpp, accept_sample);
+six circles, one for each side, have room for 170."""
 NO_IRON: Final = np.array([[0.0] * 3, [1.0] * 3, [0.0] * 3])
 _AXES: Final = "XYZ"
 NAMES: Final = {
@@ -81,7 +90,35 @@ async def report(vehicle: SitlVehicle, folder: Path) -> int:
             await _look(
                 vehicle, ground, f"companion, {headings} headings ({done.partition(': ')[2].partition(',')[0]})"
             )
+        # The last one, because ArduPilot's writes COMPASS_SCALE too.
+        await _reset(vehicle, ground)
+        await _look(vehicle, ground, f"own rotation on all sides ({await _own_rotation(vehicle, ground, hands)})")
         return failed
+
+
+async def _own_rotation(vehicle: SitlVehicle, ground: GroundStation, hands: Hands) -> str:
+    """Run the firmware's own compass calibration: spin the aircraft in each pose until it is done; return its word."""
+    since_s = asyncio.get_running_loop().time()
+    if isinstance(vehicle, Px4Sitl):
+        await ground.command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0.0, 1.0)
+    else:
+        await ground.stream(mavlink.MAVLINK_MSG_ID_MAG_CAL_REPORT, 1.0)
+        await ground.command(mavlink.MAV_CMD_DO_START_MAG_CAL, 1.0, 0.0, 1.0)
+
+    def word() -> str:
+        if reports := ground.all(mavlink.MAVLink_mag_cal_report_message, since_s=since_s):
+            return f"status {reports[-1].cal_status}, fitness {reports[-1].fitness:.1f}"
+        said = [one.text.strip() for one in ground.all(mavlink.MAVLink_statustext_message, since_s=since_s)]
+        return next((text for text in said if "calibration done" in text or "calibration failed" in text), "")
+
+    for pitch, roll in (*SIDES.values(), *EDGES, *SIDES.values()):
+        if not word():
+            await vehicle.sleep(hands.hold(vehicle.now_s + AHEAD_S, pitch, roll) - vehicle.now_s + DETECTED_S)
+            spin = Turn(start_s=vehicle.now_s + AHEAD_S, duration_s=SPIN_S, heading_deg=360.0)
+            vehicle.aircraft.add(spin)
+            await vehicle.sleep(SPIN_S + DETECTED_S)
+    await vehicle.sleep(hands.back(vehicle.now_s + AHEAD_S) - vehicle.now_s + STORED_S)
+    return word() or "no word"
 
 
 async def add_iron(vehicle: SitlVehicle, ground: GroundStation) -> None:
