@@ -193,6 +193,7 @@ class Align(Command, frozen=True, tag="align"):
             allowed_words="a number from 0 to 360",
         ),
     ] = None
+    sides: Annotated[bool, Field("after faces: the compasses on six sides, at any heading", by=by)] = False
     level: Annotated[bool, Field("after faces: write the tilt of the board (AHRS_TRIM, SENS_BOARD)", by=by)] = False
     write: Annotated[bool, Field("write the result to the autopilot", by=by)] = False
     wait: Annotated[bool, Field(by=Interface(0))] = True

@@ -39,7 +39,7 @@ ALIGNMENTS: Final = {
     "faces": ("accelerometers by hand, in about 12 poses on any side", ("write", "timeout_s")),
     "compass": (
         "the autopilot's compasses, by turning on one place (no heading need be known)",
-        ("headings", "heading", "write", "timeout_s"),
+        ("headings", "heading", "sides", "write", "timeout_s"),
     ),
     "show": ("show the stored alignment", ()),
     "forget": ("return to the zero and sigma of the configuration", ()),

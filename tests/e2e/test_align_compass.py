@@ -25,6 +25,8 @@ from sim.scenario import site_at
 from sim.sitl.compasses import HARD_MGAUSS, NAMES, SOFT, heading_errors_deg
 from tests.e2e.test_align import follow
 from tests.e2e.test_calibration import started
+from tests.support.by_hand import alone
+from tests.support.by_hand import follow as follow_sides
 from tests.support.rig import Rig
 
 SITE = site_at(40.0, 116.0, 50.0)
@@ -174,6 +176,29 @@ async def test_one_heading_suffices_where_it_is_known(tmp_path: Path, own: bool,
         assert abs(record.heading_deg - 40.0) < 2.0 * heading_sigma_deg
         assert found.heading_sigma_deg > heading_sigma_deg > 1.0
         assert np.abs(np.subtract(found.offset_mgauss, HARD_MGAUSS) / found.offset_sigma_mgauss).max() < 3.0
+
+
+async def test_all_sides_give_hard_and_soft_iron_at_headings_that_nobody_knows(tmp_path: Path) -> None:
+    compass = SimCompass(HARD_MGAUSS, SOFT, noise_mgauss=1.0)
+    made, hands = alone(tmp_path, propped_deg=4.0, imu_rate_hz=10.0, compasses=[compass])
+    async with made.running():
+        await made.ready()
+        asked = {"action": "compass", "sides": True, "write": True, "timeout_s": 2000.0}
+        start = made.service.calibrating.start_alignment
+        result = await follow_sides(made, hands, started(start(Align.read(asked), "test")))
+        assert "align faces first" in result.reason
+        faces = {"action": "faces", "write": True, "timeout_s": 2000.0}
+        assert (await follow_sides(made, hands, started(start(Align.read(faces), "test")))).outcome == "done"
+        job = started(start(Align.read(asked), "test"))
+        result = await follow_sides(made, hands, job)
+        assert result.outcome == "done", result
+        record = job.product
+        assert isinstance(record, CompassRecord)
+        (found,) = record.compasses
+        left_deg = errors_deg(values(made, "ardupilot"), "ardupilot")
+        assert np.sqrt(np.mean(np.square(left_deg))) < min(1.0, 2.0 * found.heading_sigma_deg)
+        assert np.abs(np.subtract(found.offset_mgauss, HARD_MGAUSS) / found.offset_sigma_mgauss).max() < 3.0
+        assert {one.outcome for one in found.written.values()} == {"verified"}
 
 
 async def test_our_own_compass_that_contradicts_is_named(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from companion.daemon.poses.session import PoseSession, PoseTask
 from companion.daemon.poses.tasks import SixPositionTask, TurnTask, ZeroTask
 from companion.daemon.poses.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
+from companion.estimation.alignment.faces import SIDES
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
 from companion.estimation.machine import Event, What
 from companion.estimation.means.windows import Window
@@ -214,13 +215,14 @@ class Calibrating(Subsystem):
         if action is None:
             allowed = Align.fields()["action"].allowed
             raise CalibrationRefusedError(f"align: 'action': found nothing; allowed: {allowed}")
-        on_turn = action == "turn"
+        on_turn, sides = action == "turn", asked.sides and action == "compass"
         request = AlignmentRequest(
             action,
-            asked.headings or (HEADINGS if action in ("turn", "compass") else 2),
+            len(SIDES) if sides else asked.headings or (HEADINGS if action in ("turn", "compass") else 2),
             write=asked.write and action in ("turn", "faces", "compass"),
             level=asked.level and on_turn,
-            heading_deg=asked.heading if action == "compass" else None,
+            heading_deg=asked.heading if action == "compass" and not sides else None,
+            sides=sides,
         )
         if action != "compass" and request.headings not in (2, HEADINGS):
             return Refusal("other", f"headings: found {request.headings}; allowed for {action}: 2 or 4")

@@ -53,13 +53,8 @@ class CompassStatus:
     def rows(self) -> list[Object]:
         """Return the heading error of each compass from the last alignment; none if its values are not in force."""
         done = self._by_hand.last_compass
-        if (
-            done is None
-            or not done.written
-            or not all(
-                name in self._values and same_float32(self._values[name], value) for name, value in done.written.items()
-            )
-        ):
+        now = {name: self._values.get(name, math.nan) for name in (done.written if done else ())}
+        if done is None or not all(same_float32(now[name], value) for name, value in done.written.items()):
             return []
         return [
             {"name": name, "summary": f"heading good to {sigma:.1f} deg, aligned {done.measured_at[:10]}"}
@@ -91,8 +86,7 @@ class CompassStatus:
             return []
         up = np.array(window.imus[0].accel_m_s2)
         up /= np.linalg.norm(up)
-        own = self._own_heading(window, up, local)
-        return _doubts(field.mean_gauss, up, local, own)
+        return _doubts(field.mean_gauss, up, local, self._own_heading(window, up, local))
 
     def _own_heading(self, window: Window, up: Array, local: LocalEarth) -> tuple[float, float] | None:
         """Return the true heading of the companion's own compass and its sigma, deg; None: it has none."""

@@ -19,12 +19,13 @@ from companion.daemon.poses.tasks import NOT_WRITTEN, SamePlaceTask
 from companion.daemon.poses.writes import AlignmentWrites, CompassStep
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.alignment.compass import CompassEstimate, CompassPose, compass
-from companion.estimation.alignment.poses import AlignmentRequest, HeldPose, objection
+from companion.estimation.alignment.faces import FACE_DEG, SIDES
+from companion.estimation.alignment.poses import AlignmentRequest, HeldPose, PoseRequest, objection
 from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import CompassFiguresRecord, CompassRecord
 from companion.estimation.solution.site import LocalEarth
-from companion.estimation.solution.truth import NOTHING, Truth, truth_of
-from companion.physics.frames import Array, wrap_deg
+from companion.estimation.solution.truth import NOTHING, truth_of, up_by_sides
+from companion.physics.frames import Array, Matrix, wrap_deg
 from companion.physics.units import DEG
 from companion.samples import Vector
 
@@ -46,7 +47,7 @@ class CompassTask(SamePlaceTask):
     def __init__(self, core: Core, request: AlignmentRequest, estimator: Estimator, fields: CompassFields) -> None:
         super().__init__(core, request)
         self._estimator, self._fields = estimator, fields
-        self.imus_alone = core.config.gradienter is None
+        self.imus_alone = request.sides or core.config.gradienter is None
         self.fit_from = 1
         self._compasses: dict[int, CompassCalibration] = {}
         self._found: dict[int, CompassEstimate] = {}
@@ -54,7 +55,7 @@ class CompassTask(SamePlaceTask):
         self._left_out: list[str] = []
         self._latest: dict[int, MeanField] = {}
         self._means: list[dict[int, MeanField]] = []  # Of each pose, by compass
-        self._tilts: list[Truth] = []
+        self._tilts: list[tuple[Array, Matrix]] = []  # Vector up and its covariance in each pose
         self._sides = NOTHING
 
     async def prepare(self) -> None:
@@ -88,10 +89,21 @@ class CompassTask(SamePlaceTask):
                 self._latest[number] = field
         return None
 
+    def wish(self, state: SessionState) -> PoseRequest | None:
+        left = list(SIDES.items())[len(state.poses) :]
+        if not self.request.sides or not left:
+            return super().wish(state)
+        return PoseRequest(f"{left[0][0]}: propped up, hands off", left[0][1])
+
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         up = np.array(now.imus[0].accel_m_s2)
-        pose = self._counted(state, now, up / np.linalg.norm(up), 0.0)
+        up /= np.linalg.norm(up)
         self._sides = self._estimator.sides(now)
+        if self.request.sides:
+            off_deg = math.degrees(math.acos(np.clip(up @ state.wish.up, -1.0, 1.0)))
+            wrong = f"tilted by {off_deg:.0f} degrees: {state.wish.words}" if off_deg > FACE_DEG else None
+            return HeldPose(up, 0.0, math.inf), wrong
+        pose = self._counted(state, now, up, 0.0)
         tilt_deg = math.degrees(math.acos(min(1.0, -float(pose.up[2]))))
         if tilt_deg > MOST_TILT_DEG:
             return pose, f"tilted by {tilt_deg:.0f} degrees: put it where it stands within {MOST_TILT_DEG:.0f}"
@@ -101,24 +113,22 @@ class CompassTask(SamePlaceTask):
         if local.field is None:
             raise CalibrationRefusedError("the Earth's field is unknown without position and date: wait for GNSS")
         self._means.append(dict(self._latest))
-        gradienter, warnings = self._estimator.alignment.model(), list[str]()
-        self._tilts = [truth_of(one, gradienter, None, local, warnings, self._sides) for one in state.windows]
-        if self._tilts[0].tilt_from is None:
-            raise CalibrationRefusedError("the tilt is known to 3 deg only: align faces first, or connect a gradienter")
-        if len(state.poses) == 1 < self.total and self.request.heading_deg is None:
+        self._tilts = [self._tilt(one, local) for one in state.windows]
+        least = self.total if self.request.sides else 2 if self.total > 1 and self.request.heading_deg is None else 1
+        if len(state.poses) < least:
             return []
-        tilt_sigma_rad = math.sqrt(max(float(np.diag(tilt.up_covariance)[:2].max()) for tilt in self._tilts))
+        tilt_sigma_rad = math.sqrt(max(float(np.diag(covariance)[:2].max()) for _, covariance in self._tilts))
         heading = self._known_heading(state.windows[0], local)
         for number, calibration in self._compasses.items():
             poses = [
                 CompassPose(
-                    tilt.up,
+                    up,
                     calibration.raw_gauss(field.mean_gauss),
                     np.full(3, float(field.sigma_gauss.max())),
                     (pose.heading_deg - before.heading_deg) * DEG,
                     pose.heading_sigma_deg * DEG,
                 )
-                for tilt, field, pose, before in zip(
+                for (up, _), field, pose, before in zip(
                     self._tilts,
                     (means[number] for means in self._means),
                     state.poses,
@@ -129,6 +139,16 @@ class CompassTask(SamePlaceTask):
             self._found[number] = compass(poses, local.field, calibration.figures, tilt_sigma_rad, heading)
         worst_deg = max(found.sigma_rad() for found in self._found.values()) / DEG
         return [f"Heading good to {worst_deg:.1f} degrees so far"] if len(state.poses) < self.total else []
+
+    def _tilt(self, window: Window, local: LocalEarth) -> tuple[Array, Matrix]:
+        if self.request.sides:
+            found = up_by_sides(window.imus, self._sides, local, [])
+        else:
+            seen = truth_of(window, self._estimator.alignment.model(), None, local, [], self._sides)
+            found = None if seen.tilt_from is None else (seen.up, seen.up_covariance)
+        if found is None:
+            raise CalibrationRefusedError("the tilt is known to 3 deg only: align faces first, or connect a gradienter")
+        return found
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> CompassRecord:
         assert local.field is not None
@@ -149,10 +169,10 @@ class CompassTask(SamePlaceTask):
             field_gauss=local.field.strength_gauss,
             inclination_deg=local.field.inclination_deg,
             declination_deg=local.declination_deg,
-            tilt_deg=round(max(math.degrees(math.acos(min(1.0, -float(tilt.up[2])))) for tilt in self._tilts), 2),
+            tilt_deg=round(max(math.degrees(math.acos(min(1.0, -float(up[2])))) for up, _ in self._tilts), 2),
             heading_deg=round(heading_deg, 2),
             heading_sigma_deg=round(math.hypot(first.heading_sigma_rad / DEG, local.declination_sigma_deg), 2),
-            turns_deg=tuple(round(float(turn), 2) for turn in np.diff(headings)),
+            turns_deg=() if self.request.sides else tuple(round(float(turn), 2) for turn in np.diff(headings)),
             compasses=tuple(self._figures_record(number, found) for number, found in self._found.items()),
         )
 

@@ -64,7 +64,7 @@ class CompassPose(NamedTuple):
     raw_gauss: Array
     sigma_gauss: Array
     turn_rad: float = 0.0  # About the vehicle's z axis, clockwise from above, since the previous pose
-    turn_sigma_rad: float = 0.0
+    turn_sigma_rad: float = 0.0  # math.inf: nobody knows the turn, so all poses have a heading of their own
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +136,7 @@ def compass(
     """Estimate the correction of one compass.
 
     Args:
-        poses: at least two, or one with a `heading`.
+        poses: at least two, or one with a `heading`; on six sides their turns may be unknown.
         earth: Earth's field at the place.
         before: present correction; its D is the mean of the prior.
         tilt_sigma_rad: of the tilt that all poses have in common.
@@ -149,8 +149,14 @@ def compass(
     start, prior = model.start(earth, before), _prior(poses, earth)
     if heading is not None:
         start[_HEADING], prior[_HEADING] = heading
-    start = model.guess(start, _GUESSES if heading is None else start[[_HEADING]])
-    found, scatter_gauss = model.solve(start, prior, [0, 1, 2, *([_HEADING] if heading is None else [])])
+    free = [0, 1, 2, *([_HEADING] if heading is None else [])]
+    if (unknown := np.flatnonzero(np.isinf(prior))).size:
+        prior[unknown] = math.pi
+        free += unknown.tolist()
+        model.guess_all(start)
+    else:
+        start = model.guess(start, _GUESSES if heading is None else start[[_HEADING]])
+    found, scatter_gauss = model.solve(start, prior, free)
     soft = model.soft(found.values[None])[0]
     kept = np.diag(before.soft @ np.linalg.inv(soft))[:2].mean()
     return CompassEstimate(
@@ -188,6 +194,14 @@ class _Model:
         off = self.expected(guesses) - self.raw
         guesses[:, OFFSET] = off.mean(axis=1)
         return np.asarray(guesses[np.argmin(off.var(axis=1).sum(axis=1))])
+
+    def guess_all(self, start: Array) -> None:
+        """Set the offset to that of a sphere through all raw fields, and all headings to those of the fields then."""
+        around = np.column_stack([-2.0 * self.raw, np.ones(len(self.raw))])
+        start[OFFSET] = np.linalg.lstsq(around, np.square(self.raw).sum(axis=1), rcond=None)[0][:3]
+        ahead, right, _ = np.einsum("pij,pi->jp", self._tilts, self.raw + start[OFFSET])
+        headings = np.arctan2(-right, ahead)
+        start[_HEADING], start[_TURNS:] = headings[0], np.diff(headings)
 
     def expected(self, at: Floats) -> Floats:
         """Return the raw fields (m, poses, 3) for m sets of unknowns (m, size)."""

@@ -49,7 +49,7 @@ SAME_DEG: Final = 20.0
 FACE_DEG: Final = 30.0  # A pose within this angle of a side counts as a measurement of that side
 _STAND_SIGMA_M_S2: Final = 0.03 * MG  # Predicted sigma of the mean of the next pose
 _AXES: Final = "xyz"
-_SIDES: Final = {
+SIDES: Final = {
     "level": (0, 0, -1),
     "on its back": (0, 0, 1),
     "nose up": (1, 0, 0),
@@ -227,11 +227,11 @@ def _not_seen(found: FacesEstimate, vehicle_from_sensor: Matrix) -> list[tuple[s
     kept = np.delete(found.up, found.left_out, axis=0)
     sides = _all_sides(vehicle_from_sensor)
     new = [(name, up) for name, up in sides if (kept @ up).max() < np.cos(np.radians(FACE_DEG))]
-    return [(name, up) for name, up in new if name in _SIDES] or new
+    return [(name, up) for name, up in new if name in SIDES] or new
 
 
 def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
-    faces = {name: np.array(up, dtype=np.float64) for name, up in _SIDES.items()}
+    faces = {name: np.array(up, dtype=np.float64) for name, up in SIDES.items()}
     edges = {
         f"between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
         for a, b in itertools.combinations(faces, 2)

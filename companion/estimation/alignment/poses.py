@@ -47,6 +47,7 @@ class AlignmentRequest(NamedTuple):
     write: bool = False  # Write offsets (and scales, if six positions determine them) to the autopilot
     level: bool = False  # Write the tilt of the board as the autopilot's level
     heading_deg: float | None = None  # True heading of the first pose, if somebody knows it
+    sides: bool = False  # Of a compass: six sides at any heading
 
     @property
     def on_spot(self) -> int:

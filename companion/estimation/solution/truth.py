@@ -119,7 +119,7 @@ def truth_of(
     if gradienter is not None and window.tilt is not None:
         up, by_reading, up_covariance = _up_by_gradienter(window.tilt, gradienter)
         reading_sigma, tilt_from = (window.tilt.x_sigma_deg * DEG, window.tilt.y_sigma_deg * DEG), "gradienter"
-    elif (by_sides := _up_by_sides(window.imus, otherwise, local, warnings)) is not None:
+    elif (by_sides := up_by_sides(window.imus, otherwise, local, warnings)) is not None:
         (up, up_covariance), tilt_from = by_sides, "accelerometers"
     else:
         mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
@@ -173,7 +173,7 @@ def _up_by_gradienter(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, 
     return up, jacobian, jacobian @ np.diag(variance) @ jacobian.T
 
 
-def _up_by_sides(
+def up_by_sides(
     imus: Sequence[ImuWindow], otherwise: FallbackPose, local: LocalEarth, warnings: list[str]
 ) -> tuple[Array, Matrix] | None:
     """Estimate the up vector and its covariance by the first IMU with a six-position calibration that fits gravity.

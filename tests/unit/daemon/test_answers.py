@@ -69,4 +69,4 @@ def test_pages_and_brokers_may_not_ask_for_everything() -> None:
     assert by[Interface.MQTT] == {"calibrate", "cancel", "undo"}
     assert by[Interface.PAGE] == {"calibrate", "align", "cancel", "undo", "answer"}
     assert set(ALL["calibrate"].fields(Interface.PAGE)) == {"what"}
-    assert set(ALL["align"].fields(Interface.PAGE)) == {"action", "headings", "heading", "write", "level"}
+    assert set(ALL["align"].fields(Interface.PAGE)) == {"action", "headings", "heading", "sides", "write", "level"}

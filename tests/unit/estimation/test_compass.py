@@ -16,6 +16,7 @@ from companion.physics.earth import MagneticField, magnetic_field
 from sim.accuracy import compasses
 from sim.accuracy.figures import covered, rms, stack
 from sim.earth import body_from_ned
+from sim.hands import SIDES
 
 EARTH = magnetic_field(47.4, 8.5, 400.0, datetime.date(2026, 6, 1))
 NO_IRON = CompassFigures(np.zeros(3), np.eye(3))
@@ -53,6 +54,31 @@ def test_one_pose_and_a_typed_heading_carry_its_error() -> None:
     assert found.figures.offset_gauss == pytest.approx([0.0, 0.1, 0.0], abs=EARTH.horizontal_gauss * math.radians(1.1))
     assert math.degrees(found.heading_sigma_rad) == pytest.approx(2.0, abs=0.1)
     assert math.degrees(found.sigma_rad()) > 2.0
+
+
+def test_six_sides_at_unknown_headings_and_sigma_says_how_good_they_are() -> None:
+    errors, sigmas, offsets = [], [], []
+    for number in range(60):
+        random = np.random.default_rng([number, 41])
+        hard, soft = random.normal(0.0, 0.08, 3), np.eye(3) + np.diag(random.uniform(-0.05, 0.05, 3))
+        soft[0, 1] = soft[1, 0] = random.uniform(-0.05, 0.05)
+        soft[1, 2] = soft[2, 1] = random.uniform(-0.05, 0.05)
+        field = np.array([EARTH.horizontal_gauss, 0.0, EARTH.down_gauss])
+        here, poses = field + random.normal(0.0, 0.002, 3) * (1.0, 0.0, 1.0), []
+        for pitch, roll in SIDES.values():
+            off_roll, off_pitch = np.radians((roll, pitch)) + random.normal(0.0, math.radians(4.0), 2)
+            body = body_from_ned(off_roll, off_pitch, random.uniform(0.0, math.tau))
+            raw = np.linalg.solve(soft, body @ here) - hard + random.normal(0.0, 1.1e-3, 3)
+            up = body @ UP + random.normal(0.0, 0.002, 3)
+            poses.append(CompassPose(up / np.linalg.norm(up), raw, np.full(3, 5e-4), 0.0, math.inf))
+        found = compass(poses, EARTH, NO_IRON, 0.002)
+        errors.append(compasses._errors(found.figures, hard, soft, field, 0.0, 0.0))
+        sigmas.append(np.full(36, found.sigma_rad()))
+        offsets.append((found.figures.offset_gauss - hard) / found.offset_sigma_gauss)
+        assert found.bent is None
+    assert math.degrees(np.sqrt(np.mean(np.square(errors)))) < 0.7
+    assert 0.92 < covered(np.array(errors), np.array(sigmas), 2.0).value < 0.995
+    assert np.sqrt(np.mean(np.square(offsets))) < 1.1
 
 
 def test_a_field_far_too_strong_is_named() -> None:
