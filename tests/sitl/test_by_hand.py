@@ -60,8 +60,8 @@ class ByHandBench:
         self.hands = Hands(vehicle.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=1, takes_s=2.0)
         self.companion = CompanionProcess(folder)
 
-    async def type(self, *words: str) -> None:
-        await obeyed(self.companion, self.hands, self.vehicle, *words)
+    async def type(self, *words: str) -> str:
+        return await obeyed(self.companion, self.hands, self.vehicle, *words)
 
     async def values(self, names: list[str]) -> list[float]:
         """Parameters by name."""
