@@ -218,6 +218,11 @@ class Undo(Command, frozen=True, tag="undo"):
     ] = False
 
 
+class Fix(Command, frozen=True, tag="fix"):
+    help = "carry out the first remedy that `companion status` names"
+    by = _SHELL | Interface.PAGE
+
+
 class AutopilotSetup(Command, frozen=True, tag="autopilot-setup"):
     help = "parameters that the autopilot needs for the gate, the offsets and the heading"
 
@@ -275,7 +280,7 @@ class Answer(Command, frozen=True, tag="answer"):
 ALL: Final = {
     kind.name(): kind
     for kind in (
-        Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, RecordInputs, Answer
+        Status, Calibrate, Align, Cancel, Undo, Fix, AutopilotSetup, History, Temperature, Monitor, RecordInputs, Answer
     )
 }  # fmt: skip
 """Class of each command, by the name of the command."""

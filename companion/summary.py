@@ -8,7 +8,7 @@ from companion import messages
 from companion.formats import Object
 
 _HEARTBEAT_S: Final = 2.0  # maximum age of the autopilot's heartbeat before the link counts as lost
-
+REFUSES: Final = "will not arm"  # Name of a row with one of the autopilot's reasons against arming
 
 StatusRow = tuple[Literal["ok", "warning", "wrong"], str, str, str]
 """One row of the status, for a connected device or a warning: verdict, name, text, remedy (empty: none)."""
@@ -18,20 +18,12 @@ def headline(status: Object) -> str:
     return f"{status['headline']['word']}: {status['headline']['reason']}"
 
 
-def remedy(status: Object) -> str:
-    """Return the remedy for the headline; empty if it asks for nothing."""
-    headline, warm_up = status["headline"], status["arming"]["warm_up"]
-    # The countdown of a warm-up follows a reason, and does not replace that reason's remedy.
-    reason = headline["reason"].removesuffix(f"; {warm_up['words']}" if warm_up else "")
-    found = messages.explain(reason) if headline["tone"] in ("bad", "wait") else None
-    return "" if found is None else found[1].remedy
-
-
 def rows(status: Object) -> list[StatusRow]:
-    """List the rows of a daemon's status: first autopilot and devices, then connections, problems and warnings."""
+    """List the rows of a daemon's status: reasons against arming, devices, then connections, problems and warnings."""
     vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]
     heartbeat_s, signing = vehicle["heartbeat_age_s"], vehicle["signing"]
-    found = [_row(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]
+    found: list[StatusRow] = [("wrong", REFUSES, one["line"], one["remedy"]) for one in status.get("diagnosis", ())]
+    found += [_row(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]
     if signing is not None:
         found.append(_row(signing["good"], f"signing ({signing['mode']})", signing["summary"]))
     found += [_row(device["good"], device["name"], device["summary"] + _counts(device)) for device in status["devices"]]

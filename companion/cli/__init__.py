@@ -34,7 +34,7 @@ from companion.errors import CompanionError, ConfigError, DaemonDeniedError, Dae
 from companion.links.system.process import OneLineFormatter
 
 GROUPS: Final = {
-    "every day": ("status", "calibrate", "cancel", "undo", "history", "report", "explain"),
+    "every day": ("status", "calibrate", "fix", "cancel", "undo", "history", "report", "explain"),
     "set-up": ("setup", "check", "ports", "align", "autopilot", "page", "service"),
     "expert": ("run", "log", "ground", "fleet"),
 }
@@ -47,7 +47,7 @@ class _Overview(Parser):
     commands: CommandGroup
 
     def format_help(self) -> str:
-        lines = ["companion: field self-calibration of gyro and accelerometer biases", ""]
+        lines = ["companion: field self-calibration of gyro and accelerometer biases"]
         for title, names in GROUPS.items():
             lines += [f"{title}:", *(f"  {name:11}{self.commands[name].description}" for name in names)]
         lines += ["", "companion COMMAND --help describes a command. All take --json (one JSON object on stdout),"]

@@ -8,6 +8,7 @@ import math
 import shutil
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -51,6 +52,7 @@ def add_commands(top: CommandGroup, autopilot: CommandGroup, log: CommandGroup) 
     for to, name, kind, command in (
         (top, "status", commands.Status, status),
         (top, "calibrate", commands.Calibrate, calibrate),
+        (top, "fix", commands.Fix, partial(calibrate, kind=commands.Fix)),
         (top, "cancel", commands.Cancel, cancel),
         (top, "undo", commands.Undo, undo),
         (top, "history", commands.History, history),
@@ -141,10 +143,11 @@ async def status(options: argparse.Namespace) -> int:
     return conclude(options, answer, show.status_lines(answer), good=True)
 
 
-async def calibrate(options: argparse.Namespace) -> int:
-    reply = await request(options, request_of(options, commands.Calibrate), CANCEL if options.wait else None)
+async def calibrate(options: argparse.Namespace, kind: type[commands.Command] = commands.Calibrate) -> int:
+    waits = getattr(options, "wait", True)
+    reply = await request(options, request_of(options, kind), CANCEL if waits else None)
     if "record" not in reply:
-        return _conclude_briefly(options, reply, good=not options.wait)
+        return _conclude_briefly(options, reply, good=not waits or reply["state"] == "done")
     record = reply["record"]
     return _conclude(options, record, show.record_lines(record), good=record["state"] == "done")
 

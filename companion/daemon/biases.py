@@ -325,6 +325,11 @@ class BiasMemory:
             found.append(msgspec.to_builtins(shown))
         return found
 
+    def last(self, name: str, triad: Triad) -> Point | None:
+        """Return the bias of an IMU's latest calibration; None if there is none of the present sensor."""
+        points = () if self._changed(name) else reversed(self._points(name))
+        return next((point for point in points if point.started_at and point.of(triad) is not None), None)
+
     def _points(self, name: str) -> tuple[Point, ...]:
         return self._known[name].points if name in self._known else ()
 

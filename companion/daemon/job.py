@@ -20,7 +20,8 @@ FACES: Final = "faces alignment"
 TURN: Final = "turn on the spot"
 COMPASS: Final = "compass alignment"
 TEMPERATURE: Final = "temperature curve"
-NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, COMPASS, TEMPERATURE)
+FIRMWARE: Final = "autopilot gyro calibration"
+NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, COMPASS, TEMPERATURE, FIRMWARE)
 
 Act = Literal["", "PUT IT DOWN", "TURN IT", "HOLD STILL"]
 """Present task of an alignment's operator, shown by the headline; empty: wait."""

@@ -27,7 +27,7 @@ from companion.commands import Interface, commands_for
 from companion.errors import CompanionError, StorageError
 from companion.formats import Object, parse_request
 from companion.links.system.connection import Reconnection
-from companion.summary import remedy, rows
+from companion.summary import rows
 from companion.web.access import TOKEN_HEADER, Access, is_loopback, new_token, page_url, split_address, stored_token
 from companion.web.listener import MAX_BODY_BYTES, Connection, listening
 
@@ -252,7 +252,7 @@ class Page:
                 if "status" in reply:
                     status = reply["status"]
                     # The status of the first-run set-up has no vehicle: no rows can be made of it.
-                    more = {"rows": rows(status), "remedy": remedy(status)} if "vehicle" in status else {}
+                    more = {"rows": rows(status)} if "vehicle" in status else {}
                     data = event({**status, **more})
                     for viewer in tuple(self._viewers):
                         viewer.send(data)

@@ -161,9 +161,12 @@ class CommandServer:
     def _run_prearm_checks(self, command: Command) -> int:
         if self._double.armed:
             return mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-        for failure in self._double.prearm_failures(command.loop_s):
-            self._double.say(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {failure}")
+        self.report_failures(command.loop_s)
         return ACCEPTED
+
+    def report_failures(self, loop_s: float) -> None:
+        for failure in self._double.prearm_failures(loop_s):
+            self._double.say(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {failure}")
 
     def _calibrate(self, command: Command) -> int | None:
         double = self._double

@@ -49,6 +49,9 @@ class ArduPilotDouble(ArduPilotBoard):
         self._parameter_server = ArduPilotParameterServer(self)
         self._commands = CommandServer(self)
         self._floats_until_s = 0.0
+        self.repeats_failures = False
+        """Repeat failed checks every 30 s, as the real one does; most tests do without."""
+        self._failures_due_s = 0.0
         self._boot_gyros(0.0)
 
     # What tests and people do to it.
@@ -118,6 +121,9 @@ class ArduPilotDouble(ArduPilotBoard):
 
     def build(self, message_id: int, loop_s: float) -> Message | None:
         """Build a message of `BUILDERS`, or the script's floats; None: the script is not allowed to send."""
+        if message_id == HEARTBEAT and self.repeats_failures and not self.armed and loop_s >= self._failures_due_s:
+            self._failures_due_s = loop_s + 30.0
+            self._commands.report_failures(loop_s)
         if message_id != FLOATS:
             return BUILDERS[message_id](self, loop_s)
         return script_floats(self, loop_s) if loop_s < self._floats_until_s and not self.armed else None

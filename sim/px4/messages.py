@@ -12,7 +12,6 @@ from sim.firmware.messages import (
     gps_raw_int,
     in_integers,
     pressure_hpa,
-    sys_status,
     system_time,
 )
 from sim.firmware.numbers import truncated_16
@@ -39,6 +38,19 @@ def heartbeat(double: PX4Board, loop_s: float) -> Message:
         state = mavlink.MAV_STATE_STANDBY
     kind = mavlink.MAV_TYPE_QUADROTOR if double.vehicle == "copter" else mavlink.MAV_TYPE_FIXED_WING
     return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_PX4, base, _HOLD_MODE, state, 3)
+
+
+_SENSORS = {"Gyro": 1, "Accel": 2, "Compass": 4}
+"""Bits of SYS_STATUS that a failed check clears, by a word of its text."""
+
+
+def px4_sys_status(double: PX4Board, loop_s: float) -> Message:
+    """Build SYS_STATUS: each failed check also clears its sensor's bit; the checks' bit is in the health alone."""
+    failures, checks = double.prearm_failures(loop_s), mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    sensors = 3 | (mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if double.has_compass else 0)
+    bad = sum(bit for word, bit in _SENSORS.items() if any(word in failure for failure in failures))
+    health = sensors & ~bad | (0 if failures else checks)
+    return mavlink.MAVLink_sys_status_message(sensors, sensors, health, 180, 12600, -1, -1, 0, 0, 0, 0, 0, 0)
 
 
 def highres_imu(double: PX4Board, loop_s: float) -> Message:
@@ -128,7 +140,7 @@ def autopilot_version(double: PX4Board, loop_s: float) -> Message:
 
 BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: px4_sys_status,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda double, loop_s: scaled_imu(double, loop_s, 0),

@@ -262,6 +262,7 @@ class ArduPilot(Firmware):
 
     # --- compasses
 
+    sensor_switches = {"gyro": "INS_USE{0}", "accel": "INS_USE{0}", "compass": "COMPASS_USE{0}"}
     compass_messages = {
         1: mavlink.MAVLink_raw_imu_message,
         2: mavlink.MAVLink_scaled_imu2_message,

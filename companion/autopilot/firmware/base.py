@@ -79,6 +79,8 @@ class Firmware:
         """Plan the changes that write curves of bias over temperature; the IMU's output at `degc` stays unchanged."""
         raise AutopilotError(self.why_no_thermal_write or message("firmware_not_supported", what="curves"))
 
+    sensor_switches: Mapping[str, str] = {}  # parameters that are 0 if a sensor is not used; {}: its number, and from 0
+    checks_in_health_alone = False  # SYS_STATUS shows the checks before arming in its health bits alone
     compass_messages: Mapping[int, type[Message]] = {}  # by compass (from 1), in milligauss
     compass_rival: type[Message] | None = None  # sent on request while the firmware itself calibrates a compass
     raw_fields: bool = False  # True: `compass_messages` carry raw fields, in the axes of the sensors

@@ -200,6 +200,8 @@ class PX4(Firmware):
 
     # --- compasses
 
+    sensor_switches = {"gyro": "CAL_GYRO{1}_PRIO", "accel": "CAL_ACC{1}_PRIO", "compass": "CAL_MAG{1}_PRIO"}
+    checks_in_health_alone = True
     compass_messages = {
         1: mavlink.MAVLink_scaled_imu_message,
         2: mavlink.MAVLink_scaled_imu2_message,

@@ -131,7 +131,7 @@ class Calibrating(Subsystem):
         }
 
     async def _calibrate(self, asked: Calibrate, face: str) -> AsyncIterator[Object]:
-        job = _accepted(
+        job = accepted(
             self.manager.start_calibration(asked.biases, f"{face} calibrate", asked.timeout_s, reboot=asked.reboot)
         )
         if not asked.wait:
@@ -152,7 +152,7 @@ class Calibrating(Subsystem):
             missing = self._why_not_written(write=True) or self._core.vehicle.kind.why_no_thermal_write
             job = Job(TEMPERATURE, What.GYROS, f"{face} temperature", ALIGN_TIMEOUT_S)
             started = self.manager.start_job(job, partial(self._write_curves, overwrite=asked.overwrite), missing)
-            async for reply in self._to_end(_accepted(started), "written"):
+            async for reply in self.to_end(accepted(started), "written"):
                 yield reply
         else:
             yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
@@ -166,7 +166,7 @@ class Calibrating(Subsystem):
 
     async def _undo(self, asked: Undo, face: str) -> AsyncIterator[Object]:
         await self._hear()
-        job = _accepted(self.manager.start_undo(f"{face} undo", force=asked.force))
+        job = accepted(self.manager.start_undo(f"{face} undo", force=asked.force))
         result = await asyncio.shield(job.finished)
         yield {
             "kind": "result",
@@ -191,11 +191,11 @@ class Calibrating(Subsystem):
             words = "the configuration's zero and sigma are active" if was else "there was no alignment to forget"
             yield {"kind": "result", "state": "done", "reason": words}
         else:
-            job = _accepted(self.start_alignment(asked, f"{face} align"))
+            job = accepted(self.start_alignment(asked, f"{face} align"))
             if not asked.wait:
                 yield {"kind": "result", "state": self.manager.state.shown, "reason": f"{job.kind} started"}
                 return
-            async for reply in self._to_end(job, "alignment"):
+            async for reply in self.to_end(job, "alignment"):
                 yield reply
 
     def _shown(self) -> Object:
@@ -273,7 +273,7 @@ class Calibrating(Subsystem):
             return "nothing is written while push.parameters is false"
         return None
 
-    async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
+    async def to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
         async for reply in self._progress(job):
             yield reply
         result, made = job.finished.result(), msgspec.to_builtins(job.product)
@@ -368,7 +368,7 @@ class Calibrating(Subsystem):
         return bool(found) and all(after is not None and same_float32(after, now) for after, now in found)
 
 
-def _accepted(answer: Job | Refusal) -> Job:
+def accepted(answer: Job | Refusal) -> Job:
     if isinstance(answer, Refusal):
         raise RequestRefusedError(answer.kind, answer.reason)
     return answer

@@ -13,11 +13,12 @@ from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.subsystem import Heading
+from companion.daemon.interfaces.diagnosis import Diagnosis
 from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.estimation.machine import State
 from companion.formats import Object
-from companion.messages import message
+from companion.messages import explain, message
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
@@ -29,21 +30,31 @@ Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, 
 class Headlines:
     """Composes the headline that all interfaces show."""
 
-    def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading) -> None:
+    def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading, diagnosis: Diagnosis) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
         self._devices, self._heading, self._warm_up = devices, heading, arming.warm_up
+        self._diagnosis = diagnosis
 
     def now(self) -> Object:
         word, reason, tone = self._now()
-        if (left := self._warm_up.words()) is not None and word.startswith(("HOLD STILL", "NOT ", "WAIT")):
-            reason = f"{reason}; {left}"
+        remedy = None
+        first = next((each for each in self._diagnosis.findings if each["remedy"]), None)
+        # A reason against arming that passes by itself hides no other fault.
+        if first is not None and (word == "READY" or (word in ("NOT CALIBRATED", "NOT READY") and not first["waits"])):
+            word, reason, tone = "WILL NOT ARM", first["line"], "wait" if first["waits"] else "bad"
+            remedy = first["remedy"]
         good = tone == "good"
         devices = self._devices
         concern = devices.watch.implausible() or devices.signing.warning or self._heading.concern
         if concern is not None and (good or word == ARMED):
             reason, tone = f"{concern}; {reason}", "wait" if good else tone
-        return {"word": word, "reason": reason, "tone": tone}
+        if remedy is None:
+            explained = explain(reason) if tone in ("bad", "wait") else None
+            remedy = "" if explained is None else explained[1].remedy
+        if (left := self._warm_up.words()) is not None and word.startswith(("HOLD STILL", "NOT ", "WAIT")):
+            reason = f"{reason}; {left}"
+        return {"word": word, "reason": reason, "tone": tone, "remedy": remedy}
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()

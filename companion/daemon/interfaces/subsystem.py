@@ -25,6 +25,7 @@ from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, RuntimeSettings, Subsystem, Task, joined
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.subsystem import Heading
+from companion.daemon.interfaces.diagnosis import Diagnosis
 from companion.daemon.interfaces.headline import Headlines
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
@@ -80,11 +81,13 @@ class Interfaces(Subsystem):
             Senders(core.config.mavlink.allow),
         )
         calibrating.manager.on_ended.add(self._show_result)
-        self._headlines = Headlines(core, devices, arming, heading)
+        self.diagnosis = Diagnosis(core, devices, offsets, calibrating, heading.pose)
+        self._headlines = Headlines(core, devices, arming, heading, self.diagnosis)
         self._pose, self._readiness = heading.pose, arming.readiness
         self._manager = calibrating.manager
         self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
+        self._handlers["fix"] = self.diagnosis.answer_fix
         for subsystem in self._subsystems:
             self._handlers |= subsystem.commands()
         self._start_child = child
@@ -166,6 +169,7 @@ class Interfaces(Subsystem):
     def status(self) -> Object:
         return {
             "headline": self._headlines.now(),
+            "diagnosis": self.diagnosis.findings,
             "vehicle": self._vehicle(),
             **self._mqtt_status(),
             "page": None if self.page is None else _NO_PAGE | self.page.status(),
@@ -213,7 +217,7 @@ class Interfaces(Subsystem):
             await asyncio.sleep(POSE_EVERY_S)
 
     def tasks(self) -> Sequence[Task]:
-        tasks: list[Task] = [("component", self.component.run)]
+        tasks: list[Task] = [("component", self.component.run), ("diagnosis", self.diagnosis.run)]
         if self.mqtt is not None:
             tasks.append(("mqtt", self.mqtt.run))
         if self.page is not None and self._core.only_listening is None:

@@ -17,6 +17,7 @@ from typing import Final
 from companion.autopilot.firmware.imu_calibration import hover_bias_changes
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError, same_float32
 from companion.autopilot.parameters.verify import EffectVerdict
+from companion.autopilot.vehicle import gyro_calibration
 from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
@@ -43,7 +44,7 @@ from companion.errors import (
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import WrittenParameter
-from companion.formats import Object
+from companion.formats import Object, utc_now
 from companion.messages import message
 from companion.storage.changes import ChangeLog, ChangeSet, Origin
 
@@ -237,6 +238,26 @@ class Offsets(Subsystem):
             more = hover_bias_changes(target.calibration, target.changes, learned)
             targets.append(dataclasses.replace(target, changes=(*target.changes, *more)))
         return dataclasses.replace(plan, targets=tuple(targets))
+
+    async def calibrate_by_firmware(self, job: Job) -> str:
+        """Let ArduPilot calibrate its gyros itself, as a write that can be undone: it accepts a bias of any size."""
+        parameters, origin, system_id = self._core.parameters, Origin(job.short, utc_now()), self._vehicle.system_id
+        before = await gyro_calibration.read_overwritten(parameters)
+        self._machine.on(Event.STILL)
+        self._machine.on(Event.ENOUGH)
+        await self.begin(job, len(before))
+        async with self.journal.transaction(ChangeSet.of(system_id, (), before, origin)):
+            with changing(self._imus.values()):
+                go_on = job.going_on(MEASURED_PERCENT)
+                outcome, words, after = await gyro_calibration.calibrate(parameters, before, go_on)
+            self._machine.on(Event.WRITTEN)
+            if outcome != "reset":
+                raise AutopilotError(words)  # `Recovery` restores the old values
+            made = [Change(name, *values) for name, values in gyro_calibration.changed(before, after).items()]
+            await self.journal.done(ChangeSet.of(system_id, made, origin=origin))
+        self._machine.on(Event.VERIFIED)
+        self._machine.on(Event.CONCLUDED)
+        return message("fix_done")
 
     async def _problems(self, plan: Plan, before: Window, log: WriteLog, go_on: GoOn) -> list[str]:
         verdicts, unseen = await verify_effect(self._core, self._px4, plan, before, go_on, plan.boots)

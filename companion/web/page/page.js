@@ -51,8 +51,8 @@ function headline(tone, word, text) {
 }
 function show(status) {
   headline(status.headline.tone, status.headline.word, status.headline.reason);
-  $("remedy").hidden = !status.remedy;
-  $("remedy").textContent = inPageWords(status.remedy || "");
+  $("remedy").hidden = !status.headline.remedy;
+  $("remedy").textContent = inPageWords(status.headline.remedy || "");
   firstRun(status.setup || null);
   if (status.setup) return;
   $("vehicle").textContent = status.vehicle.summary;

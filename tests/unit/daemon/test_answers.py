@@ -58,7 +58,7 @@ def test_every_command_of_the_table_is_answered_and_no_other(tmp_path: Path) -> 
         running = service(tmp_path)
         subsystems = (running.calibrating, running.arming, running.heading, running.recorder)
         handled = {name for subsystem in subsystems for name in subsystem.commands()}
-        assert handled | {"status", "monitor"} == ALL.keys() - {"answer"}
+        assert handled | {"status", "monitor", "fix"} == ALL.keys() - {"answer"}
 
     asyncio.run(main())
 
@@ -67,6 +67,6 @@ def test_pages_and_brokers_may_not_ask_for_everything() -> None:
     """The rights of a client that is not at the companion's own terminal: docs/security.md."""
     by = {each: {name for name, kind in ALL.items() if each in kind.by} for each in Interface}
     assert by[Interface.MQTT] == {"calibrate", "cancel", "undo"}
-    assert by[Interface.PAGE] == {"calibrate", "align", "cancel", "undo", "answer"}
+    assert by[Interface.PAGE] == {"calibrate", "align", "fix", "cancel", "undo", "answer"}
     assert set(ALL["calibrate"].fields(Interface.PAGE)) == {"what"}
     assert set(ALL["align"].fields(Interface.PAGE)) == {"action", "headings", "heading", "sides", "write", "level"}

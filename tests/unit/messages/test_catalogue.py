@@ -38,6 +38,7 @@ NOT_MESSAGES = {
     "there is no IMU of the autopilot: none is configured", "the configuration's zero and sigma are active",
     "there was no alignment to forget", "the companion ends", "starts with companion run", "nose up", "nose down",
     "left side down", "right side down", "… (after … more like this, left out)", "TURN IT", "PUT IT DOWN", "HOLD STILL",
+    ": type companion fix",
     "the board would sit more than 10 deg askew: no level is for that", "learned from … h at rest in …, saved …",
 }  # fmt: skip
 
