@@ -17,6 +17,7 @@ import pytest
 
 from companion.estimation.records.record import Record, from_json
 from companion.storage.records import RecordStore
+from sim.ardupilot.double import ArduPilotDouble
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_commands import (
     DONE,
@@ -284,5 +285,31 @@ def test_without_a_page_there_is_no_token_and_the_board_itself_needs_none(tmp_pa
             "http://127.0.0.1:8191/ needs no token: only this board can reach it\n",
         )
         assert not (tmp_path / "web-token").exists()
+
+    asyncio.run(main())
+
+
+def test_the_reasons_against_arming_come_first_and_fix_mends_one(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with scene(tmp_path, "127.0.0.1:0", PHONE) as here:
+            tab, autopilot = here.tab, here.line.scenario.autopilot
+            assert isinstance(autopilot, ArduPilotDouble)
+            real = autopilot.prearm_failures
+            reasons = ["heater temp low (21.5 < 45)"]
+            autopilot.prearm_failures = lambda loop_s: [*real(loop_s), *reasons]  # type: ignore[method-assign]
+            here.line.scenario.flight_controller_imus[0].turn_on((0.0, 0.0, math.radians(6.5)), (0.0, 0.0, 0.0))
+            autopilot.repeats_failures = True
+            await tab.until(f"{WORD} === 'WILL NOT ARM'", 20.0)
+            reason = "document.querySelector('#reason').textContent"
+            assert "IMU 1 z is" in await tab.until(f"{reason}.includes('IMU 1') && {reason}", 20.0)
+            assert "heater" in await tab.value("document.querySelector('#refusals').textContent")
+            assert "hold FIX" in await tab.value("document.querySelector('#remedy').textContent")
+            assert await pixels_needed(tab) == 0
+            box = "document.querySelector('#fix small').getBoundingClientRect()"
+            assert await tab.value(f"{box}.left >= 0 && {box}.right <= innerWidth")
+            await tab.touch("#fix")
+            refusals = "document.querySelector('#refusals').textContent"
+            await tab.until(f"document.querySelector('#fix').hidden && !{refusals}.includes('Gyros')", 30.0)
+            await tab.lift()
 
     asyncio.run(main())

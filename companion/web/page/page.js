@@ -81,6 +81,7 @@ function show(status) {
   $("last").hidden = !missed;
   if (missed) $("last").textContent = "the last one: " + inPageWords(last.reason.startsWith(last.state) ? last.reason : `${last.state}: ${last.reason}`);
   links(status);
+  diagnosis(status.diagnosis, status.headline.reason, busy || away);
   byHand(status.by_hand, status.undoable);
   aloud(status);
   stands(status.stands, status);
@@ -194,9 +195,20 @@ function link(good, name, words, remedy) {
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
+const FIXES = {gyros: "calibrates the gyros", accelerometers: "calibrates the accelerometers", 
+  "autopilot gyro calibration": "the autopilot calibrates its gyros"};
+// Reasons of the autopilot against arming; the headline shows the first one.
+function diagnosis(found, shown, held) {
+  const fix = found.find(one => one.fix);
+  $("diagnosis").hidden = !found.some(one => one.line !== shown) && !fix;
+  $("refusals").replaceChildren(...found.filter(({line}) => line !== shown).map(one => link(false, "will not arm:", one.line, one.remedy)));
+  $("fix").hidden = !fix;
+  $("fix").disabled = held;
+  if (fix) $("fixes").textContent = `hold 1.5 s; ${FIXES[fix.fix] || fix.fix}`;
+}
 // The daemon composes these rows; the command line shows the same ones.
 function links(status) {
-  $("links").replaceChildren(...status.rows.map(([verdict, name, words, remedy]) => link(verdict === "ok", name, words, remedy)));
+  $("links").replaceChildren(...status.rows.filter(([, name]) => name !== "will not arm").map(([verdict, name, words, remedy]) => link(verdict === "ok", name, words, remedy)));
 }
 async function records() {
   let found;
@@ -282,7 +294,7 @@ function watch() {
   else headline("gone", "NO LINK", refused || (heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
     : "no word from the companion yet"));
   $("progress").hidden = true;
-  for (const button of document.querySelectorAll("#keys button, #align button")) button.disabled = true;
+  for (const button of document.querySelectorAll("#keys button, #align button, #fix")) button.disabled = true;
   if (source && now - triedAt > (heardAt ? 2 : 5) * GONE_MS) listen();
 }
 setInterval(watch, 500);
