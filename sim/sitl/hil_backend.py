@@ -155,6 +155,7 @@ class HilBackend:
         self.blocks = SampleBlocks(aircraft, [first, *imus[1:]])
         self._wanted_port = port
         self.compass = SimCompass()
+        self.gnss = True
         self._random = np.random.default_rng([seed, 7])
         self._server: asyncio.Server | None = None
         self._driving: asyncio.Task[None] | None = None
@@ -260,7 +261,7 @@ class HilBackend:
         data = codec.sensor(time_us, 0, on_fifo_grid(sample.readings[0]), magnetic_gauss=magnetic, barometer=barometer)
         for other, reading in enumerate(sample.readings[1:], 1):
             data += codec.sensor(time_us, other, reading)
-        if number % GPS_EVERY == 0:
+        if self.gnss and number % GPS_EVERY == 0:
             data += self._gps(codec, sample.t_s)
         return data
 
