@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from companion.formats import Object
-from companion.summary import headline, remedy, rows
+from companion.summary import headline, rows
 
 
 def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() -> None:
@@ -27,11 +27,6 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
         "warnings": ["the compass wanders"],
     }
     assert headline(status) == "READY: calibrated 5 s ago"
-    assert remedy(status) == ""
-    gone = {"word": "NO AUTOPILOT", "reason": "no heartbeat for 7 s: power? cable?", "tone": "bad"}
-    assert "power" in remedy({**status, "headline": gone})
-    silent = {**gone, "reason": f"no data from imu fc yet; {status['arming']['warm_up']['words']}"}
-    assert remedy({**status, "headline": silent}) == "Check power, plug and wires."
     assert [row[:3] for row in rows(status)] == [
         ("wrong", "autopilot", "ArduPilot, disarmed"),
         ("ok", "imu", "200 Hz; bad frames: 4; reconnected: 2"),
