@@ -98,17 +98,13 @@ class OwnParameters:
             mavlink.MAVLink_param_value_message(name.encode("ascii"), self._values[name], _REAL32, count, index)
         )
 
-    def _addressed(self, message: Any) -> bool:
-        target = self._link.system_id, self._link.component_id
-        return message.target_system in (0, target[0]) and message.target_component in (0, target[1])
-
     def _on_request_list(self, message: mavlink.MAVLink_param_request_list_message, _t_s: float) -> None:
-        if self._addressed(message):
+        if self._link.is_for_us(message):
             for name in self._names:
                 self._request(name)
 
     def _on_request_read(self, message: mavlink.MAVLink_param_request_read_message, _t_s: float) -> None:
-        if not self._addressed(message):
+        if not self._link.is_for_us(message):
             return
         index = message.param_index
         name = message.param_id if index < 0 else next(iter(self._names[index : index + 1]), "")
@@ -118,7 +114,7 @@ class OwnParameters:
             self._send_unknown(message, message.param_index)
 
     def _on_set(self, message: mavlink.MAVLink_param_set_message, _t_s: float) -> None:
-        if not self._addressed(message):
+        if not self._link.is_for_us(message):
             return
         parameter = self._by_name.get(message.param_id)
         if parameter is None:

@@ -163,10 +163,6 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
     )
 
 
-def longest_window_s(config: Config) -> float:
-    return config.calibration.max_s if config.vehicle.platform == "ground" else KEPT_S
-
-
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
     """Return the place (the configured one, otherwise the autopilot's) and the date.
 
@@ -302,7 +298,8 @@ def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
 
     The sigma covers noise and the drift in the 180 s after the window, but not warm-up or the rounding of telemetry.
     """
-    mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
+    mean_s = config.calibration.max_s if config.vehicle.platform == "ground" else KEPT_S
+    horizon_s = settings(config).horizon_s
     known = {name: one.gyro for name, one in PROFILES.items() if one.is_named}
     return {name: predicted_sigma(gyro, mean_s, horizon_s) / DEG_H for name, gyro in known.items()}
 

@@ -141,22 +141,6 @@ def _calibration(told: _Object) -> Rows:
     return {"calibrations": [_row(schema.calibrations, found)], "biases": biases}
 
 
-def _arming(told: _Object) -> Rows:
-    return {"armings": [_row(schema.armings, told | {"calibration_at": told.get("calibration")})]}
-
-
-def _undo(told: _Object) -> Rows:
-    return {"undos": [_row(schema.undos, told | {"of_at": told.get("of")})]}
-
-
-def _alignment(told: _Object) -> Rows:
-    return {"alignments": [_row(schema.alignments, told)]}
-
-
-def _event(told: _Object) -> Rows:
-    return {"events": [_row(schema.events, {"what": told.get("what"), "body": msgspec.json.encode(told).decode()})]}
-
-
 def _flight(told: _Object) -> Rows:
     flight = msgspec.convert(told, KeptFlight).flight
     rows: list[Row] = []
@@ -184,10 +168,12 @@ def _flight(told: _Object) -> Rows:
 
 KINDS: Final[dict[str, Callable[[_Object], Rows]]] = {
     "calibration": _calibration,
-    "arming": _arming,
-    "undo": _undo,
-    "alignment": _alignment,
-    "event": _event,
+    "arming": lambda told: {"armings": [_row(schema.armings, told | {"calibration_at": told.get("calibration")})]},
+    "undo": lambda told: {"undos": [_row(schema.undos, told | {"of_at": told.get("of")})]},
+    "alignment": lambda told: {"alignments": [_row(schema.alignments, told)]},
+    "event": lambda told: {
+        "events": [_row(schema.events, {"what": told.get("what"), "body": msgspec.json.encode(told).decode()})]
+    },
     "profile": lambda _: {},
     "curve": lambda _: {},
     "flight": _flight,

@@ -90,7 +90,7 @@ class Broker:
             except aiomqtt.MqttError as error:
                 before, self.protocol = self.protocol, MQTT_5
                 # A broker without MQTT 5 refuses it, is silent, or closes the connection.
-                if before != MQTT_5 or not is_of_protocol(error):
+                if before != MQTT_5 or not (_reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)):
                     raise
                 self.protocol = MQTT_3_1_1
 
@@ -221,10 +221,6 @@ def causes(error: BaseException) -> list[BaseException]:
 def _reason_code(error: BaseException) -> int | None:
     codes = (getattr(cause, "rc", None) for cause in causes(error))
     return next((int(getattr(code, "value", code)) for code in codes if code is not None), None)
-
-
-def is_of_protocol(error: BaseException) -> bool:
-    return _reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
 
 
 def _is_unanswered(error: BaseException) -> bool:

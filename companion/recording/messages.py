@@ -108,7 +108,7 @@ def decode(topic: str, data: bytes) -> Any:
     if len(data) > MOST_BYTES:
         raise ValueError(f"found {len(data)} bytes; allowed: {MOST_BYTES}")
     kind = ImuState if topic.startswith(IMU) else _TYPES[topic]
-    return msgspec.msgpack.decode(data, type=kind, dec_hook=_array)
+    return msgspec.msgpack.decode(data, type=kind, dec_hook=lambda _kind, plain: np.array(plain, dtype=np.float64))
 
 
 def _plain(value: Any) -> Any:
@@ -117,10 +117,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a {type(value).__name__} is not known to recordings")
-
-
-def _array(_kind: Any, plain: Any) -> Any:
-    return np.array(plain, dtype=np.float64)
 
 
 MOST_MESSAGES: Final = 12_000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -117,18 +116,13 @@ def seconds_of(moment: datetime.datetime) -> float | None:
     return seconds if 0.0 <= seconds < _LATEST_S else None
 
 
-def clock_is_sound(points: Sequence[PlotPoint]) -> bool:
-    """Return True if all times are known and ascend: without a battery the clock restarts in the past at each boot."""
-    known = [point.unix_s for point in points]
-    return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
-
-
 def drift(points: Sequence[PlotPoint], triad: Triad, *, name: str, this: int | None = None) -> Markup:
     unit, unit_name, _ = UNITS[triad]
-    times = [point.unix_s for point in points]
-    dated = [each for each in times if each is not None] if clock_is_sound(points) else []
+    times = [point.unix_s for point in points if point.unix_s is not None]
+    # Without a battery the clock restarts in the past at each boot.
+    dated = len(times) == len(points) > 0 and times == sorted(times)
     if dated:
-        across, label = dates(dated), "time (UTC), in their order"
+        across, label = dates(times), "time (UTC), in their order"
     else:
         across = in_order([str(point.number) for point in points])
         label = "number of the calibration (clock not sound)"

@@ -71,15 +71,12 @@ async def _run_udp(
 ) -> None:
     reconnection = Reconnection("mavlink", worth_s=_TURN_S, on_state=on_state)
 
-    def factory() -> _Udp:
-        return _Listener(link) if listen else _Speaker(link)
-
     async def once() -> str:
         link.turn()
-        end = {"local_addr": address} if listen else {"remote_addr": address}
+        kind, end = (_Listener, {"local_addr": address}) if listen else (_Speaker, {"remote_addr": address})
         try:
             async with asyncio.timeout(RESOLVE_DEADLINE_S):
-                transport, udp = await asyncio.get_running_loop().create_datagram_endpoint(factory, **end)  # type: ignore[arg-type]
+                transport, udp = await asyncio.get_running_loop().create_datagram_endpoint(lambda: kind(link), **end)  # type: ignore[arg-type]
         except TimeoutError:
             return message("no_connection", url=url, reason=f"host name unknown after {RESOLVE_DEADLINE_S:g} s")
         except (OSError, UnicodeError) as error:

@@ -28,11 +28,7 @@ ECHO: Final = "echo of a command"  # own command, or one of another master, on a
 
 
 class RejectedError(Exception):
-    """Error of an unusable frame. Decoders always catch this error and count its reason in `Decoder.rejected`."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = reason
+    """Error of an unusable frame. Decoders always catch this error and count its text in `Decoder.rejected`."""
 
 
 class Decoder(ABC):
@@ -122,12 +118,12 @@ class Decoder(ABC):
         except IndexError:
             return WAIT
         except RejectedError as error:
-            self.rejected[error.reason] += 1
+            self.rejected[str(error)] += 1
             return 1
         try:
             found = self._decode(frame, self._time_of(self._origin + end))
         except RejectedError as error:
-            self.rejected[error.reason] += 1
+            self.rejected[str(error)] += 1
             return size
         if found:
             samples += found

@@ -180,7 +180,7 @@ class Stim300Decoder(Decoder):
                 samples.append(self._tilt(places, values, t_s))
             except RejectedError as error:
                 if samples:
-                    self.rejected[error.reason] += 1
+                    self.rejected[str(error)] += 1
                 refused = refused or error
         if not samples:
             raise refused or RejectedError("nothing of use")
