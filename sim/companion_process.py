@@ -55,7 +55,6 @@ class CompanionProcess:
         self._process: asyncio.subprocess.Process | None = None
 
     def command(self, *words: str) -> list[str]:
-        """Return a command line of the companion with this configuration."""
         return [sys.executable, *self._entry, "-c", str(self.folder / "companion.toml"), *words]
 
     def log(self) -> str:

@@ -151,7 +151,6 @@ class Hands:
         return t_s + self._takes_s
 
     def obey(self, line: str, t_s: float) -> str:
-        """Obey one typed line; return the answer."""
         word, *rest = line.split() or [""]
         moves: dict[str, tuple[int, Callable[..., object]]] = {
             "turn": (1, self.turn),

@@ -80,7 +80,8 @@ M = TypeVar("M", bound=mavlink.MAVLink_message)
 class Station:
     """An `End` that sends given messages and keeps every received one with its time, without retries."""
 
-    def __init__(self, system_id: int = 255, component_id: int = 190) -> None:
+    def __init__(self, system_id: int = 255, component_id: int = 190, vehicle: int = 1) -> None:
+        self.vehicle = vehicle  # System id of the autopilot
         self.heard: list[tuple[float, mavlink.MAVLink_message]] = []
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
@@ -117,12 +118,14 @@ class Station:
             mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
         )
 
-    async def command(self, number: int, *params: float, target: tuple[int, int] = (1, 1), wait_s: float = 2.0) -> int:
-        """Send COMMAND_LONG and return the first result; -1: no result came in time."""
+    async def command(
+        self, number: int, *params: float, target: tuple[int, int] | None = None, wait_s: float = 2.0
+    ) -> int:
+        """Send COMMAND_LONG, without a target to the autopilot; return the first result, -1: none came in time."""
         loop = asyncio.get_running_loop()
         begun = len(self.heard)
         seven = [*params, *[0.0] * (7 - len(params))]
-        self.send(mavlink.MAVLink_command_long_message(*target, number, 0, *seven))
+        self.send(mavlink.MAVLink_command_long_message(*(target or (self.vehicle, 1)), number, 0, *seven))
         until_s = loop.time() + wait_s
         while loop.time() < until_s:
             for _, message in self.heard[begun:]:

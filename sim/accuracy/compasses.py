@@ -116,7 +116,6 @@ def _errors(
 
 
 def section(runs: list[CompassRun]) -> Section:
-    """Return the table and the claims."""
     iron = f"{1e3 * HARD_GAUSS:.0f} mG of hard and {100.0 * SOFT:.0f} % of soft iron"
     lines = [
         f"{len(runs)} boards with {iron}: heading error all round, rms and sigma",

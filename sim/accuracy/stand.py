@@ -112,7 +112,6 @@ class Stand:
 
     @property
     def heading_deg(self) -> float:
-        """True heading of the aircraft."""
         return self.imu.aircraft.pose.heading_deg
 
     def in_vehicle(self, rows: Array) -> Array:

@@ -77,8 +77,6 @@ class TurningCase:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Result of one stand."""
-
     looks: int
     """Number of times at which a calibration was possible early enough."""
     refused: int

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.inertial import AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
-from sim.ardupilot.messages import BUILDERS, autopilot_version
+from sim.ardupilot.messages import BUILDERS, version_message
 from sim.ardupilot.parameters import Version, compass_names, since
 from sim.earth import body_from_ned
 from sim.firmware.channel import Command
@@ -47,7 +47,6 @@ class CommandServer:
         }
 
     def handle(self, command: Command) -> None:
-        """Carry out a command and acknowledge it."""
         handler = self._handlers.get(command.number)
         result = UNSUPPORTED if handler is None else handler(command)
         if result is not None:
@@ -105,7 +104,7 @@ class CommandServer:
     def _request_capabilities(self, command: Command) -> int:
         if command.params[0] != 1.0:
             return FAILED
-        self._double.answer(command.channel, autopilot_version(self._double, command.loop_s))
+        self._double.answer(command.channel, version_message(self._double, command.loop_s))
         return ACCEPTED
 
     def _reboot(self, command: Command) -> int:

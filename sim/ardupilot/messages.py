@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -11,17 +9,14 @@ from sim.ardupilot.board import ArduPilotBoard
 from sim.ardupilot.parameters import COMPASS_SLOTS, NEWEST
 from sim.firmware.messages import (
     SCALED_IMU,
-    global_position_int,
-    gps_raw_int,
+    Builder,
+    Message,
+    autopilot_version,
+    common_builders,
     in_integers,
     pressure_hpa,
-    sys_status,
-    system_time,
 )
 from sim.firmware.numbers import truncated_16
-
-Message = mavlink.MAVLink_message
-Builder = Callable[["ArduPilotBoard", float], Message | None]
 
 
 def heartbeat(double: ArduPilotBoard, loop_s: float) -> Message:
@@ -109,20 +104,10 @@ def vfr_hud(double: ArduPilotBoard, loop_s: float) -> Message:
     return mavlink.MAVLink_vfr_hud_message(double.airspeed_m_s, 0.0, heading, 0, double.aircraft.site.height_m, 0.0)
 
 
-def autopilot_version(double: ArduPilotBoard, loop_s: float) -> Message:
+def version_message(double: ArduPilotBoard, loop_s: float) -> Message:
     """Build AUTOPILOT_VERSION with the capability PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
-    capabilities = (
-        mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    )
-    major, minor = (int(part) for part in double.version.split("."))
-    software = major << 24 | minor << 16 | (0 if double.version == NEWEST else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL)
-    nothing = [0] * 8
-    return mavlink.MAVLink_autopilot_version_message(
-        capabilities, software, 0, 0, 0, nothing, nothing, nothing, 0x1209, 0x5740, 0, list(double.uid2)
-    )
+    kind = 0 if double.version == NEWEST else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+    return autopilot_version(double.uid2, double.version, kind, (0x1209, 0x5740))
 
 
 def script_floats(double: ArduPilotBoard, loop_s: float) -> Message:
@@ -143,18 +128,12 @@ def mag_cal_progress(double: ArduPilotBoard, _loop_s: float) -> Message | None:
 
 
 BUILDERS: dict[int, Builder] = {
+    **common_builders(scaled_imu),
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda double, loop_s: scaled_imu(double, loop_s, 0),
     mavlink.MAVLINK_MSG_ID_RAW_IMU: raw_imu,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: attitude,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: lambda double, loop_s: scaled_imu(double, loop_s, 1),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU3: lambda double, loop_s: scaled_imu(double, loop_s, 2),
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: version_message,
     mavlink.MAVLINK_MSG_ID_AHRS: ahrs,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status_report,
     mavlink.MAVLINK_MSG_ID_VFR_HUD: vfr_hud,

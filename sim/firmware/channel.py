@@ -112,7 +112,6 @@ class Channel(abc.ABC):
         """Return the ids of messages that are due."""
 
     def next_due_s(self) -> float | None:
-        """Return the time of the next stream message, or None."""
         return min((stream.next_s for stream in self.streams.values()), default=None)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from sim.firmware.double import AutopilotDouble
 
 Message = mavlink.MAVLink_message
+Builder = Callable[[Any, float], Message | None]
+"""Makes a message of a double at a time of the loop; None: there is none."""
 SCALED_IMU = (
     mavlink.MAVLink_scaled_imu_message,
     mavlink.MAVLink_scaled_imu2_message,
@@ -67,3 +70,30 @@ def sys_status(double: AutopilotDouble, loop_s: float) -> Message:
     )
     health = sensors if not double.prearm_failures(loop_s) else sensors & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
     return mavlink.MAVLink_sys_status_message(sensors, sensors, health, 180, 12600, -1, -1, 0, 0, 0, 0, 0, 0)
+
+
+def autopilot_version(
+    uid2: bytes, version: str, kind: int, board: tuple[int, int], capabilities: int = 0, *, middleware: bool = False
+) -> Message:
+    """Build AUTOPILOT_VERSION; `kind`: FIRMWARE_VERSION_TYPE, `board`: vendor and product, `capabilities`: own ones."""
+    major, minor = (int(part) for part in version.split("."))
+    software = major << 24 | minor << 16 | kind
+    capabilities |= mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    capabilities |= mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    nothing = [0] * 8
+    return mavlink.MAVLink_autopilot_version_message(
+        capabilities, software, software * middleware, 0, 0, nothing, nothing, nothing, *board, 0, list(uid2)
+    )
+
+
+def common_builders(scaled_imu: Callable[[Any, float, int], Message | None]) -> dict[int, Builder]:
+    """Return the builders of both firmwares; `scaled_imu` makes SCALED_IMU, 2 or 3 by its index."""
+    return {
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
+        mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda double, loop_s: scaled_imu(double, loop_s, 0),
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU2: lambda double, loop_s: scaled_imu(double, loop_s, 1),
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU3: lambda double, loop_s: scaled_imu(double, loop_s, 2),
+    }

@@ -93,7 +93,6 @@ class Aircraft:
         return sequence
 
     def arm(self, at: datetime.datetime) -> int:
-        """Arm with the active calibration."""
         known = self._calibration is not None
         arming = ArmingRecord(
             armed_at=_iso(at),
@@ -109,7 +108,6 @@ class Aircraft:
         return self.tell("arming", at, arming)
 
     def undo(self, at: datetime.datetime) -> int:
-        """Undo the active calibration."""
         of, self._calibration = self._calibration, None
         return self.tell("undo", at, {"what": "calibration", "of": of, "undone_at": _iso(at)})
 

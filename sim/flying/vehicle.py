@@ -227,7 +227,6 @@ class FlyingVehicle(FirmwareVehicle):
         await self.until_mode(ground, name)
 
     async def until_mode(self, ground: GroundStation, name: str) -> None:
-        """Wait until the vehicle reports a mode."""
         since_s = asyncio.get_running_loop().time()
         await ground.wait_for(
             lambda: any(beat.custom_mode == self.modes[name] for beat in ground.vehicle_heartbeats(since_s)),

@@ -31,8 +31,6 @@ HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'other set':>13}{'off 
 
 
 class Event(NamedTuple):
-    """An event that the firmware reported."""
-
     own_s: float
     kind: Literal["mode", "set", "disarmed", "text"]
     words: str
@@ -57,7 +55,6 @@ class Record:
     """Target circle, if the aircraft does not hold its spot: centre north and east, and radius, in m."""
 
     def after(self, kind: str) -> list[Event]:
-        """Return the events of a kind after the fault."""
         return [event for event in self.events if event.kind == kind and event.own_s >= self.struck_s]
 
 

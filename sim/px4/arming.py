@@ -28,8 +28,6 @@ _BIAS_ALARM = 0.75
 
 
 class Checks:
-    """The checks before arming."""
-
     def __init__(self, double: PX4Board) -> None:
         self._double = double
         self._reported: list[str] = []

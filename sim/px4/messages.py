@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.messages import (
     SCALED_IMU,
-    global_position_int,
-    gps_raw_int,
+    Builder,
+    Message,
+    autopilot_version,
+    common_builders,
     in_integers,
     pressure_hpa,
-    system_time,
 )
 from sim.firmware.numbers import truncated_16
 from sim.px4.board import PX4Board
 
-Message = mavlink.MAVLink_message
-Builder = Callable[["PX4Board", float], Message | None]
 _PUBLISHED_AFTER_S = 0.0008
 """Delay from sampling to publishing: SCALED_IMU carries the time of publishing, HIGHRES_IMU that of sampling."""
 _HOLD_MODE = 4 << 16 | 3 << 24
@@ -84,7 +81,6 @@ def scaled_imu(double: PX4Board, loop_s: float, index: int) -> Message | None:
 
 
 def attitude(double: PX4Board, loop_s: float) -> Message:
-    """Build ATTITUDE from the estimator."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s).output[:3] - double.vehicle_imus[0].estimator.gyro_bias_rad_s
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
@@ -120,38 +116,22 @@ def estimator_status(double: PX4Board, loop_s: float) -> Message:
     )
 
 
-def autopilot_version(double: PX4Board, loop_s: float) -> Message:
+def version_message(double: PX4Board, loop_s: float) -> Message:
     """Build AUTOPILOT_VERSION with the capabilities PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
-    capabilities = (
-        mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-        | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    )
-    major, minor = (int(part) for part in double.version.split("."))
     kind = mavlink.FIRMWARE_VERSION_TYPE_BETA if double.version == "1.18" else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
-    nothing = [0] * 8
-    software = major << 24 | minor << 16 | kind
-    return mavlink.MAVLink_autopilot_version_message(
-        capabilities, software, software, 0, 0, nothing, nothing, nothing, 0x26AC, 0x0032, 0, list(double.uid2)
-    )
+    bytewise = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    return autopilot_version(double.uid2, double.version, kind, (0x26AC, 0x0032), bytewise, middleware=True)
 
 
 BUILDERS: dict[int, Builder] = {
+    **common_builders(scaled_imu),
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: px4_sys_status,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda double, loop_s: scaled_imu(double, loop_s, 0),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: lambda double, loop_s: scaled_imu(double, loop_s, 1),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU3: lambda double, loop_s: scaled_imu(double, loop_s, 2),
     mavlink.MAVLINK_MSG_ID_ATTITUDE: attitude,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
     mavlink.MAVLINK_MSG_ID_TIMESYNC: timesync,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: home_position,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: extended_sys_state,
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: version_message,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: estimator_status,
 }

@@ -122,7 +122,6 @@ class PX4Port(Channel):
             self._plan(stream)
 
     def due(self, now_s: float) -> list[int]:
-        """Return the ids of messages that are due."""
         due = []
         for message_id, stream in self.streams.items():
             if stream.next_s <= now_s + 1e-9:

@@ -37,7 +37,6 @@ class Shell:
         self._waiting.clear()
 
     def take(self, port: Channel, message: mavlink.MAVLink_serial_control_message, loop_s: float) -> None:
-        """Handle input."""
         if message.device != mavlink.SERIAL_CONTROL_DEV_SHELL or message.flags & mavlink.SERIAL_CONTROL_FLAG_REPLY:
             return
         text = ""

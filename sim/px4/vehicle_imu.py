@@ -75,7 +75,6 @@ class Ekf2:
 
     @property
     def tilt_error_rad(self) -> tuple[float, float]:
-        """Return the errors of roll and pitch."""
         x, y = self._tilt_m_s2 / STANDARD_GRAVITY_M_S2
         return -float(y), float(x)
 
@@ -107,8 +106,6 @@ RAW_RATE_HZ = 1000.0
 
 
 class VehicleImuSample(NamedTuple):
-    """A sample of `vehicle_imu`."""
-
     t_s: float
     """End of the interval, aircraft time."""
     output: Array

@@ -163,10 +163,11 @@ async def companion_daemon(
 
     Args:
         vehicle: running; nobody else listens on its companion link.
-        folder: existing folder for the ports, the configuration, the log and the companion's storage.
+        folder: for the ports, the configuration, the log and the companion's storage.
         more: further lines of the companion's configuration.
         url: URL of the companion's link to the vehicle (None: the vehicle's own URL).
     """
+    folder.mkdir(exist_ok=True)  # noqa: ASYNC240 - a local folder
     (folder / "companion.toml").write_text(daemon_configuration(vehicle, folder, more, url), encoding="utf-8")
     async with devices(vehicle.scenario, folder), CompanionProcess(folder) as daemon:
         await daemon.ready(READY_WITHIN_S)

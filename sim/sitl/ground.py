@@ -47,8 +47,8 @@ class GroundStation(Station):
         kind: int = mavlink.MAV_TYPE_GCS,
         vehicle: int = 1,
     ) -> None:
-        super().__init__(system_id, component_id)
-        self.firmware, self.kind, self.vehicle = firmware, kind, vehicle
+        super().__init__(system_id, component_id, vehicle)
+        self.firmware, self.kind = firmware, kind
         self._types: dict[str, int] = {}
 
     def texts_since(self, since_s: float) -> str:
@@ -77,7 +77,6 @@ class GroundStation(Station):
         return self.all(kind, since_s=since_s)[-1]
 
     def vehicle_heartbeats(self, since_s: float = 0.0) -> list[mavlink.MAVLink_heartbeat_message]:
-        """Return the heartbeats of the autopilot itself."""
         return [
             message
             for message in self.all(mavlink.MAVLink_heartbeat_message, since_s=since_s)
@@ -87,30 +86,25 @@ class GroundStation(Station):
     # Parameters.
 
     async def get(self, name: str) -> float:
-        loop = asyncio.get_running_loop()
-        for _ in range(TRIES):
-            since_s = loop.time()
-            self.send(mavlink.MAVLink_param_request_read_message(self.vehicle, 1, name.encode(), -1))
-            try:
-                await self.wait_for(lambda: bool(self._answers(name, since_s)), ANSWER_S, name)  # noqa: B023
-            except TimeoutError:
-                if self.parameter_errors(name, since_s):
-                    break
-                continue
-            return self._answers(name, since_s)[-1]
-        raise KeyError(name)
+        request = mavlink.MAVLink_param_request_read_message(self.vehicle, 1, name.encode(), -1)
+        return await self._answer_to(name, lambda: self.send(request))
 
     async def put(self, name: str, value: float) -> float:
         """Set a parameter; return the firmware's value afterwards."""
         if name not in self._types:
             await self.get(name)
-        loop = asyncio.get_running_loop()
+        return await self._answer_to(name, lambda: self.send_put(name, value))
+
+    async def _answer_to(self, name: str, request: Callable[[], None]) -> float:
+        """Send a request until a PARAM_VALUE of this name comes; raise KeyError if none comes, or an error."""
         for _ in range(TRIES):
-            since_s = loop.time()
-            self.send_put(name, value)
+            since_s = asyncio.get_running_loop().time()
+            request()
             try:
                 await self.wait_for(lambda: bool(self._answers(name, since_s)), ANSWER_S, name)  # noqa: B023
             except TimeoutError:
+                if self.parameter_errors(name, since_s):
+                    break
                 continue
             return self._answers(name, since_s)[-1]
         raise KeyError(name)
@@ -190,12 +184,6 @@ class GroundStation(Station):
         """Send SET_MESSAGE_INTERVAL on this link; return the result. Rate 0 stops the stream."""
         interval_us = 1e6 / rate_hz if rate_hz > 0.0 else -1.0
         return await self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
-
-    async def command(
-        self, number: int, *params: float, target: tuple[int, int] | None = None, wait_s: float = 2.0
-    ) -> int:
-        """Send a command; without a target, to the autopilot."""
-        return await super().command(number, *params, target=target or (self.vehicle, 1), wait_s=wait_s)
 
     async def arm(self, *, arm: bool = True, force: bool = False, wait_s: float = 10.0) -> int:
         """Send MAV_CMD_COMPONENT_ARM_DISARM; return the result, -1 without an answer."""

@@ -233,8 +233,6 @@ UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table."""
-
     what: str
     instance: int
     left: Array

@@ -93,7 +93,6 @@ class FirmwareVehicle(ABC):
         )
 
     async def power_off(self) -> None:
-        """Cut the power of the autopilot."""
         await self.process.stop()
 
     async def power_cycle(self, off_s: float = 0.5) -> None:
