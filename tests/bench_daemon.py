@@ -114,7 +114,6 @@ def bare_loop(ports: Ports, udp: tuple[str, int], imu: str, pipe: Connection) ->
 
 
 def bare_asyncio(ports: Ports, udp: tuple[str, int], imu: str, pipe: Connection) -> None:
-    """Read in a bare loop on asyncio."""
     counts: Counter[str] = Counter()
     descriptors = _opened(ports)
 
@@ -162,8 +161,6 @@ READERS: Final[dict[str, Callable[[Ports, tuple[str, int], str, Connection], Non
 
 
 class Worker:
-    """A process with a pipe."""
-
     def __init__(self, target: Callable[..., None], *arguments: object) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, there = context.Pipe()
@@ -188,8 +185,6 @@ class Worker:
 
 
 class Load:
-    """All senders, in their own processes."""
-
     def __init__(self, folder: Path, imu: str, stack: contextlib.ExitStack) -> None:
         self.folder, self.imu = folder, imu
         self.udp = ("127.0.0.1", free_port())

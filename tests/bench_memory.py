@@ -72,8 +72,6 @@ page = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.BaseHTTPReq
 
 
 class Memory(NamedTuple):
-    """MiB."""
-
     resident: float
     shared_out: float
     own: float

@@ -95,7 +95,6 @@ async def _live(folder: Path) -> None:
 
 
 def main(samples: int = MILLION // 10) -> None:
-    """Print the table."""
     print(f"\nreplay, {samples:,} IMU samples in each:")
     print(f"  {'':56} {'samples/s':>11} {'s/million':>8} {'wall':>7}")
     with tempfile.TemporaryDirectory() as name:

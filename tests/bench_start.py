@@ -145,7 +145,6 @@ class StartBench:
 
 @contextlib.contextmanager
 def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """End it at the end."""
     try:
         yield process
     finally:
@@ -158,13 +157,10 @@ def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]
 
 
 def processor_s(process_id: int) -> float:
-    """Processor time of all threads of a process, in seconds."""
     return 1e-9 * sum(int(task.read_text().split()[0]) for task in Path(f"/proc/{process_id}/task").glob("*/schedstat"))
 
 
 class Start(NamedTuple):
-    """A command and its environment."""
-
     words: str
     command: list[str]
     environment: dict[str, str]
@@ -202,7 +198,6 @@ def _has_mavsdk() -> bool:
 
 
 def cold_start(rounds: int) -> None:
-    """The table of starts."""
     with tempfile.TemporaryDirectory() as text:
         bench = StartBench(Path(text))
         rows = starts(bench, Path(text))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import inspect
 import json
@@ -103,12 +104,17 @@ def _choose(config: pytest.Config, items: list[pytest.Item], wanted: Callable[[A
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is a coroutine on virtual time."""
+    """Run a test that is a coroutine: on virtual time, or on the real clock where a mark says so."""
     test = pyfuncitem.obj
     if not inspect.iscoroutinefunction(test):
         return None
-    run_virtual(test(**{name: pyfuncitem.funcargs[name] for name in inspect.signature(test).parameters}))
+    run = run_virtual if _is_on_virtual_time(pyfuncitem) else asyncio.run
+    run(test(**{name: pyfuncitem.funcargs[name] for name in inspect.signature(test).parameters}))
     return True
+
+
+def _is_on_virtual_time(item: pytest.Item) -> bool:
+    return not any(item.get_closest_marker(mark) for mark in ("real_clock", "sitl", "sockets"))
 
 
 @pytest.hookimpl(trylast=True)
@@ -166,7 +172,7 @@ _began_s: dict[str, float] = {}
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     _began_s[item.nodeid] = _processor_s()
-    _Running.on_virtual_time = not any(item.get_closest_marker(mark) for mark in ("real_clock", "sitl"))
+    _Running.on_virtual_time = _is_on_virtual_time(item)
     done = yield
     _Running.on_virtual_time = False
     return done

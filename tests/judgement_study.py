@@ -92,14 +92,11 @@ def alarms_of(parts: Sequence[Columns]) -> Iterator[tuple[int, Alarm]]:
 
 
 def model_by(histories: Sequence[PartHistory]) -> Floats | None:
-    """Fit the model to all histories."""
     return scatter_of_model([scatter_of_part(each.biases, each.temperature_degc) for each in histories])
 
 
 @dataclasses.dataclass(frozen=True)
 class FalseAlarms:
-    """False alarms of a fleet without a fault."""
-
     months: float
     """Aircraft times months."""
     by_kind: dict[str, int]
@@ -142,7 +139,6 @@ def delays(fault: str, parts: int, since: int, seed: int, *, alone: bool = False
 
 
 def main() -> None:
-    """Print the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.judgement_study", description=__doc__.splitlines()[0])
     parser.add_argument("--aircraft", type=int, default=100)
     parser.add_argument("--years", type=float, default=5.0)

@@ -72,8 +72,6 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class StudyOutcome:
-    """Over all trials and axes."""
-
     rms_without: float
     rms_with: float
     coverage: float
@@ -109,7 +107,6 @@ def imu_solution(name: str, gyro: Array, accel: Array, stat: Array, covariance: 
 
 
 def solution(imus: Sequence[ImuSolution], shared: Shared) -> Solution:
-    """Solution of several IMUs."""
     return Solution(pose=_POSE, site=_SITE, imus=tuple(imus), warnings=(), unknown=(), magnetic=None, shared=shared)
 
 
@@ -222,7 +219,6 @@ def one_trial(
 
 
 def study(case: Case, trials: int, seed: int = 1) -> StudyOutcome:
-    """Many trials."""
     random, effect = np.random.default_rng(seed), pose_effect(None)
     without, having, sigmas, ahead, used, doubted = [], [], [], [], 0, 0
     for _ in range(trials):
@@ -301,7 +297,6 @@ CASES = (
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.prior_study", description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)

@@ -61,7 +61,6 @@ class Fault:
     """
 
     name: str
-    room: Room
     does: str
     strike: Act
     lift: Act = nothing
@@ -76,3 +75,4 @@ class Fault:
     moves: bool = False
     named_in: tuple[Phase, ...] = PHASES
     """Phases in which `names` must be found; elsewhere it may be over before anybody notices."""
+    room: Room = dataclasses.field(kw_only=True)

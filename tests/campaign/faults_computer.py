@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -14,6 +15,12 @@ from tests.campaign.fault import Act, Fault, Scene
 from tests.campaign.faults_devices import STILLNESS
 from tests.campaign.faults_mavlink import LOST
 from tests.campaign.witness import vectors
+
+disk_fault = functools.partial(Fault, room="disk")
+clock_fault = functools.partial(Fault, room="clock")
+process_fault = functools.partial(Fault, room="process")
+file_fault = functools.partial(Fault, room="files")
+face_fault = functools.partial(Fault, room="faces")
 
 DISK = r"cannot be (written|removed)|not kept|No space|read-only|Read-only|Input/output"
 
@@ -284,14 +291,11 @@ def faults() -> list[Fault]:
     }
     disk: dict[str, Any] = {"excused": DISK, "recordings_mb": 8}
     return [
-        Fault("disk-full", "disk", "no space is left", *refuses("full"), names=DISK, **disk),
-        Fault(
-            "disk-read-only", "disk", "the file system has become read-only", *refuses("read-only"), names=DISK, **disk
-        ),
-        Fault("disk-error", "disk", "fsync fails: a worn-out card", *refuses("fsync"), names=DISK, **disk),
-        Fault(
+        disk_fault("disk-full", "no space is left", *refuses("full"), names=DISK, **disk),
+        disk_fault("disk-read-only", "the file system has become read-only", *refuses("read-only"), names=DISK, **disk),
+        disk_fault("disk-error", "fsync fails: a worn-out card", *refuses("fsync"), names=DISK, **disk),
+        disk_fault(
             "disk-slow",
-            "disk",
             "every write takes up to 6 s",
             slow,
             quick,
@@ -299,81 +303,71 @@ def faults() -> list[Fault]:
             recordings_mb=8,
             excused=STILLNESS,
         ),
-        Fault("folder-removed", "disk", "somebody removes the state directory", remove_folder, excused=DISK),
-        Fault("clock-step", "clock", "the wall clock is set forward or back by an hour", step_clock),
-        Fault(
-            "clock-1970", "clock", "the wall clock is in 1970, and right again later", sets_clock(to_s=5.0), right_clock
+        disk_fault("folder-removed", "somebody removes the state directory", remove_folder, excused=DISK),
+        clock_fault("clock-step", "the wall clock is set forward or back by an hour", step_clock),
+        clock_fault(
+            "clock-1970", "the wall clock is in 1970, and right again later", sets_clock(to_s=5.0), right_clock
         ),
-        Fault("kill", "process", "kill -9, and started again", kill, **back),
-        Fault("kill-again-and-again", "process", "kill -9 four times within seconds", kill_again_and_again, **back),
-        Fault("stop", "process", "stopped in order, and started again", end_in_order, **back),
-        Fault(
+        process_fault("kill", "kill -9, and started again", kill, **back),
+        process_fault("kill-again-and-again", "kill -9 four times within seconds", kill_again_and_again, **back),
+        process_fault("stop", "stopped in order, and started again", end_in_order, **back),
+        process_fault(
             "power-cut",
-            "process",
             "power cut of everything at any byte of a write",
             power_cut(autopilot=True),
             recordings_mb=8,
             **back,
         ),
-        Fault(
+        process_fault(
             "power-cut-companion",
-            "process",
             "power cut of the companion alone, at any byte of a write",
             power_cut(autopilot=False),
             recordings_mb=8,
             **back,
         ),
-        Fault("record-damaged", "files", "the newest record is damaged", spoil_record, names=r"skipped", **back),
-        Fault(
+        file_fault("record-damaged", "the newest record is damaged", spoil_record, names=r"skipped", **back),
+        file_fault(
             "record-newer",
-            "files",
             "the newest record is of a later version",
             spoils("records/??????.json", "newer"),
             names=r"skipped",
             **back,
         ),
-        Fault("undo-damaged", "files", "the values for undo are damaged", spoil_undo, names=r"cannot be used", **back),
-        Fault(
+        file_fault("undo-damaged", "the values for undo are damaged", spoil_undo, names=r"cannot be used", **back),
+        file_fault(
             "journal-damaged",
-            "files",
             "the journal of a write is damaged",
             spoil_journal,
             names=r"cannot be used",
             **back,
         ),
-        Fault(
+        file_fault(
             "journal-tampered",
-            "files",
             "the journal of a write names values that no IMU has",
             tamper_journal,
             names=r"cannot be used",
             **back,
         ),
-        Fault(
+        file_fault(
             "alignment-damaged",
-            "files",
             "the gradienter's alignment is damaged",
             spoils("alignment.json", "cut"),
             names=r"cannot be used",
             **back,
         ),
-        Fault(
-            "recording-damaged", "files", "the newest recording is damaged", spoil_recording, recordings_mb=8, **back
-        ),
-        Fault("control-garbage", "faces", "nonsense at the control socket", control_garbage),
-        Fault(
+        file_fault("recording-damaged", "the newest recording is damaged", spoil_recording, recordings_mb=8, **back),
+        face_fault("control-garbage", "nonsense at the control socket", control_garbage),
+        face_fault(
             "control-half-lines",
-            "faces",
             "twelve clients of the control socket that never finish",
             control_half_lines,
             hang_up,
             lasts_s=(6.0, 9.0),
         ),
-        Fault("control-huge-line", "faces", "lines of 10 MB at the control socket", control_huge_line),
-        Fault("control-crowd", "faces", "200 connections to the control socket", control_crowd, hang_up),
-        Fault(
+        face_fault("control-huge-line", "lines of 10 MB at the control socket", control_huge_line),
+        face_fault("control-crowd", "200 connections to the control socket", control_crowd, hang_up),
+        face_fault(
             "control-deaf",
-            "faces",
             "clients of the control socket that read nothing",
             control_deaf,
             hang_up,

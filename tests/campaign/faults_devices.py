@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from sim.devices import Frame, VectorNavBinary, vectornav_packet
 from sim.motions import Handling, Turn
 from sim.pty_device import Setting, heard
 from tests.campaign.fault import Act, Fault, Scene
+
+STILLNESS = r"still|moved|moving|wait|spread|disagree|not quiet|jump"
+device_fault = functools.partial(Fault, room="device", excused=STILLNESS)
 
 IMU, TILT, COMPASS = "own", "gradienter", "compass"
 WHAT = {IMU: "serial IMU", TILT: "gradienter", COMPASS: "compass"}
@@ -190,168 +194,96 @@ async def swap(scene: Scene) -> None:
     plugs[TILT], plugs[COMPASS] = plugs[COMPASS], plugs[TILT]
 
 
-STILLNESS = r"still|moved|moving|wait|spread|disagree|not quiet|jump"
-
-
-def _each() -> list[Fault]:
-    found = []
+def _each() -> Iterator[Fault]:
     for name, what in WHAT.items():
-        strike, lift = pulled(name)
-        found.append(
-            Fault(
-                f"{SHORT[name]}-unplugged",
-                "device",
-                f"the {what}'s plug is pulled and put in again",
-                strike,
-                lift,
-                names=r"nobody listens|closed the connection|refused|reset by peer",
-                excused=STILLNESS,
-            )
-        )
-        strike, lift = silenced(name)
-        found.append(
-            Fault(
-                f"{SHORT[name]}-silent",
-                "device",
-                f"the {what} says nothing",
-                strike,
-                lift,
-                lasts_s=(4.5, 9.0),
-                names=r"silent|asked anew",
-                excused=STILLNESS,
-            )
-        )
+        short = SHORT[name]
+        yield device_fault(
+            f"{short}-unplugged", f"the {what}'s plug is pulled and put in again", *pulled(name),
+            names=r"nobody listens|closed the connection|refused|reset by peer"
+        )  # fmt: skip
+        yield device_fault(
+            f"{short}-silent", f"the {what} says nothing", *silenced(name), lasts_s=(4.5, 9.0),
+            names=r"silent|asked anew"
+        )  # fmt: skip
         if name == COMPASS:
             continue
-        strike, lift = mangled(name, garbage)
-        found.append(
-            Fault(
-                f"{SHORT[name]}-garbage",
-                "device",
-                f"random bytes come in the place of the {what}'s",
-                strike,
-                lift,
-                lasts_s=(4.5, 9.0),
-                names=r"bytes come, but no|damaged",
-                excused=STILLNESS,
-            )
-        )
+        yield device_fault(
+            f"{short}-garbage", f"random bytes come in the place of the {what}'s", *mangled(name, garbage),
+            lasts_s=(4.5, 9.0), names=r"bytes come, but no|damaged"
+        )  # fmt: skip
         if name != IMU:
             continue  # what such noise looks like is the decoders' business: tests/e2e/test_serial_misbehaviour.py
-        strike, lift = mangled(name, wrong_speed(name))
-        found.append(
-            Fault(
-                f"{SHORT[name]}-baud",
-                "device",
-                f"the {what}'s line is read at another speed",
-                strike,
-                lift,
-                lasts_s=(4.5, 9.0),
-                names=r"bytes come, but no|damaged|silent",
-                excused=STILLNESS,
-            )
-        )
-    return found
+        yield device_fault(
+            f"{short}-baud", f"the {what}'s line is read at another speed", *mangled(name, wrong_speed(name)),
+            lasts_s=(4.5, 9.0), names=r"bytes come, but no|damaged|silent"
+        )  # fmt: skip
 
 
 def faults() -> list[Fault]:
-    stuck, well = mangled(IMU, stuck_imu)
-    spikes, calm = mangled(IMU, spiky_imu)
-    nan, real = mangled(IMU, nan_imu)
-    jumps, level = mangled(TILT, spiky_tilt)
-    stolen, whole = mangled(TILT, damaged)
-    drowned, dry = mangled(COMPASS, flood)
     return [
         *_each(),
-        Fault(
+        device_fault(
             "imu-stuck",
-            "device",
             "the serial IMU repeats one reading with a clock that goes on",
-            stuck,
-            well,
+            *mangled(IMU, stuck_imu),
             lasts_s=(4.0, 8.0),
             names=r"stuck",
-            excused=STILLNESS,
         ),
-        Fault(
-            "imu-spikes", "device", "one reading in ten of the serial IMU cannot be", spikes, calm, excused=STILLNESS
-        ),
-        Fault(
+        device_fault("imu-spikes", "one reading in ten of the serial IMU cannot be", *mangled(IMU, spiky_imu)),
+        device_fault(
             "imu-nan",
-            "device",
             "the serial IMU gives NaN and infinity in whole frames",
-            nan,
-            real,
+            *mangled(IMU, nan_imu),
             lasts_s=(4.5, 8.0),
             names=r"NaN|no valid|not finite|non-finite",
-            excused=STILLNESS,
         ),
-        Fault(
+        device_fault(
             "imu-clock",
-            "device",
             "the serial IMU starts anew, its clock from zero",
             restart_imu,
             names=r"restarted|clock went back|started anew|jumped",
-            excused=STILLNESS,
         ),
-        Fault(
+        device_fault(
             "imu-double-rate",
-            "device",
             "the serial IMU sends twice as often",
             double_rate,
             usual_rate,
-            excused=STILLNESS,
         ),
-        Fault(
+        device_fault(
             "gradienter-spikes",
-            "device",
             "the gradienter jumps by 40 deg now and then",
-            jumps,
-            level,
-            excused=STILLNESS,
+            *mangled(TILT, spiky_tilt),
         ),
-        Fault(
+        device_fault(
             "gradienter-stolen-bytes",
-            "device",
             "a second reader takes one of the gradienter's bytes in fifty",
-            stolen,
-            whole,
+            *mangled(TILT, damaged),
             lasts_s=(4.5, 9.0),
             names=r"damaged",
-            excused=STILLNESS,
         ),
-        Fault(
+        device_fault(
             "gradienter-stuck",
-            "device",
             "the gradienter hangs while somebody tilts the aircraft",
             stick_and_tilt,
             unstick,
             lasts_s=(9.0, 14.0),
             names=r"stuck",
-            excused=STILLNESS,
         ),
-        Fault(
+        device_fault(
             "compass-flood",
-            "device",
             "the compass sends over a megabyte a second",
-            drowned,
-            dry,
+            *mangled(COMPASS, flood),
             lasts_s=(4.0, 7.0),
             names=r"sends more than",
-            excused=STILLNESS,
         ),
-        Fault(
+        device_fault(
             "swapped-plugs",
-            "device",
             "gradienter and compass are swapped and swapped back",
             swap,
             swap,
             lasts_s=(5.0, 9.0),
             names=r"this is (hmr3300|inclinometer)|bytes come, but no",
-            excused=STILLNESS,
         ),
-        Fault("handled", "device", "the aircraft is taken in hand and put back", handle, excused=STILLNESS),
-        Fault(
-            "set-down-differently", "device", "the aircraft is set down in another pose", set_down, excused=STILLNESS
-        ),
+        device_fault("handled", "the aircraft is taken in hand and put back", handle),
+        device_fault("set-down-differently", "the aircraft is set down in another pose", set_down),
     ]

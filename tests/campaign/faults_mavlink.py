@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -11,6 +12,10 @@ from tests.campaign.fault import PHASES, Act, Fault, Phase, Scene
 from tests.campaign.faults_devices import STILLNESS
 from tests.campaign.rough_wire import Stranger, malformed
 from tests.support.component import CALIBRATE, CANCEL, UNDO, command_message
+
+link_fault = functools.partial(Fault, room="link")
+autopilot_fault = functools.partial(Fault, room="autopilot")
+intruder_fault = functools.partial(Fault, room="intruder")
 
 LOST = (
     r"heartbeat|does not answer|no answer|telemetry|not be put back|NOT restored|not read|lost|not seen"
@@ -109,9 +114,8 @@ def link_faults() -> list[Fault]:
         ("neighbour", "another vehicle is heard: armed, with its own values", every(0.2, _neighbour), None, (4.0, 8.0)),
     ]
     return [
-        Fault(
+        link_fault(
             f"link-{name}",
-            "link",
             does,
             *acts,
             lasts_s=lasts_s,
@@ -219,10 +223,9 @@ def _set_id(scene: Scene, system: int) -> None:
 def autopilot_faults() -> list[Fault]:
     write_only: dict[Phase, str] = {phase: "it shows in a write only" for phase in PHASES if phase == "armed"}
     return [
-        Fault("reboot", "autopilot", "the autopilot restarts", reboot, names=r"reboot", excused=f"{LOST}|{STILLNESS}"),
-        Fault(
+        autopilot_fault("reboot", "the autopilot restarts", reboot, names=r"reboot", excused=f"{LOST}|{STILLNESS}"),
+        autopilot_fault(
             "reboot-in-write",
-            "autopilot",
             "the autopilot restarts at one of the writes",
             reboot_in_write,
             disarm,
@@ -230,9 +233,8 @@ def autopilot_faults() -> list[Fault]:
             excused=f"reboot|{LOST}|{STILLNESS}",
             not_in=write_only,
         ),
-        Fault(
+        autopilot_fault(
             "arms",
-            "autopilot",
             "the pilot arms, and disarms later",
             arm,
             disarm,
@@ -240,9 +242,8 @@ def autopilot_faults() -> list[Fault]:
             excused=LOST,
             not_in={"armed": "it is armed already"},
         ),
-        Fault(
+        autopilot_fault(
             "arms-in-write",
-            "autopilot",
             "the pilot arms at one of the writes",
             arm_in_write,
             disarm,
@@ -250,18 +251,16 @@ def autopilot_faults() -> list[Fault]:
             excused=ARMED,
             not_in=write_only,
         ),
-        Fault(
+        autopilot_fault(
             "arm-toggling",
-            "autopilot",
             "armed and disarmed every 0.7 s",
             every(0.7, _toggle)[0],
             every(0.7, _toggle)[1],
             names=ARMED,
             excused=f"{LOST}|{STILLNESS}",
         ),
-        Fault(
+        autopilot_fault(
             "refuses",
-            "autopilot",
             "PARAM_SET of one offset is refused",
             *at_one("refuse"),
             lasts_s=(12.0, 16.0),
@@ -269,9 +268,8 @@ def autopilot_faults() -> list[Fault]:
             excused=r"refuse|answered another value",
             not_in=write_only,
         ),
-        Fault(
+        autopilot_fault(
             "echoes-only",
-            "autopilot",
             "PARAM_SET is stored and echoed, and the old value stays in use",
             echo_only,
             restart_whole,
@@ -280,34 +278,30 @@ def autopilot_faults() -> list[Fault]:
             # It ends with a restart, which may come in the middle of the next attempt.
             excused=r"does not use|not in use|no effect|did not follow|still off|reboot|restart|unknown whether",
         ),
-        Fault(
+        autopilot_fault(
             "other-value",
-            "autopilot",
             "the answer to PARAM_SET carries another value",
             *at_one("wrong_echo"),
             lasts_s=(12.0, 16.0),
             excused=r"OFF|reads? back|another value|changed",
             not_in=write_only,
         ),
-        Fault(
+        autopilot_fault(
             "silent",
-            "autopilot",
             "heartbeats and telemetry go on, but nothing is answered",
             *switched(silent=True),
             lasts_s=(6.0, 12.0),
             excused=LOST,
         ),
-        Fault(
+        autopilot_fault(
             "one-parameter-unanswered",
-            "autopilot",
             "one offset can neither be read nor set",
             *at_one("ignore"),
             lasts_s=(8.0, 14.0),
             excused=f"{LOST}|OFF",
         ),
-        Fault(
+        autopilot_fault(
             "no-heartbeat",
-            "autopilot",
             "the heartbeat stays away, all else goes on",
             *switched(heartbeat_off=True),
             # Shorter gaps than 5 s are nobody's fault: then a calibration may end well, and nothing is said.
@@ -317,33 +311,29 @@ def autopilot_faults() -> list[Fault]:
             names=r"heartbeat",
             excused=LOST,
         ),
-        Fault(
+        autopilot_fault(
             "no-telemetry",
-            "autopilot",
             "nothing but heartbeats and answers is sent",
             *switched(telemetry_off=True),
             lasts_s=(4.0, 8.0),
             names=r"imu fc|telemetry|no .*IMU|fc: ",
             excused=f"{LOST}|{STILLNESS}|fc",
         ),
-        Fault(
+        autopilot_fault(
             "frozen-imu",
-            "autopilot",
             "the autopilot's IMU messages repeat the last values",
             *switched(frozen_imu=True),
             lasts_s=(4.0, 8.0),
             excused=f"{STILLNESS}|frozen|same|does not use|fc|reboot|unknown whether",
         ),
-        Fault(
+        autopilot_fault(
             "foreign-writer",
-            "autopilot",
             "another station sets an offset to nonsense",
             foreign_write,
             excused=r"somebody|someone|changed|set |NOT restored|OFF|does not use",
         ),
-        Fault(
+        autopilot_fault(
             "gyro-calibration-fails",
-            "autopilot",
             "ArduPilot's own gyro calibration does not converge",
             *switched(gyro_calibration_fails=True),
             variants=("ArduPilot 4.8", "ArduPilot 4.6"),
@@ -351,18 +341,16 @@ def autopilot_faults() -> list[Fault]:
             excused=r"gyro calibration|gyro",
             not_in=write_only,
         ),
-        Fault(
+        autopilot_fault(
             "two-autopilots",
-            "autopilot",
             "a second firmware has the same system id",
             *every(0.5, _second),
             lasts_s=(3.0, 8.0),
             names=r"two autopilots",
             excused=f"{LOST}|{STILLNESS}|two autopilots",
         ),
-        Fault(
+        autopilot_fault(
             "other-system-id",
-            "autopilot",
             "it restarts with another system id, and later with its own",
             change_id,
             change_id_back,
@@ -515,22 +503,19 @@ def _told_of_signatures(scene: Scene) -> int:
 
 def intruder_faults() -> list[Fault]:
     return [
-        Fault(
+        intruder_fault(
             "malformed",
-            "intruder",
             "oversized, cut, unknown and wrongly summed frames, 400 a second",
             *every(0.05, _malformed),
             excused=f"{LOST}|{STILLNESS}",
         ),
-        Fault(
+        intruder_fault(
             "spoofed-commands",
-            "intruder",
             "requests to others, and as if from ourselves",
             *every(0.3, _spoofed_commands),
         ),
-        Fault(
+        intruder_fault(
             "forged-disarmed",
-            "intruder",
             "50 disarmed heartbeats a second under the autopilot's ids, and the pilot arms",
             forge_and_arm,
             no_longer_forged,
@@ -538,38 +523,33 @@ def intruder_faults() -> list[Fault]:
             names=r"two autopilots, or a forger",
             excused=f"{LOST}|{ARMED}|{STILLNESS}",
         ),
-        Fault(
-            "our-own-ids", "intruder", "somebody beats under our own system and component id", *every(0.3, _our_own_ids)
+        intruder_fault(
+            "our-own-ids", "somebody beats under our own system and component id", *every(0.3, _our_own_ids)
         ),
-        Fault(
+        intruder_fault(
             "fake-autopilots",
-            "intruder",
             "heartbeats of pretended autopilots, some armed",
             *every(0.2, _fake_autopilots),
         ),
-        Fault(
+        intruder_fault(
             "spoofed-values",
-            "intruder",
             "values, telemetry and acknowledgements of another component",
             *every(0.1, _spoofed_values),
         ),
-        Fault(
+        intruder_fault(
             "forged-places",
-            "intruder",
             "dates and places that cannot be, under the autopilot's ids",
             *every(0.2, _forged_dates_and_places),
             excused=r"position|height",
         ),
-        Fault(
+        intruder_fault(
             "announced-offset",
-            "intruder",
             "an offset that is not in force is announced under the autopilot's ids",
             *every(2.5, _announced_offset),
             excused=r"OFF|somebody|changed",
         ),
-        Fault(
+        intruder_fault(
             "arm-question-flood",
-            "intruder",
             "PX4 asks 400 times a second whether it may arm (command 3001)",
             *every(0.05, _asks_to_arm),
             variants=("PX4",),
@@ -577,17 +557,15 @@ def intruder_faults() -> list[Fault]:
             excused=STILLNESS,
             lasts_s=(2.0, 4.0),
         ),
-        Fault(
+        intruder_fault(
             "signed",
-            "intruder",
             "everything that comes is signed (MAVLink 2 signing)",
             signs,
             unsigned,
             lasts_s=(4.0, 9.0),
         ),
-        Fault(
+        intruder_fault(
             "signatures-demanded",
-            "intruder",
             "the autopilot signs, and takes nothing that is not signed",
             demands_signatures,
             no_longer_demanded,

@@ -34,8 +34,6 @@ REMEMBERED_S: Final = 300.0
 
 
 class Sample(NamedTuple):
-    """At the end of a minute, in peace."""
-
     minute: int
     rss_mib: float
     objects: int
@@ -45,8 +43,6 @@ class Sample(NamedTuple):
 
 @dataclasses.dataclass
 class Hour:
-    """Observations of an hour."""
-
     seed: int
     variant: str
     samples: list[Sample] = dataclasses.field(default_factory=list)

@@ -26,7 +26,6 @@ def new_port() -> int:
 
 
 def listen(port: int) -> socket.socket:
-    """A listening socket at a port of `new_port`, to be given to `asyncio.start_server`."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(_name(port))
     listener.listen(100)

@@ -44,7 +44,6 @@ def turn(rig: Rig, headings: int, *, write: bool) -> Job:
 
 
 async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: Meddle = NOTHING) -> TurnRecord:
-    """Run the alignment to its record."""
     job = turn(rig, headings, write=write)
     result = await follow(rig, hands, job, meddle)
     assert result.outcome == "done", result

@@ -17,7 +17,6 @@ from sim.firmware.faults import Faults
 from sim.motions import Handling
 from tests.support.component import Ground
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
 ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
@@ -125,23 +124,19 @@ async def test_a_dead_gradienter_is_a_fault_that_denies_and_is_named(tmp_path: P
         assert "Arm auth: Denied" not in texts(rig)  # reason 1: the companion has said it
 
 
-def test_what_was_in_force_at_arming_is_kept_and_shown_with_its_record(tmp_path: Path) -> None:
-    async def main() -> dict[str, Any]:
-        async with px4(tmp_path, "warn").running() as rig:
-            await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 20.0)
-            rig.px4.arm()
-            await rig.until(lambda: rig.service.arming.armings.last is not None, 5.0)
-            rig.px4.disarm()
-            await rig.until(lambda: len(rig.service.calibrating.store.history()) == 1, 100.0)
-            await asyncio.sleep(90.0)
-            rig.px4.arm()
-            await asyncio.sleep(1.5)
-            history: dict[str, Any] = {}
-            async for reply in rig.service.faces.answer({"command": "history"}):
-                history = reply
-            return history
-
-    history = run_virtual(main())
+async def test_what_was_in_force_at_arming_is_kept_and_shown_with_its_record(tmp_path: Path) -> None:
+    async with px4(tmp_path, "warn").running() as rig:
+        await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 20.0)
+        rig.px4.arm()
+        await rig.until(lambda: rig.service.arming.armings.last is not None, 5.0)
+        rig.px4.disarm()
+        await rig.until(lambda: len(rig.service.calibrating.store.history()) == 1, 100.0)
+        await asyncio.sleep(90.0)
+        rig.px4.arm()
+        await asyncio.sleep(1.5)
+        history: dict[str, Any] = {}
+        async for reply in rig.service.faces.answer({"command": "history"}):
+            history = reply
     (record,) = history["records"]
     last, first = history["armings"]
     assert list(record["armings"]) == [last]

@@ -31,8 +31,6 @@ QUICK = {"min_still_s": 3.0, "max_s": 6.0}
 
 
 class Flight:
-    """A rig with its witness."""
-
     def __init__(self, rig: Rig, witness: WriteWitness) -> None:
         self.rig, self.witness = rig, witness
 
@@ -46,7 +44,6 @@ class Flight:
         return self.rig.aircraft.angles_rad(self.rig.aircraft.time_at(self.rig.now_s))[2]
 
     def theirs_deg(self) -> float:
-        """Heading error of the autopilot."""
         yaw = self.rig.autopilot.estimated_angles_rad(self.rig.now_s)[2]
         return math.degrees(abs(math.remainder(yaw - self.true_yaw_rad, 2.0 * math.pi)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 from collections.abc import AsyncIterator
@@ -65,41 +64,30 @@ def of(findings: list[CheckLine], *names: str) -> list[CheckLine]:
     return [finding for finding in findings if finding.name in names and finding.remedy]
 
 
-def test_a_bench_in_order_has_nothing_to_say(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600), Setting(19200)):
-            findings = await found(text(tmp_path))
-            assert of(findings, "gradienter", "compass", "ports") == []
-            assert [one.good for one in findings if one.name in ("gradienter", "compass")] == [True, True]
-
-    asyncio.run(main())
+async def test_a_bench_in_order_has_nothing_to_say(tmp_path: Path) -> None:
+    async with bench(tmp_path, Setting(9600), Setting(19200)):
+        findings = await found(text(tmp_path))
+        assert of(findings, "gradienter", "compass", "ports") == []
+        assert [one.good for one in findings if one.name in ("gradienter", "compass")] == [True, True]
 
 
-def test_another_speed_and_parity(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600, "even"), Setting(19200)):
-            (finding,) = of(await found(text(tmp_path, "baud = 115200")), "gradienter", "ports")
-            assert not finding.good
-            assert finding.remedy == 'set baud = 9600 and parity = "even" in [gradienter]'
-            assert finding.words.startswith("this is inclinometer_xy at 9600 8E1, not at ")
-
-    asyncio.run(main())
+async def test_another_speed_and_parity(tmp_path: Path) -> None:
+    async with bench(tmp_path, Setting(9600, "even"), Setting(19200)):
+        (finding,) = of(await found(text(tmp_path, "baud = 115200")), "gradienter", "ports")
+        assert not finding.good
+        assert finding.remedy == 'set baud = 9600 and parity = "even" in [gradienter]'
+        assert finding.words.startswith("this is inclinometer_xy at 9600 8E1, not at ")
 
 
-def test_two_devices_swapped_each_at_its_own_speed(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600), Setting(19200), swapped=True):
-            told = {each.name: each.words for each in of(await found(text(tmp_path)), "gradienter", "compass")}
-            assert told["gradienter"].startswith(
-                "this is hmr3300, a device for compass, not for gradienter:"
-                " give [gradienter] the port of the gradienter"
-            )
-            assert told["compass"].startswith(
-                "this is inclinometer_xy, a device for gradienter, not for compass:"
-                " give [compass] the port of the compass"
-            )
-
-    asyncio.run(main())
+async def test_two_devices_swapped_each_at_its_own_speed(tmp_path: Path) -> None:
+    async with bench(tmp_path, Setting(9600), Setting(19200), swapped=True):
+        told = {each.name: each.words for each in of(await found(text(tmp_path)), "gradienter", "compass")}
+        assert told["gradienter"].startswith(
+            "this is hmr3300, a device for compass, not for gradienter: give [gradienter] the port of the gradienter"
+        )
+        assert told["compass"].startswith(
+            "this is inclinometer_xy, a device for gradienter, not for compass: give [compass] the port of the compass"
+        )
 
 
 def sent_to(device: Chatter) -> bytes:
@@ -112,17 +100,14 @@ def sent_to(device: Chatter) -> bytes:
 # companion ports ------------------------------------------------------------------------------------------------------
 
 
-def test_ports_listen_says_who_speaks_and_at_which_speed(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600, "even"), Setting(19200)) as (one, other):
-            said = await companion("ports", "--listen", str(tmp_path / "gradienter"), str(tmp_path / "compass"))
-            assert said.code == 0
-            for name, device in (
-                ("gradienter", "inclinometer_xy, a device for gradienter (9600 8E1)"),
-                ("compass", "hmr3300, a device for compass (19200 8N1)"),
-            ):
-                assert f"{tmp_path / name}: {device}\n" in said.out
-            assert "companion setup takes them" in said.err
-            assert [sent_to(one), sent_to(other)] == [b"", b""]
-
-    asyncio.run(main())
+async def test_ports_listen_says_who_speaks_and_at_which_speed(tmp_path: Path) -> None:
+    async with bench(tmp_path, Setting(9600, "even"), Setting(19200)) as (one, other):
+        said = await companion("ports", "--listen", str(tmp_path / "gradienter"), str(tmp_path / "compass"))
+        assert said.code == 0
+        for name, device in (
+            ("gradienter", "inclinometer_xy, a device for gradienter (9600 8E1)"),
+            ("compass", "hmr3300, a device for compass (19200 8N1)"),
+        ):
+            assert f"{tmp_path / name}: {device}\n" in said.out
+        assert "companion setup takes them" in said.err
+        assert [sent_to(one), sent_to(other)] == [b"", b""]

@@ -94,27 +94,23 @@ async def calibrated(rig: Rig, during: State | None = None, fault: Callable[[], 
 
 
 def rig_of(folder: Path, section: str) -> Rig:
-    """An aircraft with a control socket."""
     return Rig(folder, min_still_s=2.0, max_s=8.0, more=f'[control]\nsocket = "{folder}/c.sock"\n{section}')
 
 
-def test_a_hostile_broker_costs_at_most_the_mqtt_process(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with HostileBroker() as hostile:
-            section = f'[mqtt]\nhost = "127.0.0.1"\nport = {hostile.port}\n'
-            async with beside(rig := rig_of(tmp_path, section)) as child:
-                for manner in ("huge", "flood", "silent", "closing"):
-                    hostile.manner, before = manner, hostile.connections
-                    assert await calibrated(rig) == "done"
-                    async with asyncio.timeout(120.0):
-                        while hostile.connections == before:
-                            await asyncio.sleep(0.05)
-                    assert _rss_mib() < 400.0, "the message is held in the child, not here"
+async def test_a_hostile_broker_costs_at_most_the_mqtt_process(tmp_path: Path) -> None:
+    async with HostileBroker() as hostile:
+        section = f'[mqtt]\nhost = "127.0.0.1"\nport = {hostile.port}\n'
+        async with beside(rig := rig_of(tmp_path, section)) as child:
+            for manner in ("huge", "flood", "silent", "closing"):
+                hostile.manner, before = manner, hostile.connections
+                assert await calibrated(rig) == "done"
                 async with asyncio.timeout(120.0):
-                    while child.process_id is None:
+                    while hostile.connections == before:
                         await asyncio.sleep(0.05)
-
-    asyncio.run(main())
+                assert _rss_mib() < 400.0, "the message is held in the child, not here"
+            async with asyncio.timeout(120.0):
+                while child.process_id is None:
+                    await asyncio.sleep(0.05)
 
 
 def _rss_mib() -> float:
@@ -123,19 +119,16 @@ def _rss_mib() -> float:
 
 
 @pytest.mark.parametrize(("state", "blow"), [(State.WRITING, signal.SIGSTOP), (State.VERIFYING, signal.SIGKILL)])
-def test_a_child_that_is_killed_or_stopped_returns(tmp_path: Path, state: State, blow: signal.Signals) -> None:
-    async def main() -> None:
-        async with broker(tmp_path) as one, peer(one) as watcher:
-            async with beside(rig := rig_of(tmp_path, one.section())) as child:
-                await watcher.until("companion/1/status", is_(b"online"))
-                struck = child.process_id
-                assert struck is not None
-                assert await calibrated(rig, state, lambda: os.kill(struck, blow)) == "done"
-                async with asyncio.timeout(60.0):
-                    while child.process_id in (None, struck):
-                        await asyncio.sleep(0.05)
-                done = await watcher.until("companion/1/calibration/state")
-                assert done.json["state"] == "done"
-            await watcher.until("companion/1/status", is_(b"offline"))
-
-    asyncio.run(main())
+async def test_a_child_that_is_killed_or_stopped_returns(tmp_path: Path, state: State, blow: signal.Signals) -> None:
+    async with broker(tmp_path) as one, peer(one) as watcher:
+        async with beside(rig := rig_of(tmp_path, one.section())) as child:
+            await watcher.until("companion/1/status", is_(b"online"))
+            struck = child.process_id
+            assert struck is not None
+            assert await calibrated(rig, state, lambda: os.kill(struck, blow)) == "done"
+            async with asyncio.timeout(60.0):
+                while child.process_id in (None, struck):
+                    await asyncio.sleep(0.05)
+            done = await watcher.until("companion/1/calibration/state")
+            assert done.json["state"] == "done"
+        await watcher.until("companion/1/status", is_(b"offline"))

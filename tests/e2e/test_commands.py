@@ -118,76 +118,73 @@ async def until_status(config: Path, what: str, holds: Callable[[Any], bool]) ->
     raise AssertionError(f"the daemon never said {what}: {status}")
 
 
-def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight_line(tmp_path) as line:
-            config = str(line.config)
-            autopilot = line.scenario.autopilot
-            assert stat.S_IMODE((tmp_path / "control.sock").stat().st_mode) == 0o600
-            before = autopilot.parameter("INS_GYROFFS_X")
+async def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
+    async with flight_line(tmp_path) as line:
+        config = str(line.config)
+        autopilot = line.scenario.autopilot
+        assert stat.S_IMODE((tmp_path / "control.sock").stat().st_mode) == 0o600
+        before = autopilot.parameter("INS_GYROFFS_X")
 
-            await _until_read(line.config)
-            status = await companion("status", "-c", config)
-            assert status.code == DONE
-            for word in ("active calibration: ", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
-                assert word in status.out
+        await _until_read(line.config)
+        status = await companion("status", "-c", config)
+        assert status.code == DONE
+        for word in ("active calibration: ", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
+            assert word in status.out
 
-            done = await companion("-c", config, "calibrate", "--timeout", "60", "--json")
-            assert done.code == DONE, done.err
-            _check_record(done.json)
-            assert "still" in done.err
-            assert autopilot.parameter("INS_GYROFFS_X") != before
-            x = done.json["imus"][0]["written"]["INS_GYROFFS_X"]
-            assert x["outcome"] == "verified"
-            assert autopilot.parameter("INS_GYROFFS_X") == x["read_back"]
+        done = await companion("-c", config, "calibrate", "--timeout", "60", "--json")
+        assert done.code == DONE, done.err
+        _check_record(done.json)
+        assert "still" in done.err
+        assert autopilot.parameter("INS_GYROFFS_X") != before
+        x = done.json["imus"][0]["written"]["INS_GYROFFS_X"]
+        assert x["outcome"] == "verified"
+        assert autopilot.parameter("INS_GYROFFS_X") == x["read_back"]
 
-            history = await companion("history", "-n", "5", "--json", "-c", config)
-            assert history.json["records"] == [done.json]
-            assert history.json["numbers"] == [1]
+        history = await companion("history", "-n", "5", "--json", "-c", config)
+        assert history.json["records"] == [done.json]
+        assert history.json["numbers"] == [1]
 
-            check = await companion("-c", config, "check", "--json")
-            assert check.code == DONE, check.out
-            assert {finding["name"] for finding in check.json["findings"]} >= {
-                "configuration", "daemon", "autopilot", "fc", "own", "gradienter", "compass",
-            }  # fmt: skip
+        check = await companion("-c", config, "check", "--json")
+        assert check.code == DONE, check.out
+        assert {finding["name"] for finding in check.json["findings"]} >= {
+            "configuration", "daemon", "autopilot", "fc", "own", "gradienter", "compass",
+        }  # fmt: skip
 
-            undone = await companion("-c", config, "undo", "--json")
-            assert undone.code == DONE, undone
-            assert undone.json["written"]["INS_GYROFFS_X"]["outcome"] == "rolled_back"
-            again = await companion("-c", config, "--json", "undo")
-            assert again.code == FAILED
-            assert "nothing to undo" in again.json["reason"]
+        undone = await companion("-c", config, "undo", "--json")
+        assert undone.code == DONE, undone
+        assert undone.json["written"]["INS_GYROFFS_X"]["outcome"] == "rolled_back"
+        again = await companion("-c", config, "--json", "undo")
+        assert again.code == FAILED
+        assert "nothing to undo" in again.json["reason"]
 
-            # Something worth correcting; for the gyros the firmware's own calibration would do so nearly as well.
-            autopilot.write_as_another_station("INS_ACCOFFS_X", 0.3)
-            autopilot.faults.echo_without_effect = True
-            broken = await companion("-c", config, "calibrate", "--json")
-            assert broken.code == FAILED
-            assert broken.json["state"] == "failed"
-            assert "INS_ACCOFFS_X" in broken.json["reason"]
-            assert "does not use" in broken.json["reason"]
-            assert broken.json["imus"][0]["written"]["INS_ACCOFFS_X"]["outcome"] == "rolled_back"
-            autopilot.faults.echo_without_effect = False
+        # Something worth correcting; for the gyros the firmware's own calibration would do so nearly as well.
+        autopilot.write_as_another_station("INS_ACCOFFS_X", 0.3)
+        autopilot.faults.echo_without_effect = True
+        broken = await companion("-c", config, "calibrate", "--json")
+        assert broken.code == FAILED
+        assert broken.json["state"] == "failed"
+        assert "INS_ACCOFFS_X" in broken.json["reason"]
+        assert "does not use" in broken.json["reason"]
+        assert broken.json["imus"][0]["written"]["INS_ACCOFFS_X"]["outcome"] == "rolled_back"
+        autopilot.faults.echo_without_effect = False
 
-            autopilot.arm()
-            await _until(line.config, "armed")
-            armed = await companion("-c", config, "calibrate", "--json")
-            assert armed.code == FAILED
-            assert "armed" in armed.json["reason"]
-            autopilot.disarm()
+        autopilot.arm()
+        await _until(line.config, "armed")
+        armed = await companion("-c", config, "calibrate", "--json")
+        assert armed.code == FAILED
+        assert "armed" in armed.json["reason"]
+        autopilot.disarm()
 
-            assert line.daemon is not None
-            line.daemon.send_signal(signal.SIGTERM)
-            _, log = await line.daemon.communicate()
-            assert line.daemon.returncode == DONE
-            assert b"Traceback" not in log
-            assert not (tmp_path / "control.sock").exists()
-            gone = await companion("-c", config, "status", "--json")
-            assert gone.code == NO_DAEMON
-            assert "the companion is not running" in gone.json["reason"]
-            assert gone.err.count("\n") == 2, "the line, and what to do"
-
-    asyncio.run(main())
+        assert line.daemon is not None
+        line.daemon.send_signal(signal.SIGTERM)
+        _, log = await line.daemon.communicate()
+        assert line.daemon.returncode == DONE
+        assert b"Traceback" not in log
+        assert not (tmp_path / "control.sock").exists()
+        gone = await companion("-c", config, "status", "--json")
+        assert gone.code == NO_DAEMON
+        assert "the companion is not running" in gone.json["reason"]
+        assert gone.err.count("\n") == 2, "the line, and what to do"
 
 
 def _check_record(record: Any) -> None:
@@ -209,49 +206,43 @@ def _check_record(record: Any) -> None:
     assert own["written"] == {}
 
 
-def test_ctrl_c_cancels_the_calibration_that_is_watched(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight_line(tmp_path, still_s=(600.0, 600.0)) as line:
-            config = str(line.config)
-            watched = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "companion", "-c", config, "calibrate"),
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.PIPE,
-            )
-            assert watched.stderr is not None
-            async with asyncio.timeout(40.0):
-                await watched.stderr.readuntil(b"hold still")
-                watched.send_signal(signal.SIGINT)
-                out, _ = await watched.communicate()
-            assert watched.returncode == FAILED
-            assert out.decode() == "Cancelled (Ctrl-C). Nothing was written.\n"
-            status = (await companion("-c", config, "status", "--json")).json
-            assert status["state"] not in ("waiting", "measuring")
-            assert line.scenario.autopilot.writes == []
-
-    asyncio.run(main())
+async def test_ctrl_c_cancels_the_calibration_that_is_watched(tmp_path: Path) -> None:
+    async with flight_line(tmp_path, still_s=(600.0, 600.0)) as line:
+        config = str(line.config)
+        watched = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "companion", "-c", config, "calibrate"),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        assert watched.stderr is not None
+        async with asyncio.timeout(40.0):
+            await watched.stderr.readuntil(b"hold still")
+            watched.send_signal(signal.SIGINT)
+            out, _ = await watched.communicate()
+        assert watched.returncode == FAILED
+        assert out.decode() == "Cancelled (Ctrl-C). Nothing was written.\n"
+        status = (await companion("-c", config, "status", "--json")).json
+        assert status["state"] not in ("waiting", "measuring")
+        assert line.scenario.autopilot.writes == []
 
 
-def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight_line(tmp_path, daemon=False) as line:
-            good = await companion("-c", str(line.config), "check")
-            assert good.code == DONE, good.out
-            assert "not running" in good.out
-            assert line.scenario.autopilot.writes == []
-            broken = line.config.with_name("broken.toml")
-            text = line.config.read_text().replace(str(tmp_path / "compass"), str(tmp_path / "nothing"))
-            broken.write_text(re.sub('url = ".*"', 'url = "tcp:127.0.0.1:9"', text))
-            bad = await companion("-c", str(broken), "check", "--json")
-            assert bad.code == FAILED
-            # On a busy machine others may have said nothing in so short a time.
-            (finding,) = [each for each in bad.json["findings"] if each["name"] == "compass"]
-            assert not finding["good"]
-            assert "nothing" in finding["words"]
-            assert "compass" in bad.json["reason"]
-            (finding,) = [each for each in bad.json["findings"] if each["name"] == "autopilot"]
-            assert "127.0.0.1:9" in finding["words"], "the cause, not what a working link would need"
-            assert bad.err.startswith("checking: 3 s")
-            assert not any(each["name"] == "fc" for each in bad.json["findings"]), "named once"
-
-    asyncio.run(main())
+async def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
+    async with flight_line(tmp_path, daemon=False) as line:
+        good = await companion("-c", str(line.config), "check")
+        assert good.code == DONE, good.out
+        assert "not running" in good.out
+        assert line.scenario.autopilot.writes == []
+        broken = line.config.with_name("broken.toml")
+        text = line.config.read_text().replace(str(tmp_path / "compass"), str(tmp_path / "nothing"))
+        broken.write_text(re.sub('url = ".*"', 'url = "tcp:127.0.0.1:9"', text))
+        bad = await companion("-c", str(broken), "check", "--json")
+        assert bad.code == FAILED
+        # On a busy machine others may have said nothing in so short a time.
+        (finding,) = [each for each in bad.json["findings"] if each["name"] == "compass"]
+        assert not finding["good"]
+        assert "nothing" in finding["words"]
+        assert "compass" in bad.json["reason"]
+        (finding,) = [each for each in bad.json["findings"] if each["name"] == "autopilot"]
+        assert "127.0.0.1:9" in finding["words"], "the cause, not what a working link would need"
+        assert bad.err.startswith("checking: 3 s")
+        assert not any(each["name"] == "fc" for each in bad.json["findings"]), "named once"

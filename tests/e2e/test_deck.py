@@ -12,7 +12,6 @@ import numpy as np
 from companion.commands import Align
 from companion.component.service import Refusal
 from companion.estimation.machine import What
-from companion.estimation.records.record import Record
 from companion.lab.replay import replay
 from sim.imu_model import DEG_H, MG
 from sim.motions import DAY_S, Sea, SlowTurn, Wave
@@ -20,7 +19,6 @@ from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
 from tests.e2e.test_calibration import started
 from tests.e2e.test_record_replay import ring, same
 from tests.support.rig import Rig
-from tests.support.virtual_time import run_virtual
 
 DECK = '[vehicle]\nplatform = "deck"\n'
 BOAT = (Sea(start_s=-20.0, waves=(Wave(0.2, 5.0), Wave(0.05, 1.0)), seed=4),)
@@ -83,21 +81,18 @@ async def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Pat
         assert "Armed: calibrated" in texts(rig)
 
 
-def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
-    async def main() -> list[Record]:
-        async with boat(
-            tmp_path, more=f"{DECK}[push]\nparameters = false\n", recordings_mb=64, imu_rate_hz=25.0
-        ).running() as rig:
-            await rig.ready()
-            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
-            for _ in range(2):
-                job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test", 300.0))
-                result = await job.finished
-                assert result.outcome == "done", result
-                await asyncio.sleep(40.0)
-        return rig.service.calibrating.store.history()[::-1]
-
-    records = run_virtual(main())
+async def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
+    async with boat(
+        tmp_path, more=f"{DECK}[push]\nparameters = false\n", recordings_mb=64, imu_rate_hz=25.0
+    ).running() as rig:
+        await rig.ready()
+        rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+        for _ in range(2):
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test", 300.0))
+            result = await job.finished
+            assert result.outcome == "done", result
+            await asyncio.sleep(40.0)
+    records = rig.service.calibrating.store.history()[::-1]
     assert len(records) == 2
     same(replay(ring(tmp_path)), records)
 

@@ -75,8 +75,6 @@ class Run:
 
 @dataclass(frozen=True)
 class FamilyOutcome:
-    """Result and truth of one family."""
-
     record: Record
     truth: dict[str, Bias]
     heading_deg: float
@@ -115,7 +113,6 @@ def cases(run: Run) -> Iterator[tuple[str, str]]:
 
 
 def section(role: str, device: SerialDevice, path: Path, *more: str) -> str:
-    """The part of a configuration that fits a device in a role."""
     mounting = list(fit(role, device.protocol).mounting_deg)
     lines = [f'port = "{path}"', f"baud = {device.baud}", f'protocol = "{device.protocol}"', f"mounting = {mounting}"]
     return "\n".join([*(more[:1] if role == "imu" else [f"[{role}]"]), *lines, *(more[1:] if role == "imu" else more)])
@@ -139,7 +136,6 @@ def calm() -> SavedProfile:
 
 
 async def carry_out(run: Run, folder: Path, number: int) -> FamilyOutcome:
-    """One daemon from its start to a record."""
     aircraft = VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0))
     aircraft.begin(asyncio.get_running_loop().time())
     imus: dict[str, ImuModel] = {

@@ -59,7 +59,6 @@ def client(one: Broker, user: str) -> aiomqtt.Client:
 
 
 async def heard_until(one: aiomqtt.Client, last: str) -> list[tuple[str, str]]:
-    """Topics and payloads until one with that payload."""
     found = []
     async with asyncio.timeout(60.0):
         async for message in one.messages:
@@ -72,37 +71,35 @@ async def heard_until(one: aiomqtt.Client, last: str) -> list[tuple[str, str]]:
 @pytest.mark.real_clock
 @mosquitto_only
 @pytest.mark.parametrize(("aircraft", "users"), FLEETS)
-def test_each_says_and_hears_what_is_its_own_and_nothing_else(tmp_path: Path, aircraft: list[str], users: str) -> None:
+async def test_each_says_and_hears_what_is_its_own_and_nothing_else(
+    tmp_path: Path, aircraft: list[str], users: str
+) -> None:
     says, hears = said_and_heard(USERS[users])
     topics = sorted(set().union(*says.values(), *hears.values()))
     one = start(tmp_path, aircraft, (*says, "witness"), "log_type all")
-
-    async def main() -> None:
-        await one.start()
-        try:
-            async with client(one, "witness") as witness:
-                await witness.subscribe("#", qos=1)
-                for user in says:
-                    async with client(one, user) as speaker:
-                        for topic in topics:
-                            await speaker.publish(topic, user, qos=1)
-                    await witness.publish("over", "over", qos=1)
-                    heard = await heard_until(witness, "over")
-                    assert {topic for topic, _ in heard} == says[user], user
-                for user in hears:
-                    async with client(one, user) as listener:
-                        # Mosquitto grants every subscription, and delivers what may be read.
-                        for topic in ("#", "$share/collectors/fleet/+/item"):
-                            await listener.subscribe(topic, qos=1)
-                        for topic in topics:
-                            await witness.publish(topic, "news", qos=1)
-                        await witness.publish(min(hears[user]), "over", qos=1)
-                        heard = await heard_until(listener, "over")
-                        assert {topic for topic, _ in heard} == hears[user], user
-        finally:
-            one.kill()
-
-    asyncio.run(main())
+    await one.start()
+    try:
+        async with client(one, "witness") as witness:
+            await witness.subscribe("#", qos=1)
+            for user in says:
+                async with client(one, user) as speaker:
+                    for topic in topics:
+                        await speaker.publish(topic, user, qos=1)
+                await witness.publish("over", "over", qos=1)
+                heard = await heard_until(witness, "over")
+                assert {topic for topic, _ in heard} == says[user], user
+            for user in hears:
+                async with client(one, user) as listener:
+                    # Mosquitto grants every subscription, and delivers what may be read.
+                    for topic in ("#", "$share/collectors/fleet/+/item"):
+                        await listener.subscribe(topic, qos=1)
+                    for topic in topics:
+                        await witness.publish(topic, "news", qos=1)
+                    await witness.publish(min(hears[user]), "over", qos=1)
+                    heard = await heard_until(listener, "over")
+                    assert {topic for topic, _ in heard} == hears[user], user
+    finally:
+        one.kill()
     crane, denied = USERS[users][1], (one.folder / "log").read_text()
     assert f"Denied PUBLISH from client-{crane[:8]} (d0, q1, r0, m" in denied
     assert f"'fleet/{HERON}/item'" in denied

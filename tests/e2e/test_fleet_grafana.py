@@ -27,7 +27,6 @@ NOW = datetime.datetime.now(tz=datetime.UTC)
 
 @pytest.fixture(scope="module")
 def database() -> Iterator[str]:
-    """With the fleet of the demonstration."""
     if INITDB is None:
         pytest.skip("no PostgreSQL")
     fleet = demo.fleet_of(demo.AIRCRAFT, NOW)

@@ -50,7 +50,6 @@ async def lived(folder: Path) -> None:
 
 
 async def told(folder: Path, location: Location) -> list[Any]:
-    """Return all items that the fleet receives from the folder."""
     aircraft = Aircraft(folder, location=location)
     async with aircraft.running():
         aircraft.connection.connect()

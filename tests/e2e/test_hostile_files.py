@@ -18,7 +18,6 @@ from tests.support.rig import Rig
 
 
 def changes(name: str, before: float) -> bytes:
-    """Encode a journal of one parameter."""
     return sealed(msgspec.json.encode(ChangeSet(1, (Changed(name, before=before, after=0.001),))))
 
 

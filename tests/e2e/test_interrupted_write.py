@@ -21,7 +21,6 @@ async def history(rig: Rig) -> list[str]:
 
 
 async def told(rig: Rig) -> str:
-    """The one line of an interruption."""
     lines = await history(rig)
     (heading,) = [at for at, line in enumerate(lines) if "interrupted (UTC)" in line]
     return lines[heading + 1]

@@ -91,47 +91,43 @@ def typed_lines(first: str) -> list[str]:
     return [line.strip() for line in block]
 
 
-def test_what_the_documentation_says_to_type(tmp_path: Path) -> None:
+async def test_what_the_documentation_says_to_type(tmp_path: Path) -> None:
     choose, calibrate, show, push, back = typed_lines("vehicle 1:191")
     load, everybody, message = typed_lines("module load message")
+    async with ground_line(tmp_path, "ardupilot") as line, mavproxy(tmp_path, line.port) as station:
+        autopilot = line.scenario.autopilot
+        before = autopilot.parameter("INS_ACCOFFS_X")
+        await station.prints(r"Detected vehicle 1:191")
+        await station.prints(r"Received \d+ parameters", within_s=30.0)
 
-    async def main() -> None:
-        async with ground_line(tmp_path, "ardupilot") as line, mavproxy(tmp_path, line.port) as station:
-            autopilot = line.scenario.autopilot
-            before = autopilot.parameter("INS_ACCOFFS_X")
-            await station.prints(r"Detected vehicle 1:191")
-            await station.prints(r"Received \d+ parameters", within_s=30.0)
+        await station.type(choose)
+        await station.prints(r"Set vehicle 1:191")
+        await station.type(calibrate)
+        await station.prints(r"Got COMMAND_ACK: USER_1: IN_PROGRESS", within_s=30.0)
+        await station.prints(r"AP: Calibration started: keep the aircraft still")
+        await station.prints(r"Got COMMAND_ACK: USER_1: ACCEPTED", within_s=60.0)
+        figures = await station.prints(r"AP: \.\.\. sigma [\d.]+ deg/h(?: warming)?, [\d.]+ mg")
+        record = (await line.daemon.ask("history"))["records"][0]
+        assert record["state"] == "done"
+        assert figures.endswith(record["reason"])
+        assert autopilot.parameter("INS_ACCOFFS_X") != before
 
-            await station.type(choose)
-            await station.prints(r"Set vehicle 1:191")
-            await station.type(calibrate)
-            await station.prints(r"Got COMMAND_ACK: USER_1: IN_PROGRESS", within_s=30.0)
-            await station.prints(r"AP: Calibration started: keep the aircraft still")
-            await station.prints(r"Got COMMAND_ACK: USER_1: ACCEPTED", within_s=60.0)
-            figures = await station.prints(r"AP: \.\.\. sigma [\d.]+ deg/h(?: warming)?, [\d.]+ mg")
-            record = (await line.daemon.ask("history"))["records"][0]
-            assert record["state"] == "done"
-            assert figures.endswith(record["reason"])
-            assert autopilot.parameter("INS_ACCOFFS_X") != before
+        place = len(station.printed)
+        await station.type(show)
+        await station.prints(r"CMP_STATE\s+1\.0", after=place)
+        await station.type(push.replace(" 1", " 0"))
+        await station.prints_when_asked("param show CMP_PUSH", r"CMP_PUSH\s+0\.0")
+        await station.type(push)
+        await station.prints_when_asked("param show CMP_PUSH", r"CMP_PUSH\s+1\.0")
+        await station.type(back)
+        await station.prints(r"Set vehicle 1:1 ", after=place)
 
-            place = len(station.printed)
-            await station.type(show)
-            await station.prints(r"CMP_STATE\s+1\.0", after=place)
-            await station.type(push.replace(" 1", " 0"))
-            await station.prints_when_asked("param show CMP_PUSH", r"CMP_PUSH\s+0\.0")
-            await station.type(push)
-            await station.prints_when_asked("param show CMP_PUSH", r"CMP_PUSH\s+1\.0")
-            await station.type(back)
-            await station.prints(r"Set vehicle 1:1 ", after=place)
-
-            autopilot.arm()
-            await asyncio.sleep(1.5)  # until the heartbeat says so
-            await station.type(load)
-            await station.prints(r"Loaded module message")
-            await station.type(everybody)
-            place = len(station.printed)
-            await station.type(message)
-            await station.prints(r"Got COMMAND_ACK: USER_1: DENIED", after=place)
-            await station.prints(r"AP: Calibration refused: armed: disarm first", after=place)
-
-    asyncio.run(main())
+        autopilot.arm()
+        await asyncio.sleep(1.5)  # until the heartbeat says so
+        await station.type(load)
+        await station.prints(r"Loaded module message")
+        await station.type(everybody)
+        place = len(station.printed)
+        await station.type(message)
+        await station.prints(r"Got COMMAND_ACK: USER_1: DENIED", after=place)
+        await station.prints(r"AP: Calibration refused: armed: disarm first", after=place)

@@ -16,7 +16,6 @@ WRONG = 'protocol = "vectornav"\nmounting = "ROTATION_ROLL_180"'
 
 
 def summary(rig: Rig, name: str) -> tuple[bool, str]:
-    """Return the line of `companion check`."""
     return next((each["good"], each["summary"]) for each in rig.service.status()["devices"] if each["name"] == name)
 
 

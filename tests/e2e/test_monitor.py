@@ -106,46 +106,43 @@ def words(text: str) -> list[str]:
     return [found["headline"]["word"] if "headline" in found else found["state"] for found in objects(text)]
 
 
-def test_in_a_pipe_and_on_a_terminal_through_a_calibration_and_a_restart(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight_line(tmp_path) as line, contextlib.AsyncExitStack() as stack:
-            as_json = await stack.enter_async_context(monitor(line.config, "--json"))
-            as_lines = await stack.enter_async_context(monitor(line.config))
-            drawn = await stack.enter_async_context(monitor(line.config, terminal=True))
-            await as_json.until(lambda text: "NOT CALIBRATED" in words(text))
-            await as_lines.until(lambda text: "NOT CALIBRATED: not calibrated yet" in text)
-            await drawn.until(lambda text: "N O T   C A L I B R A T E D" in text)
+async def test_in_a_pipe_and_on_a_terminal_through_a_calibration_and_a_restart(tmp_path: Path) -> None:
+    async with flight_line(tmp_path) as line, contextlib.AsyncExitStack() as stack:
+        as_json = await stack.enter_async_context(monitor(line.config, "--json"))
+        as_lines = await stack.enter_async_context(monitor(line.config))
+        drawn = await stack.enter_async_context(monitor(line.config, terminal=True))
+        await as_json.until(lambda text: "NOT CALIBRATED" in words(text))
+        await as_lines.until(lambda text: "NOT CALIBRATED: not calibrated yet" in text)
+        await drawn.until(lambda text: "N O T   C A L I B R A T E D" in text)
 
-            await companion("-c", str(line.config), "calibrate", "--no-wait", "--json")
-            await as_json.until(lambda text: any(word.startswith("MEASURING") for word in words(text)))
-            await drawn.until(lambda text: re.search(r"M E A S U R I N G .*\[#+\.*\] \d+ %", text, re.DOTALL))
-            await companion("-c", str(line.config), "cancel")
-            await as_lines.until(lambda text: "last calibration: cancelled" in text)
+        await companion("-c", str(line.config), "calibrate", "--no-wait", "--json")
+        await as_json.until(lambda text: any(word.startswith("MEASURING") for word in words(text)))
+        await drawn.until(lambda text: re.search(r"M E A S U R I N G .*\[#+\.*\] \d+ %", text, re.DOTALL))
+        await companion("-c", str(line.config), "cancel")
+        await as_lines.until(lambda text: "last calibration: cancelled" in text)
 
-            assert line.daemon is not None
-            line.daemon.kill()
-            await line.daemon.communicate()
-            await as_json.until(lambda text: words(text)[-1] == "unreachable")
-            await as_lines.until(lambda text: "NO DAEMON" in text)
-            await drawn.until(lambda text: "N O   D A E M O N" in text)
-            before = len(objects(as_json.text)), len(as_lines.text), len(drawn.text)
-            async with restarted(line):
-                await as_json.until(lambda text: "NOT CALIBRATED" in words(text)[before[0] :])
-                await as_lines.until(lambda text: "NOT CALIBRATED" in text[before[1] :])
-                await drawn.until(lambda text: "N O T   C A L I B R A T E D" in text[before[2] :])
-                for watched in (as_json, as_lines, drawn):
-                    assert await watched.interrupt() == DONE
-                    assert "Traceback" not in watched.text
+        assert line.daemon is not None
+        line.daemon.kill()
+        await line.daemon.communicate()
+        await as_json.until(lambda text: words(text)[-1] == "unreachable")
+        await as_lines.until(lambda text: "NO DAEMON" in text)
+        await drawn.until(lambda text: "N O   D A E M O N" in text)
+        before = len(objects(as_json.text)), len(as_lines.text), len(drawn.text)
+        async with restarted(line):
+            await as_json.until(lambda text: "NOT CALIBRATED" in words(text)[before[0] :])
+            await as_lines.until(lambda text: "NOT CALIBRATED" in text[before[1] :])
+            await drawn.until(lambda text: "N O T   C A L I B R A T E D" in text[before[2] :])
+            for watched in (as_json, as_lines, drawn):
+                assert await watched.interrupt() == DONE
+                assert "Traceback" not in watched.text
 
-            # A pipe gets lines with words in them, a terminal what fits, and its cursor back.
-            assert "\x1b" not in as_lines.text + as_json.text
-            printed = [line[9:] for line in as_lines.text.splitlines()]
-            assert len(printed) < 60, printed
-            assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in as_lines.text.splitlines())
-            await drawn.until(lambda text: text.endswith("\x1b[?25h\r\n"))
-            for frame in drawn.text.split("\x1b[H")[1:]:
-                plain = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", frame.partition("\x1b[J")[0]).split("\r\n")
-                assert len(plain) <= ROWS
-                assert max(map(len, plain)) <= COLUMNS
-
-    asyncio.run(main())
+        # A pipe gets lines with words in them, a terminal what fits, and its cursor back.
+        assert "\x1b" not in as_lines.text + as_json.text
+        printed = [line[9:] for line in as_lines.text.splitlines()]
+        assert len(printed) < 60, printed
+        assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in as_lines.text.splitlines())
+        await drawn.until(lambda text: text.endswith("\x1b[?25h\r\n"))
+        for frame in drawn.text.split("\x1b[H")[1:]:
+            plain = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", frame.partition("\x1b[J")[0]).split("\r\n")
+            assert len(plain) <= ROWS
+            assert max(map(len, plain)) <= COLUMNS

@@ -20,8 +20,6 @@ from tests.support.rig import Rig
 
 
 async def press(rig: Rig, button: str, /, **body: Any) -> tuple[int, str]:
-    """Press a button and return the answer."""
-
     async def ask(request: dict[str, Any]) -> AsyncGenerator[dict[str, Any], None]:
         async for reply in rig.service.faces.answer(request | {"face": "page"}):
             yield reply

@@ -52,15 +52,11 @@ def starved(process_id: int, port: int) -> None:
         asking.sendall(b"POST /cancel HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99\r\n\r\n")
 
 
-def test_the_page_runs_out_of_memory_and_returns(tmp_path: Path) -> None:
+async def test_the_page_runs_out_of_memory_and_returns(tmp_path: Path) -> None:
     """tests/e2e/test_child_processes.py has a child that is stopped or killed."""
-
-    async def main() -> None:
-        rig = rig_of(tmp_path, SECTION)
-        async with beside(rig) as page:
-            port, struck = await opened(page), page.process_id
-            assert struck is not None
-            assert await calibrated(rig, State.COLLECTING, lambda: starved(struck, port)) == "done"
-            assert await answer(await opened(page, struck)) == 200
-
-    asyncio.run(main())
+    rig = rig_of(tmp_path, SECTION)
+    async with beside(rig) as page:
+        port, struck = await opened(page), page.process_id
+        assert struck is not None
+        assert await calibrated(rig, State.COLLECTING, lambda: starved(struck, port)) == "done"
+        assert await answer(await opened(page, struck)) == 200

@@ -26,7 +26,6 @@ SPI_1 = 0x0A
 
 
 def device_id(kind: int, address: int = 1) -> int:
-    """Return the id that both firmwares make."""
     return kind << 16 | address << 8 | SPI_1
 
 

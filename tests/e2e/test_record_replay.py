@@ -160,26 +160,23 @@ def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 @pytest.mark.parametrize("floats", [False, True])
-def test_integers_and_the_floats_in_their_place_are_replayed_as_such(
+async def test_integers_and_the_floats_in_their_place_are_replayed_as_such(
     tmp_path: Path, firmware: str, floats: bool
 ) -> None:
-    async def main() -> list[Record]:
-        if firmware == "ardupilot":
-            rig = three_imus(tmp_path, script=floats, max_s=20.0)
-        else:
-            rig = px4(tmp_path, console=floats, max_s=20.0)
-        storage = msgspec.structs.replace(rig.config.storage, recordings_mb=64)
-        rig.config = msgspec.structs.replace(rig.config, storage=storage)
-        async with rig.running():
-            imus = rig.service.devices.imus.values()
-            await rig.until(lambda: all(imu.calibration is not None for imu in imus), 15.0)
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert (record.imus[1].gyro_bias_rad_s is not None) == floats
-            await asyncio.sleep(1.5)
-        return rig.service.calibrating.store.history()
-
-    (kept,) = run_virtual(main())
+    if firmware == "ardupilot":
+        rig = three_imus(tmp_path, script=floats, max_s=20.0)
+    else:
+        rig = px4(tmp_path, console=floats, max_s=20.0)
+    storage = msgspec.structs.replace(rig.config.storage, recordings_mb=64)
+    rig.config = msgspec.structs.replace(rig.config, storage=storage)
+    async with rig.running():
+        imus = rig.service.devices.imus.values()
+        await rig.until(lambda: all(imu.calibration is not None for imu in imus), 15.0)
+        result, record = await calibrated(rig)
+        assert result.outcome == "done", result
+        assert (record.imus[1].gyro_bias_rad_s is not None) == floats
+        await asyncio.sleep(1.5)
+    (kept,) = rig.service.calibrating.store.history()
     same(replay(ring(tmp_path)), [kept])
 
 
@@ -270,74 +267,62 @@ async def asked(rig: Rig, **request: Any) -> list[Object]:
     return [reply async for reply in rig.service.faces.answer({"command": "record", **request})]
 
 
-def test_recording_on_request(tmp_path: Path) -> None:
+async def test_recording_on_request(tmp_path: Path) -> None:
     path, absent = tmp_path / "mine.mcap", tmp_path / "nowhere" / "at" / "all.mcap"
-
-    async def main() -> None:
-        async with Rig(tmp_path, own_imu=True).running() as rig:
-            await rig.ready()
-            await asyncio.sleep(3.3)
-            replies = await asked(rig, file=str(path), seconds=14.0)
-            ended = replies[-1]
-            assert ended["state"] == "done"
-            assert ended["file"] == str(path)
-            assert 14.0 <= ended["seconds"] < 16.0
-            assert ended["bytes"] > 100_000
-            assert ended["lost"] == 0
-            assert len(replies) > 20
-            assert rig.service.status()["recording"]["file"] is None
-            # Until somebody stops it, and one at a time.
-            running = asyncio.create_task(asked(rig))
-            await asyncio.sleep(2.2)
-            status = rig.service.status()["recording"]["file"]
-            assert status["seconds"] == pytest.approx(2.2, abs=0.1)
-            with pytest.raises(StorageError, match=r"already recording to .*kept-001\.mcap; end it with"):
-                await asked(rig, file=str(tmp_path / "other.mcap"))
-            (stopped,) = await asked(rig, stop=True)
-            assert (await running)[-1]["file"] == stopped["file"] == str(tmp_path / "recordings" / "kept-001.mcap")
-            with pytest.raises(StorageError, match="nothing is being recorded"):
-                await asked(rig, stop=True)
-            # With a length, so that one that is not refused ends.
-            for refused, words in (
-                ({"file": str(path), "seconds": 5.0}, "exists already"),
-                (
-                    {"file": str(absent), "seconds": 5.0},
-                    f"{absent}: recording cannot be created: there is no folder {absent.parent}",
-                ),
-            ):
-                with pytest.raises(StorageError, match=words):
-                    await asked(rig, **refused)
-            assert not (tmp_path / "nowhere").exists()
-
-    run_virtual(main())
+    async with Rig(tmp_path, own_imu=True).running() as rig:
+        await rig.ready()
+        await asyncio.sleep(3.3)
+        replies = await asked(rig, file=str(path), seconds=14.0)
+        ended = replies[-1]
+        assert ended["state"] == "done"
+        assert ended["file"] == str(path)
+        assert 14.0 <= ended["seconds"] < 16.0
+        assert ended["bytes"] > 100_000
+        assert ended["lost"] == 0
+        assert len(replies) > 20
+        assert rig.service.status()["recording"]["file"] is None
+        # Until somebody stops it, and one at a time.
+        running = asyncio.create_task(asked(rig))
+        await asyncio.sleep(2.2)
+        status = rig.service.status()["recording"]["file"]
+        assert status["seconds"] == pytest.approx(2.2, abs=0.1)
+        with pytest.raises(StorageError, match=r"already recording to .*kept-001\.mcap; end it with"):
+            await asked(rig, file=str(tmp_path / "other.mcap"))
+        (stopped,) = await asked(rig, stop=True)
+        assert (await running)[-1]["file"] == stopped["file"] == str(tmp_path / "recordings" / "kept-001.mcap")
+        with pytest.raises(StorageError, match="nothing is being recorded"):
+            await asked(rig, stop=True)
+        # With a length, so that one that is not refused ends.
+        for refused, words in (
+            ({"file": str(path), "seconds": 5.0}, "exists already"),
+            (
+                {"file": str(absent), "seconds": 5.0},
+                f"{absent}: recording cannot be created: there is no folder {absent.parent}",
+            ),
+        ):
+            with pytest.raises(StorageError, match=words):
+                await asked(rig, **refused)
+        assert not (tmp_path / "nowhere").exists()
     result = replay([path])
     assert result.calibrations == []
     assert result.seconds == pytest.approx(14.5, abs=1.0)
 
 
 @pytest.mark.parametrize(("seconds", "state"), [(None, "done"), (60.0, "failed")])
-def test_a_recording_leaves_a_tenth_of_the_disk_free(
+async def test_a_recording_leaves_a_tenth_of_the_disk_free(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float | None, state: str
 ) -> None:
     free = 11 << 30
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=100 << 30, free=free))
-
-    async def main() -> Object:
-        nonlocal free
-        async with asyncio.timeout(300.0), Rig(tmp_path).running() as rig:
-            running = asyncio.create_task(asked(rig, file=str(tmp_path / "mine.mcap"), seconds=seconds))
-            await asyncio.sleep(5.0)
-            assert not running.done()
-            free = 9 << 30
-            ended = (await running)[-1]
-            with pytest.raises(
-                StorageError, match=r"other\.mcap: recording cannot be created: less than 10 % of the disk"
-            ):
-                await asked(rig, file=str(tmp_path / "other.mcap"), seconds=5.0)
-        assert not (tmp_path / "other.mcap").exists()
-        return ended
-
-    ended = run_virtual(main())
+    async with asyncio.timeout(300.0), Rig(tmp_path).running() as rig:
+        running = asyncio.create_task(asked(rig, file=str(tmp_path / "mine.mcap"), seconds=seconds))
+        await asyncio.sleep(5.0)
+        assert not running.done()
+        free = 9 << 30
+        ended = (await running)[-1]
+        with pytest.raises(StorageError, match=r"other\.mcap: recording cannot be created: less than 10 % of the disk"):
+            await asked(rig, file=str(tmp_path / "other.mcap"), seconds=5.0)
+    assert not (tmp_path / "other.mcap").exists()
     reason = "less than 10 % of the disk free (9.7 of 107.4 GB)"
     assert (ended["state"], ended["reason"]) == (state, reason)
     assert replay([tmp_path / "mine.mcap"]).cut_short is None

@@ -70,85 +70,69 @@ async def service(
                 yield scenario, daemon, manager
 
 
-def test_ready_status_watchdog_and_stop(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with service(tmp_path) as (_, daemon, manager):
-            # Ready means that it can be talked to, and not a moment earlier.
-            assert await daemon.status() is not None
-            await manager.until("STATUS", "ArduPilot")
-            await manager.until("STATUS", "gradienter, compass good")
-            assert "disarmed" in manager.status
-            assert manager.status.startswith(("WAIT", "HOLD STILL", "NOT"))
-            await manager.until("WATCHDOG", count=5)
+async def test_ready_status_watchdog_and_stop(tmp_path: Path) -> None:
+    async with service(tmp_path) as (_, daemon, manager):
+        # Ready means that it can be talked to, and not a moment earlier.
+        assert await daemon.status() is not None
+        await manager.until("STATUS", "ArduPilot")
+        await manager.until("STATUS", "gradienter, compass good")
+        assert "disarmed" in manager.status
+        assert manager.status.startswith(("WAIT", "HOLD STILL", "NOT"))
+        await manager.until("WATCHDOG", count=5)
+        fed = manager.times("WATCHDOG")
+        assert max(after - before for before, after in itertools.pairwise(fed)) < WATCHDOG_S
+        daemon.signal(signal.SIGTERM)
+        assert await daemon.ended(10.0) == 0
+        assert manager.times("STOPPING")
+        assert len(manager.times("READY")) == 1
+        assert not (tmp_path / "control.sock").exists()
+
+
+async def test_a_task_that_hangs_starves_the_watchdog_and_is_named(tmp_path: Path) -> None:
+    name = "MAVLink component"
+    entry = ("-c", HANGING.replace("{patch}", "MavlinkComponent.run = for_ever"))
+    async with service(tmp_path, entry=entry) as (_, daemon, manager):
+        await manager.until("STATUS", f"HUNG: {name}")
+        starved_s = asyncio.get_running_loop().time()
+        statuses = len(manager.messages)
+        await asyncio.sleep(1.5 * WATCHDOG_S)
+        # The loop turns and the status goes on, but nobody feeds the watchdog any more.
+        assert max(manager.times("WATCHDOG")) < starved_s
+        assert len(manager.messages) >= statuses
+        (line,) = [line for line in daemon.log().splitlines() if "watchdog:" in line]
+        assert f"watchdog: {name} did not run for" in line
+        assert "waits in" in line
+
+
+async def test_where_the_whole_process_stands_still_is_in_the_log(tmp_path: Path) -> None:
+    """The loop itself is blocked, nobody is fed, and the manager's SIGABRT finds out where."""
+    patch = "import time\ndef block(*_):\n    time.sleep(1000)\nMavlinkComponent._step = block"
+    async with service(tmp_path, entry=("-c", HANGING.replace("{patch}", patch))) as (_, daemon, manager):
+        await asyncio.sleep(WATCHDOG_S)
+        assert len(manager.times("WATCHDOG")) <= 1
+        daemon.signal(signal.SIGABRT)
+        assert await daemon.ended(10.0) == -signal.SIGABRT
+        assert "Fatal Python error: Aborted" in daemon.log()
+        assert ", line " in daemon.log()
+        assert " in block" in daemon.log()
+
+
+async def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_path: Path) -> None:
+    """Waiting for a device keeps the watchdog alive; only an endless wait counts as hung."""
+    entry = ("-c", HANGING.replace("{patch}", ""))
+    (tmp_path / "companion.toml").write_text(NOTHING_THERE.format(folder=tmp_path))
+    with NotifySocket(tmp_path / "notify") as manager:
+        environment = manager.environment(WATCHDOG_S)
+        async with CompanionProcess(tmp_path, environment=environment, entry=entry) as daemon:
+            await manager.until("READY")
+            await manager.until("WATCHDOG", count=20)
             fed = manager.times("WATCHDOG")
             assert max(after - before for before, after in itertools.pairwise(fed)) < WATCHDOG_S
-            daemon.signal(signal.SIGTERM)
-            assert await daemon.ended(10.0) == 0
-            assert manager.times("STOPPING")
-            assert len(manager.times("READY")) == 1
-            assert not (tmp_path / "control.sock").exists()
-
-    asyncio.run(main())
-
-
-def test_a_task_that_hangs_starves_the_watchdog_and_is_named(tmp_path: Path) -> None:
-    name = "MAVLink component"
-
-    async def main() -> None:
-        entry = ("-c", HANGING.replace("{patch}", "MavlinkComponent.run = for_ever"))
-        async with service(tmp_path, entry=entry) as (_, daemon, manager):
-            await manager.until("STATUS", f"HUNG: {name}")
-            starved_s = asyncio.get_running_loop().time()
-            statuses = len(manager.messages)
-            await asyncio.sleep(1.5 * WATCHDOG_S)
-            # The loop turns and the status goes on, but nobody feeds the watchdog any more.
-            assert max(manager.times("WATCHDOG")) < starved_s
-            assert len(manager.messages) >= statuses
-            (line,) = [line for line in daemon.log().splitlines() if "watchdog:" in line]
-            assert f"watchdog: {name} did not run for" in line
-            assert "waits in" in line
-
-    asyncio.run(main())
-
-
-def test_where_the_whole_process_stands_still_is_in_the_log(tmp_path: Path) -> None:
-    """The loop itself is blocked, nobody is fed, and the manager's SIGABRT finds out where."""
-
-    async def main() -> None:
-        patch = "import time\ndef block(*_):\n    time.sleep(1000)\nMavlinkComponent._step = block"
-        async with service(tmp_path, entry=("-c", HANGING.replace("{patch}", patch))) as (_, daemon, manager):
-            await asyncio.sleep(WATCHDOG_S)
-            assert len(manager.times("WATCHDOG")) <= 1
-            daemon.signal(signal.SIGABRT)
-            assert await daemon.ended(10.0) == -signal.SIGABRT
-            assert "Fatal Python error: Aborted" in daemon.log()
-            assert ", line " in daemon.log()
-            assert " in block" in daemon.log()
-
-    asyncio.run(main())
-
-
-def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_path: Path) -> None:
-    """Waiting for a device keeps the watchdog alive; only an endless wait counts as hung."""
-
-    async def main() -> None:
-        entry = ("-c", HANGING.replace("{patch}", ""))
-        (tmp_path / "companion.toml").write_text(NOTHING_THERE.format(folder=tmp_path))
-        with NotifySocket(tmp_path / "notify") as manager:
-            environment = manager.environment(WATCHDOG_S)
-            async with CompanionProcess(tmp_path, environment=environment, entry=entry) as daemon:
-                await manager.until("READY")
-                await manager.until("WATCHDOG", count=20)
-                fed = manager.times("WATCHDOG")
-                assert max(after - before for before, after in itertools.pairwise(fed)) < WATCHDOG_S
-                assert "watchdog:" not in daemon.log()
-                assert "compass: " in manager.status
-
-    asyncio.run(main())
+            assert "watchdog:" not in daemon.log()
+            assert "compass: " in manager.status
 
 
 def offsets(scenario: Scenario) -> dict[str, float]:
-    """Offsets in the autopilot."""
     return {
         name: scenario.autopilot.parameter(name)
         for instance in (1, 2)
@@ -166,28 +150,25 @@ async def calibrate(daemon: CompanionProcess) -> None:
     assert await asking.wait() == 0
 
 
-def test_sigterm_in_a_write_leaves_the_old_values(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with service(tmp_path) as (scenario, daemon, manager):
-            before = offsets(scenario)
-            await calibrate(daemon)
-            async with asyncio.timeout(60.0):
-                while offsets(scenario) == before:  # the double has no event for a write
-                    await asyncio.sleep(0.02)
-            daemon.signal(signal.SIGTERM)
-            await manager.until("STOPPING")
-            daemon.signal(signal.SIGTERM)  # an impatient second one cuts nothing off
-            assert await daemon.ended(30.0) == 0
-            assert offsets(scenario) == before
-            assert "Calibration cancelled" in daemon.log()
-            assert "already stopping" in daemon.log()
-            # Nothing is left for the next start to put in order.
-            async with CompanionProcess(tmp_path) as again:
-                await again.ready()
-                status = await again.status()
-                assert status is not None
-                assert not status["putting_back"]
-                assert status["fault"] is None
-                assert status["last"]["state"] == "cancelled"
-
-    asyncio.run(main())
+async def test_sigterm_in_a_write_leaves_the_old_values(tmp_path: Path) -> None:
+    async with service(tmp_path) as (scenario, daemon, manager):
+        before = offsets(scenario)
+        await calibrate(daemon)
+        async with asyncio.timeout(60.0):
+            while offsets(scenario) == before:  # the double has no event for a write
+                await asyncio.sleep(0.02)
+        daemon.signal(signal.SIGTERM)
+        await manager.until("STOPPING")
+        daemon.signal(signal.SIGTERM)  # an impatient second one cuts nothing off
+        assert await daemon.ended(30.0) == 0
+        assert offsets(scenario) == before
+        assert "Calibration cancelled" in daemon.log()
+        assert "already stopping" in daemon.log()
+        # Nothing is left for the next start to put in order.
+        async with CompanionProcess(tmp_path) as again:
+            await again.ready()
+            status = await again.status()
+            assert status is not None
+            assert not status["putting_back"]
+            assert status["fault"] is None
+            assert status["last"]["state"] == "cancelled"

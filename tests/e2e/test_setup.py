@@ -56,7 +56,6 @@ class SetupBench:
         return ["-c", str(self.file), "setup", *paths, "--udp", str(silent or self.udp)]
 
     def configuration(self) -> dict[str, Any]:
-        """Content of the file."""
         return tomllib.loads(self.file.read_text())
 
     def left(self) -> set[str]:
@@ -147,143 +146,126 @@ async def by_script(made: SetupBench, *words: str) -> tuple[int, Any, str]:
     return await process.wait(), json.loads(out) if out else None, err.decode()
 
 
-def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
-            said = await terminal.says("Ctrl-C ends")
-            assert made.told == [], "it only listens"
-            assert f"UDP {made.udp}: ArduPilot, system 1" in said
-            await answered(terminal, "", "eu", "180", "0", "yaw 90")
-            await terminal.says("IMU 1: its device id tells no part of the catalogue")
-            await terminal.answer("It has IMU 2 too", "")
-            await terminal.answer(r"IMU 1 of the autopilot \(fc\).*adis16470 13", "ICM-42688-P")
-            await terminal.answer(r"the own IMU \(own\)", "bmi")
-            await terminal.answer(r"IMU 2 of the autopilot \(fc2\)", "")
-            assert made.left() == set()
-            shown = await terminal.says(r"Write it\?")
-            assert 'law = "euler"' in shown
-            await terminal.answer("", "")
-            checked = await terminal.says("Next:")
-            assert await terminal.ended() == 0, terminal.screen
-            assert not re.search("^wrong", checked, re.MULTILINE)
-            assert "calibrate" in terminal.screen
-            assert "align zero   (once: the gradienter's zero; until then accelerometers to 0.9 mg)" in terminal.screen
-            assert made.configuration()["mavlink"]["url"] == f"udpin:127.0.0.1:{made.udp}"
-            assert made.configuration()["gradienter"] == {
-                "port": str(tmp_path / "gradienter"), "protocol": "inclinometer_xy", "law": "euler", "baud": 9600,
-                "parity": "none", "mounting": "ROTATION_YAW_180",
-            }  # fmt: skip
-            assert made.configuration()["compass"]["protocol"] == "hmr3300"
-            assert made.configuration()["compass"]["baud"] == 19200
-            first, own, second = made.configuration()["imu"]
-            assert own["mounting"] == "ROTATION_YAW_90"
-            assert (first["source"], second) == ("autopilot", {"name": "fc2", "source": "autopilot", "instance": 2})
-            assert (first["profile"], own["profile"]) == ("icm42688p", "bmi088")
-            assert re.search("^ok +profile fc +icm42688p", checked, re.MULTILINE)
-            assert re.search(
-                "^warning +profile +fc2: part unknown: its noise is learned at rest", checked, re.MULTILINE
-            )
-            assert re.search(r"ok +fc2 +autopilot IMU 2", checked), "what is there, and nothing of the third"
-            assert "IMU 3" not in terminal.screen
-            assert made.left() == {"companion.toml"}
-
-    asyncio.run(main())
+async def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> None:
+    async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
+        said = await terminal.says("Ctrl-C ends")
+        assert made.told == [], "it only listens"
+        assert f"UDP {made.udp}: ArduPilot, system 1" in said
+        await answered(terminal, "", "eu", "180", "0", "yaw 90")
+        await terminal.says("IMU 1: its device id tells no part of the catalogue")
+        await terminal.answer("It has IMU 2 too", "")
+        await terminal.answer(r"IMU 1 of the autopilot \(fc\).*adis16470 13", "ICM-42688-P")
+        await terminal.answer(r"the own IMU \(own\)", "bmi")
+        await terminal.answer(r"IMU 2 of the autopilot \(fc2\)", "")
+        assert made.left() == set()
+        shown = await terminal.says(r"Write it\?")
+        assert 'law = "euler"' in shown
+        await terminal.answer("", "")
+        checked = await terminal.says("Next:")
+        assert await terminal.ended() == 0, terminal.screen
+        assert not re.search("^wrong", checked, re.MULTILINE)
+        assert "calibrate" in terminal.screen
+        assert "align zero   (once: the gradienter's zero; until then accelerometers to 0.9 mg)" in terminal.screen
+        assert made.configuration()["mavlink"]["url"] == f"udpin:127.0.0.1:{made.udp}"
+        assert made.configuration()["gradienter"] == {
+            "port": str(tmp_path / "gradienter"), "protocol": "inclinometer_xy", "law": "euler", "baud": 9600,
+            "parity": "none", "mounting": "ROTATION_YAW_180",
+        }  # fmt: skip
+        assert made.configuration()["compass"]["protocol"] == "hmr3300"
+        assert made.configuration()["compass"]["baud"] == 19200
+        first, own, second = made.configuration()["imu"]
+        assert own["mounting"] == "ROTATION_YAW_90"
+        assert (first["source"], second) == ("autopilot", {"name": "fc2", "source": "autopilot", "instance": 2})
+        assert (first["profile"], own["profile"]) == ("icm42688p", "bmi088")
+        assert re.search("^ok +profile fc +icm42688p", checked, re.MULTILINE)
+        assert re.search("^warning +profile +fc2: part unknown: its noise is learned at rest", checked, re.MULTILINE)
+        assert re.search(r"ok +fc2 +autopilot IMU 2", checked), "what is there, and nothing of the third"
+        assert "IMU 3" not in terminal.screen
+        assert made.left() == {"companion.toml"}
 
 
-def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, firmware="px4", on_wire=True) as made:
-            code, answer, told = await by_script(made, *made.words("telem"), "--platform", "deck")
-            assert answer["heard"][str(tmp_path / "telem")] == "PX4, system 1 (57600 8N1)"
-            assert code == 0, told
-            assert made.configuration()["mavlink"]["url"] == f"serial:{tmp_path}/telem:57600"
-            assert made.configuration()["vehicle"]["platform"] == "deck"
-            assert made.configuration().keys() & {"gradienter", "compass"} == set()
-            assert (answer["state"], answer["reason"], answer["guessed"]) == (
-                "done",
-                "",
-                ["imu.fc.profile", "imu.fc2.profile"],
-            )
-            assert [finding["name"] for finding in answer["findings"] if not finding["good"]] == []
-            assert "no gradienter: gyros only" in told.lower()
-            assert [imu["name"] for imu in made.configuration()["imu"]] == ["fc", "fc2"]
-            assert made.configuration()["storage"]["directory"] == str(tmp_path / "companion-state")
-            assert answer["next"][-1].split("   ")[0] == f"companion -c {made.file} calibrate"
-
-    asyncio.run(main())
+async def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path) -> None:
+    async with bench(tmp_path, firmware="px4", on_wire=True) as made:
+        code, answer, told = await by_script(made, *made.words("telem"), "--platform", "deck")
+        assert answer["heard"][str(tmp_path / "telem")] == "PX4, system 1 (57600 8N1)"
+        assert code == 0, told
+        assert made.configuration()["mavlink"]["url"] == f"serial:{tmp_path}/telem:57600"
+        assert made.configuration()["vehicle"]["platform"] == "deck"
+        assert made.configuration().keys() & {"gradienter", "compass"} == set()
+        assert (answer["state"], answer["reason"], answer["guessed"]) == (
+            "done",
+            "",
+            ["imu.fc.profile", "imu.fc2.profile"],
+        )
+        assert [finding["name"] for finding in answer["findings"] if not finding["good"]] == []
+        assert "no gradienter: gyros only" in told.lower()
+        assert [imu["name"] for imu in made.configuration()["imu"]] == ["fc", "fc2"]
+        assert made.configuration()["storage"]["directory"] == str(tmp_path / "companion-state")
+        assert answer["next"][-1].split("   ")[0] == f"companion -c {made.file} calibrate"
 
 
 @pytest.mark.parametrize("at", [0, 3, 10])
-def test_whoever_ends_it_at_any_question_leaves_all_as_it_was(tmp_path: Path, at: int) -> None:
-    async def main() -> None:
-        async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
-            if at:
-                await terminal.says("Ctrl-C ends")
-                for _ in range(at - 1):
-                    await terminal.answer("")
+async def test_whoever_ends_it_at_any_question_leaves_all_as_it_was(tmp_path: Path, at: int) -> None:
+    async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
+        if at:
+            await terminal.says("Ctrl-C ends")
+            for _ in range(at - 1):
+                await terminal.answer("")
+            await terminal.says("> ")
+            terminal.types(CTRL_D if at == 3 else CTRL_C)
+        else:
+            await terminal.says("Listening")
+            terminal.types(CTRL_C)
+        assert await terminal.ended() == 1, terminal.screen
+        await terminal.says("nothing was written")
+        assert "Traceback" not in terminal.screen
+        assert made.left() == set()
+        assert made.told == [] or at > len(LINES) + 2, "the autopilot is asked after these questions"
+
+
+async def test_bad_answers_get_one_line_each_and_are_asked_again(tmp_path: Path) -> None:
+    async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
+        for question, *bad in (
+            ("on the ground", "water"),
+            ("axis, slope, euler or test", "x" * 3000, "\x1b[2J"),
+            ("gradienter turned", "90 0", "ROTATION_ROLL_180"),
+            ("Which part", "mpu6000", "adis", "\x00"),
+            (r"Write it\?", "perhaps"),
+        ):
+            await terminal.says(f"(?s){question}.*?> ")
+            for words in bad:
+                terminal.types(f"{words}\n")
+                complaint = await terminal.says("\n  .*found .*; allowed.*\n")
+                assert len(complaint.splitlines()[-1]) < 250
                 await terminal.says("> ")
-                terminal.types(CTRL_D if at == 3 else CTRL_C)
-            else:
-                await terminal.says("Listening")
-                terminal.types(CTRL_C)
-            assert await terminal.ended() == 1, terminal.screen
-            await terminal.says("nothing was written")
-            assert "Traceback" not in terminal.screen
-            assert made.left() == set()
-            assert made.told == [] or at > len(LINES) + 2, "the autopilot is asked after these questions"
-
-    asyncio.run(main())
+            terminal.types("\n" if "test" not in question else "axis\n")
+        assert await terminal.ended() == 0
+        assert made.configuration()["gradienter"]["law"] == "axis"
 
 
-def test_bad_answers_get_one_line_each_and_are_asked_again(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
-            for question, *bad in (
-                ("on the ground", "water"),
-                ("axis, slope, euler or test", "x" * 3000, "\x1b[2J"),
-                ("gradienter turned", "90 0", "ROTATION_ROLL_180"),
-                ("Which part", "mpu6000", "adis", "\x00"),
-                (r"Write it\?", "perhaps"),
-            ):
-                await terminal.says(f"(?s){question}.*?> ")
-                for words in bad:
-                    terminal.types(f"{words}\n")
-                    complaint = await terminal.says("\n  .*found .*; allowed.*\n")
-                    assert len(complaint.splitlines()[-1]) < 250
-                    await terminal.says("> ")
-                terminal.types("\n" if "test" not in question else "axis\n")
-            assert await terminal.ended() == 0
-            assert made.configuration()["gradienter"]["law"] == "axis"
-
-    asyncio.run(main())
-
-
-def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path) as made:
-            first = [*made.words("gradienter"), "--no-check"]
-            assert (await by_script(made, *first, "--law", "slope"))[0] == 0
-            made.file.write_text(made.file.read_text().replace('"slope"', '"slope"  # by two positions') + "# mine\n")
-            made.file.chmod(0o600)
-            before = made.file.read_bytes()
-            code, answer, _ = await by_script(made, *first)
-            assert (code, answer["state"], answer["kept"]) == (0, "unchanged", None)
-            assert made.file.read_bytes() == before
-            async with Terminal(first, tmp_path) as terminal:
-                await terminal.answer("on the ground", "deck")
-                await terminal.answer("axis, slope or euler")
-                await terminal.answer("gradienter turned")
-                await terminal.answer("Which part")
-                await terminal.answer(r"Write it\?")
-                assert await terminal.ended() == 0, terminal.screen
-            assert made.configuration()["vehicle"]["platform"] == "deck"
-            assert 'law = "slope"  # by two positions\n' in made.file.read_text()
-            assert made.file.read_text().endswith("# mine\n")
-            assert made.file.stat().st_mode & 0o777 == 0o600
-            assert made.file.with_name("companion.toml.old1").read_bytes() == before
-            assert made.left() == {"companion.toml", "companion.toml.old1"}
-
-    asyncio.run(main())
+async def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> None:
+    async with bench(tmp_path) as made:
+        first = [*made.words("gradienter"), "--no-check"]
+        assert (await by_script(made, *first, "--law", "slope"))[0] == 0
+        made.file.write_text(made.file.read_text().replace('"slope"', '"slope"  # by two positions') + "# mine\n")
+        made.file.chmod(0o600)
+        before = made.file.read_bytes()
+        code, answer, _ = await by_script(made, *first)
+        assert (code, answer["state"], answer["kept"]) == (0, "unchanged", None)
+        assert made.file.read_bytes() == before
+        async with Terminal(first, tmp_path) as terminal:
+            await terminal.answer("on the ground", "deck")
+            await terminal.answer("axis, slope or euler")
+            await terminal.answer("gradienter turned")
+            await terminal.answer("Which part")
+            await terminal.answer(r"Write it\?")
+            assert await terminal.ended() == 0, terminal.screen
+        assert made.configuration()["vehicle"]["platform"] == "deck"
+        assert 'law = "slope"  # by two positions\n' in made.file.read_text()
+        assert made.file.read_text().endswith("# mine\n")
+        assert made.file.stat().st_mode & 0o777 == 0o600
+        assert made.file.with_name("companion.toml.old1").read_bytes() == before
+        assert made.left() == {"companion.toml", "companion.toml.old1"}
 
 
 @pytest.mark.parametrize(
@@ -297,33 +279,27 @@ def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> 
         (["--mavlink", "udpin:0.0.0.0:14550", "--part", "fc=mpu6000", "--no-check"], "imu.fc.profile: found 'mpu6000'"),
     ],
 )
-def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[str], reason: str) -> None:
-    async def main() -> None:
-        made = SetupBench(tmp_path)
-        code, _, told = await by_script(made, *made.words("nobody"), *words)
-        assert code in (1, 2)
-        assert reason in told.splitlines()[-1]
-        assert told.splitlines()[-1].endswith("nothing was written")
+async def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[str], reason: str) -> None:
+    made = SetupBench(tmp_path)
+    code, _, told = await by_script(made, *made.words("nobody"), *words)
+    assert code in (1, 2)
+    assert reason in told.splitlines()[-1]
+    assert told.splitlines()[-1].endswith("nothing was written")
+    assert made.left() == set()
+
+
+async def test_a_law_that_nothing_tells_is_not_guessed(tmp_path: Path) -> None:
+    async with bench(tmp_path) as made:
+        code, _, told = await by_script(made, *made.words("gradienter"), "--no-check")
+        assert code == 2
+        assert "inclinometer_xy does not tell; name it by --law" in told.splitlines()[-1]
         assert made.left() == set()
-
-    asyncio.run(main())
-
-
-def test_a_law_that_nothing_tells_is_not_guessed(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path) as made:
-            code, _, told = await by_script(made, *made.words("gradienter"), "--no-check")
-            assert code == 2
-            assert "inclinometer_xy does not tell; name it by --law" in told.splitlines()[-1]
-            assert made.left() == set()
-        async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
-            await terminal.answer("on the ground", "?")
-            await terminal.says("a boat, a dock")
-            await terminal.answer("", "boat")
-            await terminal.answer("axis, slope, euler or test")
-            await terminal.says("found ''; allowed: axis, slope, euler, test")
-
-    asyncio.run(main())
+    async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
+        await terminal.answer("on the ground", "?")
+        await terminal.says("a boat, a dock")
+        await terminal.answer("", "boat")
+        await terminal.answer("axis, slope, euler or test")
+        await terminal.says("found ''; allowed: axis, slope, euler, test")
 
 
 @pytest.mark.parametrize("works", [True, False])
@@ -358,20 +334,17 @@ def test_the_service_is_started_with_it(
         assert answer["next"][0].startswith("sudo systemctl enable --now companion ")
 
 
-def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:
-    async def main() -> None:
-        made = SetupBench(tmp_path)
-        made.file.write_text("[mavlnk]\n")
-        code, _, told = await by_script(made, *made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550")
-        assert code == 2
-        assert "did you mean 'mavlink'?; nothing was written" in told
-        async with Terminal([*made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550", "--no-check"], tmp_path) as one:
-            await one.answer("Begin anew", "yes")
-            await one.answer("on the ground")
-            await one.answer("Which part")
-            await one.answer(r"Write it\?")
-            assert await one.ended() == 0
-        assert made.configuration()["mavlink"]["url"] == "udpin:0.0.0.0:14550"
-        assert made.file.with_name("companion.toml.old1").read_text() == "[mavlnk]\n"
-
-    asyncio.run(main())
+async def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:
+    made = SetupBench(tmp_path)
+    made.file.write_text("[mavlnk]\n")
+    code, _, told = await by_script(made, *made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550")
+    assert code == 2
+    assert "did you mean 'mavlink'?; nothing was written" in told
+    async with Terminal([*made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550", "--no-check"], tmp_path) as one:
+        await one.answer("Begin anew", "yes")
+        await one.answer("on the ground")
+        await one.answer("Which part")
+        await one.answer(r"Write it\?")
+        assert await one.ended() == 0
+    assert made.configuration()["mavlink"]["url"] == "udpin:0.0.0.0:14550"
+    assert made.file.with_name("companion.toml.old1").read_text() == "[mavlnk]\n"

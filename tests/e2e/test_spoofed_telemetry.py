@@ -17,7 +17,6 @@ from companion.daemon.job import Job
 from companion.estimation.machine import What
 from sim.imu_model import MG
 from tests.support.rig import ACCEL_BIAS_MG, Rig
-from tests.support.virtual_time import run_virtual
 
 Message = mavlink.MAVLink_message
 QUICK: dict[str, Any] = {"min_still_s": 5.0, "max_s": 10.0, "imu_rate_hz": 10.0}
@@ -60,22 +59,19 @@ def restarted() -> Message:
     return mavlink.MAVLink_system_time_message(0, 5)
 
 
-def test_an_announced_offset_that_is_not_in_force_disturbs_nothing(
+async def test_an_announced_offset_that_is_not_in_force_disturbs_nothing(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            async with spoofed(rig, 3.0, announced):
-                job = calibrate(rig)
-                async with asyncio.timeout(60.0):
-                    result = await job.finished
-            assert result.outcome == "done"
-            assert job.record is not None
-            found = np.array(job.record.imus[0].accel_bias_m_s2) / MG
-            assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
-
-    run_virtual(main())
+    async with Rig(tmp_path).running() as rig:
+        await rig.ready()
+        async with spoofed(rig, 3.0, announced):
+            job = calibrate(rig)
+            async with asyncio.timeout(60.0):
+                result = await job.finished
+        assert result.outcome == "done"
+        assert job.record is not None
+        found = np.array(job.record.imus[0].accel_bias_m_s2) / MG
+        assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
     assert "INS_GYROFFS_X = 0.3 was announced but is not active" in caplog.text
 
 

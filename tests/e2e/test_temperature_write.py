@@ -79,11 +79,9 @@ class Warm(Rig):
         return {name: self.double.parameter(name) for name in (*TCAL, *OFFSETS, *more)}
 
     def left_deg_h(self) -> Any:
-        """In its output, vehicle FRD."""
         return self.double.residual(1, self.now_s).gyro_rad_s / DEG_H
 
     def left_mg(self) -> Any:
-        """Error left in the accelerometers."""
         return self.double.residual(1, self.now_s).accel_m_s2 / MG
 
 

@@ -29,7 +29,6 @@ OTHER_ACCEL_MG = (-20.0, 15.0, 30.0)
 
 
 def values(double: AutopilotDouble) -> dict[str, float]:
-    """All its parameters, as they are now."""
     assert isinstance(double, ArduPilotDouble | PX4Double)
     return dict(double.parameters.values)
 

@@ -69,20 +69,17 @@ async def main_process(machine: Machine) -> str:
     return (await machine.show("companion", "MainPID"))["MainPID"]
 
 
-def test_the_life_of_the_service(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with booted(tmp_path) as machine, aircraft(tmp_path) as configuration:
-            await set_up(machine, configuration)
-            await installed(machine, configuration)
-            await restricted(machine)
-            await serial_ports_alone(machine)
-            await spoken_to_by_the_group_alone(machine)
-            await calibrated(machine)
-            await killed(machine)
-            await hung(machine)
-            await removed(machine)
-
-    asyncio.run(main())
+async def test_the_life_of_the_service(tmp_path: Path) -> None:
+    async with booted(tmp_path) as machine, aircraft(tmp_path) as configuration:
+        await set_up(machine, configuration)
+        await installed(machine, configuration)
+        await restricted(machine)
+        await serial_ports_alone(machine)
+        await spoken_to_by_the_group_alone(machine)
+        await calibrated(machine)
+        await killed(machine)
+        await hung(machine)
+        await removed(machine)
 
 
 async def set_up(machine: Machine, configuration: str) -> None:

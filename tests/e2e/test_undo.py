@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -63,29 +64,23 @@ async def undone(rig: Rig, *, force: bool = False) -> JobResult:
     return await started(rig.service.calibrating.manager.start_undo("test", force=force)).finished
 
 
-def test_each_undo_takes_one_step_back_to_the_bit_says_which_and_then_there_is_nothing(tmp_path: Path) -> None:
+async def test_each_undo_takes_one_step_back_to_the_bit_says_which_and_then_there_is_nothing(tmp_path: Path) -> None:
     wanted = written(tmp_path)
-
-    async def main() -> None:
-        async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
-            await rig.ready()
-            for left, (what, values) in enumerate(zip(STEPS, wanted[1:], strict=True), 1):
-                rig.ground.command(UNDO)
-                await rig.until(lambda left=left: len(rig.ground.finals(UNDO)) == left, 30.0)  # type: ignore[misc]
-                assert read(rig) == values
-                assert any(words.endswith(f"old values restored: {what}") for words in rig.ground.texts())
-                assert steps(rig) == list(STEPS[left:])
+    async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
+        await rig.ready()
+        for left, (what, values) in enumerate(zip(STEPS, wanted[1:], strict=True), 1):
             rig.ground.command(UNDO)
-            await rig.until(lambda: rig.ground.finals(UNDO) == [*[ACCEPTED] * len(STEPS), DENIED], 30.0)
-            assert "Undo refused: nothing to undo" in rig.ground.texts()
-
-    run_virtual(main())
-    assert not list(tmp_path.glob("undo-*"))
+            await rig.until(lambda left=left: len(rig.ground.finals(UNDO)) == left, 30.0)  # type: ignore[misc]
+            assert read(rig) == values
+            assert any(words.endswith(f"old values restored: {what}") for words in rig.ground.texts())
+            assert steps(rig) == list(STEPS[left:])
+        rig.ground.command(UNDO)
+        await rig.until(lambda: rig.ground.finals(UNDO) == [*[ACCEPTED] * len(STEPS), DENIED], 30.0)
+        assert "Undo refused: nothing to undo" in rig.ground.texts()
+    assert not any("undo-" in name for name in os.listdir(tmp_path))
 
 
 class Cut(NamedTuple):
-    """State left by a power cut."""
-
     folder: Path
     parameters: Values
 

@@ -28,8 +28,6 @@ _STYLE: Final = (
 
 
 class TerminalLine(NamedTuple):
-    """A printed line and its time."""
-
     t_s: float
     text: str
 
@@ -63,7 +61,6 @@ def shortened(lines: Sequence[TerminalLine]) -> list[TerminalLine]:
 
 
 def wrapped(lines: Sequence[TerminalLine]) -> list[TerminalLine]:
-    """Wrap the lines at the width of the terminal."""
     return [
         TerminalLine(line.t_s, line.text[at : at + COLUMNS])
         for line in lines

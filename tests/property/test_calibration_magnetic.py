@@ -64,7 +64,6 @@ class DrawnField:
 
 
 def _solved(window: Window, where: LocalEarth, sigma_deg: float = 0.05) -> tuple[Solution, Magnetic]:
-    """A solution with a gradienter and the usual compass."""
     found = solve(window, where, at.gradienter(sigma_deg), at.compass(), What.BOTH)
     assert found.magnetic is not None
     return found, found.magnetic

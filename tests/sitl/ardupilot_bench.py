@@ -52,7 +52,6 @@ class ArduPilotBench:
 
     @contextlib.asynccontextmanager
     async def daemon(self, more: str = QUICK) -> AsyncIterator[CompanionProcess]:
-        self.folder.mkdir(exist_ok=True)
         async with companion_daemon(self.vehicle, self.folder, more=more, url=self.link.url) as daemon:
             yield daemon
 
@@ -172,7 +171,6 @@ def imu_warnings(record: Record) -> list[str]:
 
 
 async def calibrated(daemon: CompanionProcess, within_s: float = CALIBRATED_WITHIN_S) -> Record:
-    """One calibration; the record."""
     record = await daemon.calibrate(within_s)
     assert "imus" in record, record
     return record

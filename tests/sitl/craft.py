@@ -82,7 +82,6 @@ class Craft(ABC):
 
     @property
     def now_s(self) -> float:
-        """Aircraft time."""
         return self.aircraft.time_at(asyncio.get_running_loop().time())
 
     def move(self, motion: Motion) -> None:
@@ -98,7 +97,6 @@ class Craft(ABC):
         return self.truth() + np.concatenate(self.true_bias(instance))
 
     async def heartbeats(self, number: int = 2) -> None:
-        """Wait for that many new heartbeats of the autopilot."""
         since_s = asyncio.get_running_loop().time()
         await self.ground.wait_for(
             lambda: len(self.ground.vehicle_heartbeats(since_s)) >= number, 10.0 + number, "heartbeats"
@@ -126,7 +124,6 @@ class DoubleCraft(Craft):
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[DoubleCraft]:
-        """The double and the ground station."""
         self.aircraft.begin(asyncio.get_running_loop().time())
         wire = Wire(self.ground, self.double.ground)
         tasks = [asyncio.create_task(self.double.run()), asyncio.create_task(self.ground.run())]

@@ -107,73 +107,63 @@ async def flying(vehicle: SitlVehicle) -> AsyncIterator[GroundStation]:
         yield ground
 
 
-def test_px4_arms_only_with_a_fresh_calibration_and_a_living_companion(tmp_path: Path) -> None:
+async def test_px4_arms_only_with_a_fresh_calibration_and_a_living_companion(tmp_path: Path) -> None:
     instance = free_instance()
     parameters = {"COM_ARM_AUTH_REQ": 1, "COM_ARM_AUTH_ID": instance + 1, "MAV_1_FORWARD": 1}
     path = binary("px4-sitl")
-
-    async def main() -> None:
-        vehicle = Px4Sitl(path, world(), tmp_path / "px4", parameters=parameters, instance=instance)
-        folder = tmp_path / "daemon"
-        folder.mkdir()
-        async with flying(vehicle) as ground:
-            await vehicle.sleep(40.0)
-            assert "No response" in (await arm(ground, vehicle))[1]
-            async with companion_daemon(vehicle, folder, more=GATE) as daemon:
-                await until_arming(daemon, lambda arming: "hold still" in arming["words"])
-                armed, words = await arm(ground, vehicle)
+    vehicle = Px4Sitl(path, world(), tmp_path / "px4", parameters=parameters, instance=instance)
+    async with flying(vehicle) as ground:
+        await vehicle.sleep(40.0)
+        assert "No response" in (await arm(ground, vehicle))[1]
+        async with companion_daemon(vehicle, tmp_path / "daemon", more=GATE) as daemon:
+            await until_arming(daemon, lambda arming: "hold still" in arming["words"])
+            armed, words = await arm(ground, vehicle)
+            assert not armed
+            assert "Temporarily rejected" in words
+            assert "Not armed: hold still" in words
+            await until_ready(daemon)
+            assert "Authorized for the next 10 seconds" in await until_it_arms(ground, vehicle)
+            await vehicle.sleep(11.0)  # what was granted runs out, by its clock
+            vehicle.move([Handling(start_s=vehicle.now_s + 0.2, duration_s=12.0, seed=3)])
+            await asyncio.sleep(4.0)
+            armed, words = await arm(ground, vehicle)
+            assert not armed
+            assert "Not armed: hold still" in words
+            await asyncio.sleep(10.0)
+            await until_ready(daemon)
+            daemon.kill()
+            for force in (0.0, FORCE):
+                armed, words = await arm(ground, vehicle, force)
                 assert not armed
-                assert "Temporarily rejected" in words
-                assert "Not armed: hold still" in words
-                await until_ready(daemon)
-                assert "Authorized for the next 10 seconds" in await until_it_arms(ground, vehicle)
-                await vehicle.sleep(11.0)  # what was granted runs out, by its clock
-                vehicle.move([Handling(start_s=vehicle.now_s + 0.2, duration_s=12.0, seed=3)])
-                await asyncio.sleep(4.0)
-                armed, words = await arm(ground, vehicle)
-                assert not armed
-                assert "Not armed: hold still" in words
-                await asyncio.sleep(10.0)
-                await until_ready(daemon)
-                daemon.kill()
-                for force in (0.0, FORCE):
-                    armed, words = await arm(ground, vehicle, force)
-                    assert not armed
-                    assert "No response" in words
-
-    asyncio.run(main())
+                assert "No response" in words
 
 
-def test_ardupilots_script_lets_it_arm_only_with_a_fresh_calibration_and_a_living_companion(tmp_path: Path) -> None:
+async def test_ardupilots_script_lets_it_arm_only_with_a_fresh_calibration_and_a_living_companion(
+    tmp_path: Path,
+) -> None:
     path = binary("ardupilot-sitl")
-
-    async def main() -> None:
-        vehicle = ArduPilotSitl(path, world(), tmp_path / "ap")
-        (tmp_path / "ap" / "scripts").mkdir(parents=True)
-        (tmp_path / "ap" / "scripts" / ARMING_SCRIPT.name).write_bytes(ARMING_SCRIPT.read_bytes())
-        folder = tmp_path / "daemon"
-        folder.mkdir()
-        async with flying(vehicle) as ground:
-            await asyncio.sleep(40.0)
-            assert SILENT in (await arm(ground, vehicle))[1]
-            async with companion_daemon(vehicle, folder, more=GATE) as daemon:
-                await seconds_until_said(ground, vehicle, "Companion: hold still")
-                assert not (await arm(ground, vehicle))[0]
-                await until_ready(daemon)
-                assert "Arming motors" in await until_it_arms(ground, vehicle)
-                vehicle.move([Handling(start_s=vehicle.now_s + 0.2, duration_s=12.0, seed=3)])
-                # Heard by the companion within a second or two; on a busy machine later.
-                await seconds_until_said(ground, vehicle, "Companion: hold still", 8.0)
-                assert not (await arm(ground, vehicle))[0]
-                await asyncio.sleep(10.0)
-                await until_ready(daemon)
-                await until_it_arms(ground, vehicle)
-                daemon.kill()
-                # Its last word is half a second old at most, the script looks every 0.2 s, we every 0.3 s.
-                assert 2.4 < await seconds_until_said(ground, vehicle, SILENT) < 4.0
-                armed, words = await arm(ground, vehicle)
-                assert not armed
-                assert SILENT in words
-                assert (await arm(ground, vehicle, FORCE))[0]  # a forced arming passes by: documented
-
-    asyncio.run(main())
+    vehicle = ArduPilotSitl(path, world(), tmp_path / "ap")
+    (tmp_path / "ap" / "scripts").mkdir(parents=True)
+    (tmp_path / "ap" / "scripts" / ARMING_SCRIPT.name).write_bytes(ARMING_SCRIPT.read_bytes())
+    async with flying(vehicle) as ground:
+        await asyncio.sleep(40.0)
+        assert SILENT in (await arm(ground, vehicle))[1]
+        async with companion_daemon(vehicle, tmp_path / "daemon", more=GATE) as daemon:
+            await seconds_until_said(ground, vehicle, "Companion: hold still")
+            assert not (await arm(ground, vehicle))[0]
+            await until_ready(daemon)
+            assert "Arming motors" in await until_it_arms(ground, vehicle)
+            vehicle.move([Handling(start_s=vehicle.now_s + 0.2, duration_s=12.0, seed=3)])
+            # Heard by the companion within a second or two; on a busy machine later.
+            await seconds_until_said(ground, vehicle, "Companion: hold still", 8.0)
+            assert not (await arm(ground, vehicle))[0]
+            await asyncio.sleep(10.0)
+            await until_ready(daemon)
+            await until_it_arms(ground, vehicle)
+            daemon.kill()
+            # Its last word is half a second old at most, the script looks every 0.2 s, we every 0.3 s.
+            assert 2.4 < await seconds_until_said(ground, vehicle, SILENT) < 4.0
+            armed, words = await arm(ground, vehicle)
+            assert not armed
+            assert SILENT in words
+            assert (await arm(ground, vehicle, FORCE))[0]  # a forced arming passes by: documented

@@ -65,13 +65,11 @@ class AttitudeBench:
         return answer
 
     async def attitude(self) -> dict[str, Any]:
-        """Attitude in the companion's status."""
         status = await self.ask("status")
         found: dict[str, Any] = status["attitude"]
         return found
 
     async def pushing(self, within_s: float = 60.0) -> None:
-        """Wait for the push to begin."""
         async with asyncio.timeout(within_s):
             while not (await self.attitude())["pushing"]:
                 await asyncio.sleep(1.0)
@@ -124,7 +122,6 @@ class AttitudeBench:
         return found
 
     def turn(self, heading_deg: float) -> None:
-        """Turn the aircraft."""
         self.vehicle.move([Turn(start_s=self.vehicle.now_s + 0.5, duration_s=4.0, heading_deg=heading_deg)])
 
 
@@ -149,88 +146,81 @@ async def bench(kind: Kind, folder: Path, **options: Any) -> AsyncIterator[Attit
             yield AttitudeBench(vehicle, ground, daemon)
 
 
-def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench("ardupilot-sitl", tmp_path) as on:
-            loop = asyncio.get_running_loop()
-            await on.set_up(net=False)
-            assert (await on.ground.get("EK3_SRC1_YAW"), await on.ground.get("VISO_TYPE")) == (6.0, 1.0)
-            await on.vehicle.sleep(3.0)
-            booted_s = loop.time()
-            await on.vehicle.power_cycle()
-            await on.vehicle.sleep(20.0)
-            await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
-            await on.stream(mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, 5.0)
-            report = await on.ground.wait_message(mavlink.MAVLink_ekf_status_report_message, 5.0)
-            assert not report.flags & mavlink.EKF_POS_HORIZ_ABS  # no heading, no GNSS
-            assert "yaw aligned" not in on.ground.texts_since(booted_s)
-            record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
-            assert record["state"] == "done", record["reason"]
-            await on.pushing()
-            found = await on.until_follows(LIE_DEG, 20.0)
-            print(f"EKF3's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass")
-            assert abs(found - LIE_DEG) < FOLLOWS_DEG
-            assert "EKF3 IMU0 yaw aligned" in on.ground.texts_since(booted_s)
-            since_s = loop.time()
-            await on.ground.wait_for(
-                lambda: any(
-                    one.flags & mavlink.EKF_POS_HORIZ_ABS
-                    for one in on.ground.all(mavlink.MAVLink_ekf_status_report_message, since_s=since_s)
-                ),
-                60.0,
-                "GNSS in use, now that there is a heading",
-            )
-            on.turn(100.0)
-            await on.vehicle.sleep(8.0)
-            found = await on.theirs_deg()
-            print(f"after a turn by 100 deg: {found:.2f} deg; {await on.attitude()}")
-            assert abs(found - LIE_DEG) < FOLLOWS_DEG
-            # Without the stream it does not arm; with it again, after an alignment, nothing objects to it.
-            on.daemon.signal(signal.SIGSTOP)
-            await on.vehicle.sleep(2.0)
-            assert "VisOdom: not healthy" in await on.prearm_words()
-            on.daemon.signal(signal.SIGCONT)
-            await on.pushing()
-            await on.vehicle.sleep(2.0)
-            assert "VisOdom" not in await on.prearm_words()
-
-    asyncio.run(main())
+async def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
+    async with bench("ardupilot-sitl", tmp_path) as on:
+        loop = asyncio.get_running_loop()
+        await on.set_up(net=False)
+        assert (await on.ground.get("EK3_SRC1_YAW"), await on.ground.get("VISO_TYPE")) == (6.0, 1.0)
+        await on.vehicle.sleep(3.0)
+        booted_s = loop.time()
+        await on.vehicle.power_cycle()
+        await on.vehicle.sleep(20.0)
+        await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
+        await on.stream(mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, 5.0)
+        report = await on.ground.wait_message(mavlink.MAVLink_ekf_status_report_message, 5.0)
+        assert not report.flags & mavlink.EKF_POS_HORIZ_ABS  # no heading, no GNSS
+        assert "yaw aligned" not in on.ground.texts_since(booted_s)
+        record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
+        assert record["state"] == "done", record["reason"]
+        await on.pushing()
+        found = await on.until_follows(LIE_DEG, 20.0)
+        print(f"EKF3's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass")
+        assert abs(found - LIE_DEG) < FOLLOWS_DEG
+        assert "EKF3 IMU0 yaw aligned" in on.ground.texts_since(booted_s)
+        since_s = loop.time()
+        await on.ground.wait_for(
+            lambda: any(
+                one.flags & mavlink.EKF_POS_HORIZ_ABS
+                for one in on.ground.all(mavlink.MAVLink_ekf_status_report_message, since_s=since_s)
+            ),
+            60.0,
+            "GNSS in use, now that there is a heading",
+        )
+        on.turn(100.0)
+        await on.vehicle.sleep(8.0)
+        found = await on.theirs_deg()
+        print(f"after a turn by 100 deg: {found:.2f} deg; {await on.attitude()}")
+        assert abs(found - LIE_DEG) < FOLLOWS_DEG
+        # Without the stream it does not arm; with it again, after an alignment, nothing objects to it.
+        on.daemon.signal(signal.SIGSTOP)
+        await on.vehicle.sleep(2.0)
+        assert "VisOdom: not healthy" in await on.prearm_words()
+        on.daemon.signal(signal.SIGCONT)
+        await on.pushing()
+        await on.vehicle.sleep(2.0)
+        assert "VisOdom" not in await on.prearm_words()
 
 
 @pytest.mark.parametrize("script", [True, False], ids=["script", "command"])
-def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, script: bool) -> None:
+async def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, script: bool) -> None:
     """The script does it within a second, even after kill -9; without a script the companion asks for it."""
-
-    async def main() -> None:
+    if script:
+        scripts = tmp_path / "firmware" / "scripts"
+        scripts.mkdir(parents=True)
+        (scripts / ARMING_SCRIPT.name).write_bytes(ARMING_SCRIPT.read_bytes())
+    async with bench("ardupilot-sitl", tmp_path, parameters={"CMPG_ENABLE": 0} if script else {}) as on:
+        shown = await on.set_up()
+        print(shown["net"])
+        await on.vehicle.sleep(3.0)
+        await on.vehicle.power_cycle()
+        await on.vehicle.sleep(35.0)
+        assert (await on.ask("autopilot", "params"))["net"]["kind"] == ("script" if script else "command")
+        await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
+        await on.until_follows(0.0, 30.0)  # its compass, as long as there is no other
+        record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
+        assert record["state"] == "done", record["reason"]
+        await on.pushing()
+        found = await on.until_follows(LIE_DEG, 40.0)
+        print(f"EKF3's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass")
+        assert abs(found - LIE_DEG) < FOLLOWS_DEG
+        await on.vehicle.sleep(3.0)
+        begun_s, physics_s = asyncio.get_running_loop().time(), on.vehicle.physics_s
+        on.daemon.signal(signal.SIGKILL if script else signal.SIGTERM)
+        found = await on.until_follows(0.0, 30.0)
+        print(f"{found:.2f} deg, {on.vehicle.physics_s - physics_s:.1f} s after the end")
+        assert abs(found) < FOLLOWS_DEG
         if script:
-            scripts = tmp_path / "firmware" / "scripts"
-            scripts.mkdir(parents=True)
-            (scripts / ARMING_SCRIPT.name).write_bytes(ARMING_SCRIPT.read_bytes())
-        async with bench("ardupilot-sitl", tmp_path, parameters={"CMPG_ENABLE": 0} if script else {}) as on:
-            shown = await on.set_up()
-            print(shown["net"])
-            await on.vehicle.sleep(3.0)
-            await on.vehicle.power_cycle()
-            await on.vehicle.sleep(35.0)
-            assert (await on.ask("autopilot", "params"))["net"]["kind"] == ("script" if script else "command")
-            await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
-            await on.until_follows(0.0, 30.0)  # its compass, as long as there is no other
-            record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
-            assert record["state"] == "done", record["reason"]
-            await on.pushing()
-            found = await on.until_follows(LIE_DEG, 40.0)
-            print(f"EKF3's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass")
-            assert abs(found - LIE_DEG) < FOLLOWS_DEG
-            await on.vehicle.sleep(3.0)
-            begun_s, physics_s = asyncio.get_running_loop().time(), on.vehicle.physics_s
-            on.daemon.signal(signal.SIGKILL if script else signal.SIGTERM)
-            found = await on.until_follows(0.0, 30.0)
-            print(f"{found:.2f} deg, {on.vehicle.physics_s - physics_s:.1f} s after the end")
-            assert abs(found) < FOLLOWS_DEG
-            if script:
-                assert "Heading: compass, none from companion" in on.ground.texts_since(begun_s)
-
-    asyncio.run(main())
+            assert "Heading: compass, none from companion" in on.ground.texts_since(begun_s)
 
 
 async def ev_yaw(vehicle: SitlVehicle) -> bool:
@@ -247,34 +237,31 @@ async def ev_yaw(vehicle: SitlVehicle) -> bool:
     return "True" in lines[0]
 
 
-def test_ekf2_takes_the_heading(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench("px4-sitl", tmp_path) as on:
-            await on.set_up()
-            assert await on.ground.get("EKF2_EV_CTRL") == 8.0
-            await on.vehicle.sleep(4.0)
-            await on.vehicle.power_cycle()
-            await on.vehicle.sleep(20.0)
-            await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
-            assert abs(await on.theirs_deg()) < 10.0  # its own magnetometer's
-            assert not await ev_yaw(on.vehicle)
-            record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
-            assert record["state"] == "done", record["reason"]
-            await on.pushing()
-            found = await on.until_follows(LIE_DEG, 30.0)
-            attitude = await on.attitude()
-            print(f"EKF2's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass; {attitude}")
-            assert abs(found - LIE_DEG) < FOLLOWS_DEG
-            assert await ev_yaw(on.vehicle)
-            assert attitude["timesync_answers"] > 100
-            on.turn(100.0)
-            await on.vehicle.sleep(8.0)
-            found = await on.theirs_deg()
-            print(f"after a turn by 100 deg: {found:.2f} deg; {await on.attitude()}")
-            assert abs(found - LIE_DEG) < FOLLOWS_DEG
-            on.daemon.signal(signal.SIGTERM)
-            await on.daemon.ended(20.0)
-            await on.vehicle.sleep(1.5)
-            assert not await ev_yaw(on.vehicle)  # it stops after 0.4 s without
-
-    asyncio.run(main())
+async def test_ekf2_takes_the_heading(tmp_path: Path) -> None:
+    async with bench("px4-sitl", tmp_path) as on:
+        await on.set_up()
+        assert await on.ground.get("EKF2_EV_CTRL") == 8.0
+        await on.vehicle.sleep(4.0)
+        await on.vehicle.power_cycle()
+        await on.vehicle.sleep(20.0)
+        await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
+        assert abs(await on.theirs_deg()) < 10.0  # its own magnetometer's
+        assert not await ev_yaw(on.vehicle)
+        record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
+        assert record["state"] == "done", record["reason"]
+        await on.pushing()
+        found = await on.until_follows(LIE_DEG, 30.0)
+        attitude = await on.attitude()
+        print(f"EKF2's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass; {attitude}")
+        assert abs(found - LIE_DEG) < FOLLOWS_DEG
+        assert await ev_yaw(on.vehicle)
+        assert attitude["timesync_answers"] > 100
+        on.turn(100.0)
+        await on.vehicle.sleep(8.0)
+        found = await on.theirs_deg()
+        print(f"after a turn by 100 deg: {found:.2f} deg; {await on.attitude()}")
+        assert abs(found - LIE_DEG) < FOLLOWS_DEG
+        on.daemon.signal(signal.SIGTERM)
+        await on.daemon.ended(20.0)
+        await on.vehicle.sleep(1.5)
+        assert not await ev_yaw(on.vehicle)  # it stops after 0.4 s without

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import time
 from pathlib import Path
@@ -64,7 +63,6 @@ class ByHandBench:
         return await obeyed(self.companion, self.hands, self.vehicle, *words)
 
     async def values(self, names: list[str]) -> list[float]:
-        """Parameters by name."""
         return [await self.ground.get(name) for name in names]
 
     async def stand(self, until_s: float) -> None:
@@ -100,43 +98,39 @@ class ByHandBench:
 
 @pytest.mark.sitl
 @pytest.mark.parametrize("kind", list(NAMES))
-def test_a_bare_board_is_right_after_stands_by_hand_and_as_it_was_after_undo(kind: str, tmp_path: Path) -> None:
+async def test_a_bare_board_is_right_after_stands_by_hand_and_as_it_was_after_undo(kind: str, tmp_path: Path) -> None:
     """20 mg, 0.5 %, a board that sits askew, a spot that slopes by 5 deg."""
     reason = missing(kind)
     if reason is not None:
         pytest.skip(reason)
-
-    async def main() -> None:
-        scenario = demo(
-            pose=Pose(4.0, -3.0, 40.0), unix_s=time.time(), accel_mg=(20.0, -20.0, 20.0),
-            accel_scale=(0.005, -0.005, 0.005), board_deg=(0.8, -0.6),
-        )  # fmt: skip
-        what = Path(os.environ[BINARIES[kind]]), scenario, tmp_path / "firmware"
-        vehicle = Px4Sitl(*what) if kind == "px4-sitl" else ArduPilotSitl(*what)
-        async with vehicle, ground_station(vehicle) as ground:
-            await vehicle.sleep(SETTLE_S)
-            bench = ByHandBench(vehicle, ground, tmp_path)
-            before, level = await bench.values(NAMES[kind]), await bench.values(TRIM[kind])
-            await bench.type("setup", "--yes", "--udp", vehicle.url.rsplit(":", 1)[1])
-            async with bench.companion as daemon:
-                await daemon.ready()
-                await bench.type("align", "faces", "--write")
-                left = await bench.judged()
-                assert np.abs(left.level_mg).max() < LEVEL_MG, left
-                if kind == "px4-sitl":  # starts without scales that are within 1 % of 1
-                    await bench.type("undo")
-                    assert await bench.values(NAMES[kind]) == before
-                    await bench.type("align", "faces", "--write")
-                    await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
-                else:
-                    assert np.abs(left.scale_percent).max() < SCALE_PERCENT, left
-                written = await bench.values(NAMES[kind])
-                await bench.type("align", "turn", "--level")
-            assert np.abs(await bench.attitude_error_deg()).max() < LEVEL_DEG
-            async with bench.companion as daemon:
-                await daemon.ready()
+    scenario = demo(
+        pose=Pose(4.0, -3.0, 40.0), unix_s=time.time(), accel_mg=(20.0, -20.0, 20.0),
+        accel_scale=(0.005, -0.005, 0.005), board_deg=(0.8, -0.6),
+    )  # fmt: skip
+    what = Path(os.environ[BINARIES[kind]]), scenario, tmp_path / "firmware"
+    vehicle = Px4Sitl(*what) if kind == "px4-sitl" else ArduPilotSitl(*what)
+    async with vehicle, ground_station(vehicle) as ground:
+        await vehicle.sleep(SETTLE_S)
+        bench = ByHandBench(vehicle, ground, tmp_path)
+        before, level = await bench.values(NAMES[kind]), await bench.values(TRIM[kind])
+        await bench.type("setup", "--yes", "--udp", vehicle.url.rsplit(":", 1)[1])
+        async with bench.companion as daemon:
+            await daemon.ready()
+            await bench.type("align", "faces", "--write")
+            left = await bench.judged()
+            assert np.abs(left.level_mg).max() < LEVEL_MG, left
+            if kind == "px4-sitl":  # starts without scales that are within 1 % of 1
                 await bench.type("undo")
-            assert await bench.values(TRIM[kind]) == level
-            assert await bench.values(NAMES[kind]) == written
-
-    asyncio.run(main())
+                assert await bench.values(NAMES[kind]) == before
+                await bench.type("align", "faces", "--write")
+                await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
+            else:
+                assert np.abs(left.scale_percent).max() < SCALE_PERCENT, left
+            written = await bench.values(NAMES[kind])
+            await bench.type("align", "turn", "--level")
+        assert np.abs(await bench.attitude_error_deg()).max() < LEVEL_DEG
+        async with bench.companion as daemon:
+            await daemon.ready()
+            await bench.type("undo")
+        assert await bench.values(TRIM[kind]) == level
+        assert await bench.values(NAMES[kind]) == written

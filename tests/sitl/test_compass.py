@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import os
 import time
@@ -52,36 +51,32 @@ async def heading_errors_deg(bench: ByHandBench, kind: str) -> Array:
 @pytest.mark.sitl
 @pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.parametrize("way", ["--headings=4", "--sides"])
-def test_iron_is_gone_after_an_alignment_and_back_after_undo(kind: str, way: str, tmp_path: Path) -> None:
+async def test_iron_is_gone_after_an_alignment_and_back_after_undo(kind: str, way: str, tmp_path: Path) -> None:
     """150 mG of hard iron and soft iron of 5 %, on a slope of 5 deg."""
     reason = missing(kind)
     if reason is not None:
         pytest.skip(reason)
-
-    async def main() -> None:
-        scenario = demo(pose=Pose(4.0, -3.0, 40.0), unix_s=time.time())
-        what = Path(os.environ[BINARIES[kind]]), scenario, tmp_path / "firmware"
-        vehicle = Px4Sitl(*what) if kind == "px4-sitl" else ArduPilotSitl(*what)
-        async with vehicle, ground_station(vehicle) as ground:
-            await add_iron(vehicle, ground)
-            await vehicle.sleep(SETTLE_S)
-            bench = ByHandBench(vehicle, ground, tmp_path)
-            names = [name for each in NAMES[KINDS[kind]] for name in each]
-            for each, value in zip(NAMES[KINDS[kind]], (0.0, 1.0, 0.0), strict=True):
-                await ground.put_all(dict.fromkeys(each, value))
-            old = await bench.values(names)
-            await bench.type("setup", "--yes", "--udp", vehicle.url.rsplit(":", 1)[1])
-            async with bench.companion as daemon:
-                await daemon.ready()
-                await bench.type("align", "faces", "--write")
-                await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
-                await bench.type("align", "compass", way, "--write")
-                await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
-                left = await heading_errors_deg(bench, kind)
-                print(f"{kind}, {way}: left {left.round(2)} deg")
-                assert np.sqrt(np.mean(np.square(left))) < LEFT_DEG, left
-                assert " deg, aligned 20" in await bench.type("status")
-                await bench.type("undo")
-            assert await bench.values(names) == old
-
-    asyncio.run(main())
+    scenario = demo(pose=Pose(4.0, -3.0, 40.0), unix_s=time.time())
+    what = Path(os.environ[BINARIES[kind]]), scenario, tmp_path / "firmware"
+    vehicle = Px4Sitl(*what) if kind == "px4-sitl" else ArduPilotSitl(*what)
+    async with vehicle, ground_station(vehicle) as ground:
+        await add_iron(vehicle, ground)
+        await vehicle.sleep(SETTLE_S)
+        bench = ByHandBench(vehicle, ground, tmp_path)
+        names = [name for each in NAMES[KINDS[kind]] for name in each]
+        for each, value in zip(NAMES[KINDS[kind]], (0.0, 1.0, 0.0), strict=True):
+            await ground.put_all(dict.fromkeys(each, value))
+        old = await bench.values(names)
+        await bench.type("setup", "--yes", "--udp", vehicle.url.rsplit(":", 1)[1])
+        async with bench.companion as daemon:
+            await daemon.ready()
+            await bench.type("align", "faces", "--write")
+            await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
+            await bench.type("align", "compass", way, "--write")
+            await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
+            left = await heading_errors_deg(bench, kind)
+            print(f"{kind}, {way}: left {left.round(2)} deg")
+            assert np.sqrt(np.mean(np.square(left))) < LEFT_DEG, left
+            assert " deg, aligned 20" in await bench.type("status")
+            await bench.type("undo")
+        assert await bench.values(names) == old

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import numpy as np
@@ -26,28 +25,24 @@ LEFT_DEG_H, LEFT_MG = 120.0, 1.0
 
 @pytest.mark.sitl
 @pytest.mark.parametrize("kind", BINARIES)
-def test_a_boat_is_calibrated_as_a_deck_and_refused_as_ground(kind: str, tmp_path: Path) -> None:
+async def test_a_boat_is_calibrated_as_a_deck_and_refused_as_ground(kind: str, tmp_path: Path) -> None:
     reason = missing(kind)
     if reason is not None:
         pytest.skip(reason)
-
-    async def main() -> None:
-        for name in ("ground", "deck"):
-            (tmp_path / name).mkdir()
-        vehicle = binary_vehicle(kind, tmp_path / "firmware", motions=motions_of("sea", seed=3))
-        async with vehicle, ground_station(vehicle) as ground:
-            async with companion_daemon(vehicle, tmp_path / "ground") as daemon:
-                record = await daemon.calibrate(WAITS_S)
-            assert record["state"] == "failed"
-            assert 'vehicle.platform = "deck"' in record["reason"]
-            assert not any(imu["written"] for imu in record["imus"])
-            async with companion_daemon(vehicle, tmp_path / "deck", more=DECK) as daemon:
-                record = await daemon.calibrate(CALIBRATED_WITHIN_S)
-            assert record["state"] == "done", record["reason"]
-            for instance in vehicle.instances:
-                left = await residual(vehicle, ground, instance, OBSERVE_S)
-                print(Row("companion, after a minute of waves", instance, left))
-                assert np.abs(left[:3]).max() < LEFT_DEG_H * DEG_H, left
-                assert np.abs(left[3:]).max() < LEFT_MG * MG, left
-
-    asyncio.run(main())
+    for name in ("ground", "deck"):
+        (tmp_path / name).mkdir()
+    vehicle = binary_vehicle(kind, tmp_path / "firmware", motions=motions_of("sea", seed=3))
+    async with vehicle, ground_station(vehicle) as ground:
+        async with companion_daemon(vehicle, tmp_path / "ground") as daemon:
+            record = await daemon.calibrate(WAITS_S)
+        assert record["state"] == "failed"
+        assert 'vehicle.platform = "deck"' in record["reason"]
+        assert not any(imu["written"] for imu in record["imus"])
+        async with companion_daemon(vehicle, tmp_path / "deck", more=DECK) as daemon:
+            record = await daemon.calibrate(CALIBRATED_WITHIN_S)
+        assert record["state"] == "done", record["reason"]
+        for instance in vehicle.instances:
+            left = await residual(vehicle, ground, instance, OBSERVE_S)
+            print(Row("companion, after a minute of waves", instance, left))
+            assert np.abs(left[:3]).max() < LEFT_DEG_H * DEG_H, left
+            assert np.abs(left[3:]).max() < LEFT_MG * MG, left

@@ -165,93 +165,86 @@ def rms_over_ten_k(left: dict[float, Array]) -> dict[float, float]:
 
 
 @pytest.mark.sitl
-def test_five_partial_warm_ups_leave_less_than_its_own_learner_does_after_one(tmp_path: Path) -> None:
+async def test_five_partial_warm_ups_leave_less_than_its_own_learner_does_after_one(tmp_path: Path) -> None:
     if missing("ardupilot-sitl") is None and not extent(whole=True, a_slice=False):
         pytest.skip("five warm-ups in real time take a quarter of an hour; TESTS=long does them")
-
-    async def main() -> None:
-        random = np.random.default_rng(17)
-        folder = tmp_path / "daemon"
-        only_looks = QUICK + "[push]\nparameters = false\n"
-        async with flying(tmp_path, SIM_IMUT_FIXED=0.0) as (vehicle, ground):
-            for day, start_degc in enumerate(STARTS_DEGC):
-                bias = random.normal(0.0, SCATTER_DEG_H, 3) * DEG_H
-                turn_on = {f"SIM_GYR1_BIAS_{axis}": float(bias[k]) for k, axis in enumerate("XYZ")}
-                await warm_up(vehicle, ground, start_degc, **turn_on)
-                async with companion_daemon(vehicle, folder, more=only_looks) as daemon:
-                    await vehicle.sleep(WARM_S - vehicle.physics_s)
-                    record = await daemon.calibrate(60.0)
-                    assert record["state"] == "done", record
-                    ((_, known),) = BiasStore(folder / "state").read().items()
-                    print(f"day {day}", [round(point.temperature_degc or 0.0, 1) for point in known.points], flush=True)
-                another_day(folder / "state", day)
-            # Its own learner, from start to end of the same warm-up.
-            start_degc = STARTS_DEGC[LEARNER]
-            learn = {"INS_TCAL1_ENABLE": 2.0, "INS_TCAL1_TMAX": start_degc + 11.8}
-            none = {name: await ground.get(name) for name in NAMES}
-            await warm_up(vehicle, ground, start_degc, **learn)
-            await vehicle.sleep(WARM_S + 5.0 - vehicle.physics_s)
-            low_degc, high_degc = [await ground.get(f"INS_TCAL1_{end}") for end in ("TMIN", "TMAX")]
-            print(f"its own learner has seen {low_degc:.1f} to {high_degc:.1f} degC", flush=True)
-            await ground.put("INS_TCAL1_ENABLE", 1.0)
-            own = rms_over_ten_k(await left_over(vehicle, ground, "own"))
-            # The switch hides the rest where it is off.
-            await ground.put_all({name: value for name, value in none.items() if not name.endswith("ENABLE")})
-            await ground.put("INS_TCAL1_ENABLE", 0.0)
-            await ground.put("SIM_IMUT_FIXED", 26.0)
-            async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
-                answer = await typed(daemon, "--write")
-                assert answer["state"] == "done", (answer, daemon.log())
-                ours = rms_over_ten_k(await left_over(vehicle, ground, "ours"))
-            print("own", own, "ours", ours, flush=True)
-            unseen = [low for low in ours if not low_degc - BIN_K <= low <= low + 10.0 <= high_degc + BIN_K]
-            assert len(unseen) > 2
-            assert all(ours[low] < own[low] / 3.0 for low in unseen), (unseen, own, ours)
-
-    asyncio.run(main())
+    random = np.random.default_rng(17)
+    folder = tmp_path / "daemon"
+    only_looks = QUICK + "[push]\nparameters = false\n"
+    async with flying(tmp_path, SIM_IMUT_FIXED=0.0) as (vehicle, ground):
+        for day, start_degc in enumerate(STARTS_DEGC):
+            bias = random.normal(0.0, SCATTER_DEG_H, 3) * DEG_H
+            turn_on = {f"SIM_GYR1_BIAS_{axis}": float(bias[k]) for k, axis in enumerate("XYZ")}
+            await warm_up(vehicle, ground, start_degc, **turn_on)
+            async with companion_daemon(vehicle, folder, more=only_looks) as daemon:
+                await vehicle.sleep(WARM_S - vehicle.physics_s)
+                record = await daemon.calibrate(60.0)
+                assert record["state"] == "done", record
+                ((_, known),) = BiasStore(folder / "state").read().items()
+                print(f"day {day}", [round(point.temperature_degc or 0.0, 1) for point in known.points], flush=True)
+            another_day(folder / "state", day)
+        # Its own learner, from start to end of the same warm-up.
+        start_degc = STARTS_DEGC[LEARNER]
+        learn = {"INS_TCAL1_ENABLE": 2.0, "INS_TCAL1_TMAX": start_degc + 11.8}
+        none = {name: await ground.get(name) for name in NAMES}
+        await warm_up(vehicle, ground, start_degc, **learn)
+        await vehicle.sleep(WARM_S + 5.0 - vehicle.physics_s)
+        low_degc, high_degc = [await ground.get(f"INS_TCAL1_{end}") for end in ("TMIN", "TMAX")]
+        print(f"its own learner has seen {low_degc:.1f} to {high_degc:.1f} degC", flush=True)
+        await ground.put("INS_TCAL1_ENABLE", 1.0)
+        own = rms_over_ten_k(await left_over(vehicle, ground, "own"))
+        # The switch hides the rest where it is off.
+        await ground.put_all({name: value for name, value in none.items() if not name.endswith("ENABLE")})
+        await ground.put("INS_TCAL1_ENABLE", 0.0)
+        await ground.put("SIM_IMUT_FIXED", 26.0)
+        async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
+            answer = await typed(daemon, "--write")
+            assert answer["state"] == "done", (answer, daemon.log())
+            ours = rms_over_ten_k(await left_over(vehicle, ground, "ours"))
+        print("own", own, "ours", ours, flush=True)
+        unseen = [low for low in ours if not low_degc - BIN_K <= low <= low + 10.0 <= high_degc + BIN_K]
+        assert len(unseen) > 2
+        assert all(ours[low] < own[low] / 3.0 for low in unseen), (unseen, own, ours)
 
 
 @pytest.mark.sitl
-def test_what_is_written_acts_as_predicted_and_undo_leaves_no_bit_of_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flying(tmp_path) as (vehicle, ground):
-            folder = tmp_path / "daemon"
-            async with companion_daemon(vehicle, folder, more=QUICK):
-                await first_seen(folder)
-            store = BiasStore(folder / "state")
-            ((name, known),) = store.read().items()
-            first = known.points[-1]
-            assert first.gyro is not None
-            assert first.accel is not None
-            assert first.temperature_degc is not None
-            days = [
-                msgspec.structs.replace(
-                    first,
-                    power_up=PowerUp(host=f"day {day}", since_unix_s=None),
-                    temperature_degc=float(degc),
-                    gyro=msgspec.structs.replace(
-                        first.gyro,
-                        bias=vector(first.gyro.bias + (curve(degc) - curve(first.temperature_degc)) * DEG_H),
-                    ),
-                    accel=msgspec.structs.replace(
-                        first.accel,
-                        bias=vector(first.accel.bias + (accel_curve(degc) - accel_curve(first.temperature_degc)) * MG),
-                    ),
-                )
-                for day, degc in enumerate(np.linspace(10.0, 40.0, 12))
-            ]
-            store.write({name: msgspec.structs.replace(known, points=tuple(days))})
-            async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
-                before = {name: await ground.get(name) for name in NAMES}
-                left = await all_left(vehicle, ground, 25.0)
-                answer = await typed(daemon, "--write")
-                assert answer["state"] == "done", (answer, daemon.log())
-                for degc in (25.0, 15.0, 37.0):
-                    moved = await all_left(vehicle, ground, degc) - left
-                    print(degc, np.round(moved, 2), flush=True)
-                    assert np.abs(moved[:3]).max() < WITHIN_DEG_H
-                    assert np.abs(moved[3:]).max() < WITHIN_MG
-                assert (await typed(daemon, "--undo"))["state"] == "done"
-                assert {name: await ground.get(name) for name in NAMES} == before
-
-    asyncio.run(main())
+async def test_what_is_written_acts_as_predicted_and_undo_leaves_no_bit_of_it(tmp_path: Path) -> None:
+    async with flying(tmp_path) as (vehicle, ground):
+        folder = tmp_path / "daemon"
+        async with companion_daemon(vehicle, folder, more=QUICK):
+            await first_seen(folder)
+        store = BiasStore(folder / "state")
+        ((name, known),) = store.read().items()
+        first = known.points[-1]
+        assert first.gyro is not None
+        assert first.accel is not None
+        assert first.temperature_degc is not None
+        days = [
+            msgspec.structs.replace(
+                first,
+                power_up=PowerUp(host=f"day {day}", since_unix_s=None),
+                temperature_degc=float(degc),
+                gyro=msgspec.structs.replace(
+                    first.gyro,
+                    bias=vector(first.gyro.bias + (curve(degc) - curve(first.temperature_degc)) * DEG_H),
+                ),
+                accel=msgspec.structs.replace(
+                    first.accel,
+                    bias=vector(first.accel.bias + (accel_curve(degc) - accel_curve(first.temperature_degc)) * MG),
+                ),
+            )
+            for day, degc in enumerate(np.linspace(10.0, 40.0, 12))
+        ]
+        store.write({name: msgspec.structs.replace(known, points=tuple(days))})
+        async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
+            before = {name: await ground.get(name) for name in NAMES}
+            left = await all_left(vehicle, ground, 25.0)
+            answer = await typed(daemon, "--write")
+            assert answer["state"] == "done", (answer, daemon.log())
+            for degc in (25.0, 15.0, 37.0):
+                moved = await all_left(vehicle, ground, degc) - left
+                print(degc, np.round(moved, 2), flush=True)
+                assert np.abs(moved[:3]).max() < WITHIN_DEG_H
+                assert np.abs(moved[3:]).max() < WITHIN_MG
+            assert (await typed(daemon, "--undo"))["state"] == "done"
+            assert {name: await ground.get(name) for name in NAMES} == before

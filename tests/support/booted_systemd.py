@@ -46,8 +46,6 @@ def _cgroups() -> Path | None:
 
 
 class Machine:
-    """The machine that systemd has booted."""
-
     def __init__(self, process_id: int) -> None:
         self._process_id = process_id
 

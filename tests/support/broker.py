@@ -115,7 +115,6 @@ class Broker:
             self._process = subprocess.Popen(self._command(), stdout=log, stderr=log)
 
     async def start(self) -> Broker:
-        """Start it and wait until it listens."""
         self._spawn()
         async with asyncio.timeout(60.0):
             while True:

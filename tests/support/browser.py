@@ -78,7 +78,6 @@ class Tab:
         return value
 
     async def middle(self, selector: str) -> tuple[float, float]:
-        """Return the middle of an element, to press it."""
         box = await self.value(
             f"(() => {{ const r = document.querySelector({selector!r}).getBoundingClientRect();"
             " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
@@ -147,7 +146,6 @@ class Browser:
 
 @contextlib.asynccontextmanager
 async def chromium(folder: Path) -> AsyncIterator[Browser]:
-    """A fresh browser with its profile in `folder`."""
     path = find()
     assert path is not None
     (into_out, into_in), (from_out, from_in) = _pipe(), _pipe()

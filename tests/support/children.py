@@ -14,8 +14,6 @@ from companion.mqtt.process import MqttProcess
 
 
 class Idle(Child):
-    """A child that never starts."""
-
     async def run(self) -> None:
         """Wait until cancelled."""
         await asyncio.get_running_loop().create_future()

@@ -28,8 +28,6 @@ NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
 
 
 class CollectorProcess:
-    """`companion fleet run`."""
-
     def __init__(
         self, folder: Path, name: str, one: Broker, database: str, *more: str, username: str | None = None
     ) -> None:

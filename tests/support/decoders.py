@@ -16,7 +16,6 @@ VECTORNAV_BYTES: Final = 6 + 198 + 112 + 2
 
 
 def make_decoder(kind: Kind, name: str, seconds_per_byte: float = 0.0) -> Decoder:
-    """A new decoder for a kind of device and a protocol's name."""
     return PROTOCOLS[kind][name].decoder(seconds_per_byte)
 
 

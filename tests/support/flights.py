@@ -51,7 +51,6 @@ def _imu_flight() -> ImuFlight:
 
 
 def kept_flight(key: str = "1") -> KeptFlight:
-    """Make a flight of an aircraft with one IMU."""
     flight = Flight(
         key=key, system_id=1, began_at="2026-11-23T08:00:46+00:00", stages=Stages(64.0, 65.0, 67.0, 240.0, 242.0),
         reference="ekf", notes=(), imus=(_imu_flight(),),

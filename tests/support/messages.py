@@ -80,8 +80,6 @@ _UNITS = {"deg", "mg", "min", "Hz", "imu", "gyro", "accel", "http", "IMU", "baud
 
 @dataclass(frozen=True)
 class Message:
-    """One template and where it stands."""
-
     where: str
     template: str
 

@@ -53,7 +53,6 @@ class Postgres:
         subprocess.run(command, check=True, capture_output=True, user=_USER, cwd=folder)
 
     def start(self) -> None:
-        """Start and wait until it answers."""
         settings = {"port": f"{self.port}", "listen_addresses": "127.0.0.1", "unix_socket_directories": ""}
         settings |= self._settings
         options = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
@@ -70,7 +69,6 @@ class Postgres:
 
     @property
     def process_id(self) -> int:
-        """Process id of the server's first process."""
         assert self._process is not None
         return self._process.pid
 

@@ -152,7 +152,6 @@ class ScriptedPx4(ScriptedAutopilot):
         return np.eye(3)
 
     def output(self, instance: int) -> tuple[np.ndarray, np.ndarray]:
-        """Output of IMU `instance`, without noise."""
         device = self.devices[instance - 1]
         gyro, accel = self.raw[instance - 1]
         zero = np.zeros(3)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any
 
 import pytest
@@ -19,6 +19,18 @@ ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 PARAM_FLOAT = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
 BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 C_CAST = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+
+
+@pytest.fixture
+def link() -> MavlinkLink:
+    return MavlinkLink()
+
+
+@pytest.fixture
+def vehicle(link: MavlinkLink) -> Iterator[Vehicle]:
+    found = Vehicle(link)
+    yield found
+    found.close()
 
 
 def heartbeat(
@@ -62,9 +74,9 @@ async def aboard(autopilot: ScriptedAutopilot, **wire: float) -> AsyncIterator[t
     vehicle.close()
 
 
-async def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_seconds() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_seconds(
+    link: MavlinkLink, vehicle: Vehicle
+) -> None:
     events: list[tuple[float, str]] = []
     loop = asyncio.get_running_loop()
     vehicle.on_event.add(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
@@ -75,13 +87,12 @@ async def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_s
         heartbeat(link)
     assert state(vehicle) is ArmState.DISARMED
     assert events == [(0, "found"), (0, "armed"), (3.6, "disarmed")]
-    vehicle.close()
 
 
 @pytest.mark.parametrize(("own_hz", "forger_hz"), [(1.0, 1.0), (1.0, 500.0), (5.0, 5.0)])
-async def test_disarmed_heartbeats_of_a_forger_are_not_believed_and_named(own_hz: float, forger_hz: float) -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_disarmed_heartbeats_of_a_forger_are_not_believed_and_named(
+    link: MavlinkLink, vehicle: Vehicle, own_hz: float, forger_hz: float
+) -> None:
 
     async def beat(rate_hz: float, *, armed: bool, late_s: float) -> None:
         await asyncio.sleep(late_s)
@@ -101,23 +112,19 @@ async def test_disarmed_heartbeats_of_a_forger_are_not_believed_and_named(own_hz
     assert vehicle.conflict == "system id 1 reports armed and disarmed alternately: two autopilots, or a forged sender"
     for task in both:
         task.cancel()
-    vehicle.close()
 
 
-async def test_an_armed_heartbeat_of_another_firmware_under_the_same_ids_counts() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_an_armed_heartbeat_of_another_firmware_under_the_same_ids_counts(
+    link: MavlinkLink, vehicle: Vehicle
+) -> None:
     heartbeat(link)
     assert state(vehicle) is ArmState.DISARMED
     heartbeat(link, autopilot=mavlink.MAV_AUTOPILOT_GENERIC, armed=True)
     heartbeat(link)
     assert state(vehicle) is ArmState.ARMED
-    vehicle.close()
 
 
-async def test_a_restart_that_somebody_pretends_does_not_make_it_disarmed() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_a_restart_that_somebody_pretends_does_not_make_it_disarmed(link: MavlinkLink, vehicle: Vehicle) -> None:
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     events: list[str] = []
     vehicle.on_event.add(events.append)
@@ -127,7 +134,6 @@ async def test_a_restart_that_somebody_pretends_does_not_make_it_disarmed() -> N
     heartbeat(link)
     assert events == ["found", "armed", "rebooted"]
     assert state(vehicle) is ArmState.ARMED
-    vehicle.close()
 
 
 async def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_last() -> None:
@@ -164,21 +170,18 @@ async def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_las
         (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_ANTENNA_TRACKER),
     ],
 )
-async def test_who_is_no_autopilot_is_not_latched(autopilot: int, kind: int) -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_who_is_no_autopilot_is_not_latched(
+    link: MavlinkLink, vehicle: Vehicle, autopilot: int, kind: int
+) -> None:
     heartbeat(link, system=7, autopilot=autopilot, kind=kind)
     assert latched(vehicle) is None
     heartbeat(link, system=9)
     assert latched(vehicle) == 9
     assert link.system_id == 9
     assert vehicle.firmware == "ardupilot"
-    vehicle.close()
 
 
-async def test_other_vehicles_and_other_components_say_nothing_about_ours() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_other_vehicles_and_other_components_say_nothing_about_ours(link: MavlinkLink, vehicle: Vehicle) -> None:
     heartbeat(link, system=3)
     heartbeat(link, system=4, armed=True)
     heartbeat(link, system=3, component=154, armed=True)
@@ -190,7 +193,6 @@ async def test_other_vehicles_and_other_components_say_nothing_about_ours() -> N
     await asyncio.sleep(0.6)
     assert state(vehicle) is ArmState.UNKNOWN
     assert latched(vehicle) == 3
-    vehicle.close()
 
 
 async def test_only_the_configured_system_is_latched() -> None:
@@ -265,9 +267,7 @@ async def test_a_silent_command_server_is_asked_again_and_wedges_nothing() -> No
         assert vehicle.place.unix_time_s is not None
 
 
-async def test_position_zero_zero_is_no_position_and_gps_serves_instead() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_position_zero_zero_is_no_position_and_gps_serves_instead(link: MavlinkLink, vehicle: Vehicle) -> None:
     heartbeat(link)
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for message in (
@@ -283,7 +283,6 @@ async def test_position_zero_zero_is_no_position_and_gps_serves_instead() -> Non
     assert vehicle.place.position is not None
     assert vehicle.place.position.source == "autopilot GPS_RAW_INT"
     assert vehicle.place.position.longitude_deg == pytest.approx(20.0)
-    vehicle.close()
 
 
 async def test_a_restart_is_seen_and_its_arm_state_unknown_until_the_next_heartbeat() -> None:
@@ -301,9 +300,9 @@ async def test_a_restart_is_seen_and_its_arm_state_unknown_until_the_next_heartb
         assert vehicle.version == "4.8.0-dev"
 
 
-async def test_another_firmware_that_is_flashed_is_no_second_autopilot_though_it_streams_before_its_heartbeat() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_another_firmware_that_is_flashed_is_no_second_autopilot_though_it_streams_before_its_heartbeat(
+    link: MavlinkLink, vehicle: Vehicle
+) -> None:
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 
     def stream(boot_s: float) -> None:
@@ -319,12 +318,9 @@ async def test_another_firmware_that_is_flashed_is_no_second_autopilot_though_it
     assert vehicle.firmware == "ardupilot"
     assert vehicle.conflict is None
     assert state(vehicle) is ArmState.DISARMED
-    vehicle.close()
 
 
-async def test_a_restart_leaves_the_state_unknown() -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
+async def test_a_restart_leaves_the_state_unknown(link: MavlinkLink, vehicle: Vehicle) -> None:
     heartbeat(link)
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for boot_ms in (90_000, 200):
@@ -333,7 +329,6 @@ async def test_a_restart_leaves_the_state_unknown() -> None:
     assert state(vehicle) is ArmState.UNKNOWN
     heartbeat(link)
     assert state(vehicle) is ArmState.DISARMED
-    vehicle.close()
 
 
 async def test_old_heartbeats_read_after_a_stall_of_our_own_prove_nothing() -> None:
@@ -397,14 +392,11 @@ def test_boot_clock_slow_simulation_and_drift_are_none() -> None:
     ],
 )
 async def test_integers_are_bytes_on_px4_only_whatever_anybody_says_of_its_capabilities(
-    capabilities: int | None, autopilot: int, expected: bool
+    link: MavlinkLink, vehicle: Vehicle, capabilities: int | None, autopilot: int, expected: bool
 ) -> None:
-    link = MavlinkLink()
-    vehicle = Vehicle(link)
     heartbeat(link, autopilot=autopilot)
     vehicle.capabilities = capabilities
     assert ParameterClient(link, vehicle).integers_bytewise == expected
-    vehicle.close()
 
 
 def test_boot_clock_an_autopilot_up_for_longer_than_we_heard_nothing_has_not_restarted() -> None:

@@ -88,7 +88,6 @@ def begins(text: str, shown: str, most: int) -> bool:
 
 
 def sent_to_script(text: str) -> str:
-    """The reason in the TUNNEL message."""
     link, ground, gate = MavlinkLink(), Ground(), ScriptedGate()
     link.join((1, 1))
     gate.asks_script, gate.says = True, ArmAnswer("wait", text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -36,31 +35,24 @@ def service(folder: Path) -> Service:
 
 
 @pytest.mark.parametrize(("command", "key", "value", "allowed"), WRONG)
-def test_a_value_that_is_not_allowed_is_refused_in_one_line(
+async def test_a_value_that_is_not_allowed_is_refused_in_one_line(
     tmp_path: Path, command: str, key: str, value: Any, allowed: str
 ) -> None:
-    async def main() -> None:
-        with pytest.raises(CompanionError) as caught:
-            async for _ in service(tmp_path).faces.answer({"command": command, key: value}):
-                pass
-        words = str(caught.value)
-        assert words.startswith(f"{command}: {key!r}: found ")
-        assert words.endswith(f"; allowed: {allowed}")
-        assert "\n" not in words
-
-    asyncio.run(main())
+    with pytest.raises(CompanionError) as caught:
+        async for _ in service(tmp_path).faces.answer({"command": command, key: value}):
+            pass
+    words = str(caught.value)
+    assert words.startswith(f"{command}: {key!r}: found ")
+    assert words.endswith(f"; allowed: {allowed}")
+    assert "\n" not in words
 
 
-def test_every_command_of_the_table_is_answered_and_no_other(tmp_path: Path) -> None:
+async def test_every_command_of_the_table_is_answered_and_no_other(tmp_path: Path) -> None:
     """All but `answer`, which the page asks where there is no daemon yet."""
-
-    async def main() -> None:
-        running = service(tmp_path)
-        subsystems = (running.calibrating, running.arming, running.heading, running.recorder)
-        handled = {name for subsystem in subsystems for name in subsystem.commands()}
-        assert handled | {"status", "monitor", "fix"} == ALL.keys() - {"answer"}
-
-    asyncio.run(main())
+    running = service(tmp_path)
+    subsystems = (running.calibrating, running.arming, running.heading, running.recorder)
+    handled = {name for subsystem in subsystems for name in subsystem.commands()}
+    assert handled | {"status", "monitor", "fix"} == ALL.keys() - {"answer"}
 
 
 def test_pages_and_brokers_may_not_ask_for_everything() -> None:

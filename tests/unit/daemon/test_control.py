@@ -36,62 +36,46 @@ async def _all(path: Path, request: Object) -> list[Object]:
     return [reply async for reply in ask(path, request)]
 
 
-def test_request_progress_result_and_errors(tmp_path: Path) -> None:
+async def test_request_progress_result_and_errors(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "control.sock"
-
-    async def main() -> None:
-        async with ControlServer(path, _echo):
-            assert stat.S_IMODE(path.stat().st_mode) == 0o600
-            replies = await _all(path, {"command": "x", "long": "y" * 5000})
-            assert [reply["kind"] for reply in replies] == ["progress", "result"]
-            assert replies[-1]["request"]["long"] == "y" * 5000
-            assert await _all(path, {"command": "refuse"}) == [{"kind": "error", "reason": "moved"}]
-            (broken,) = await _all(path, {"command": "break"})
-            assert "internal error" in broken["reason"]
-        assert not path.exists()
-
-    asyncio.run(main())
+    async with ControlServer(path, _echo):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        replies = await _all(path, {"command": "x", "long": "y" * 5000})
+        assert [reply["kind"] for reply in replies] == ["progress", "result"]
+        assert replies[-1]["request"]["long"] == "y" * 5000
+        assert await _all(path, {"command": "refuse"}) == [{"kind": "error", "reason": "moved"}]
+        (broken,) = await _all(path, {"command": "break"})
+        assert "internal error" in broken["reason"]
+    assert not path.exists()
 
 
-def test_a_group_may_use_it_too(tmp_path: Path) -> None:
+async def test_a_group_may_use_it_too(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     ours = grp.getgrgid(os.getgid()).gr_name
-
-    async def main() -> None:
-        async with ControlServer(path, _echo, group=ours):
-            assert stat.S_IMODE(path.stat().st_mode) == 0o660
-            assert path.stat().st_gid == os.getgid()
-
-    asyncio.run(main())
+    async with ControlServer(path, _echo, group=ours):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o660
+        assert path.stat().st_gid == os.getgid()
 
 
-def test_a_stale_socket_is_replaced_and_a_live_one_refused(tmp_path: Path) -> None:
+async def test_a_stale_socket_is_replaced_and_a_live_one_refused(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     stale = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     stale.bind(str(path))
     stale.close()  # what kill -9 leaves
-
-    async def main() -> None:
-        async with ControlServer(path, _echo):
-            assert (await _all(path, {"command": "x"}))[-1]["kind"] == "result"
-            with pytest.raises(LinkError, match="another companion is running"):
-                async with ControlServer(path, _echo):
-                    pass
-            assert (await _all(path, {"command": "x"}))[-1]["kind"] == "result"
-
-    asyncio.run(main())
-
-
-def test_a_file_in_the_way_is_not_removed(tmp_path: Path) -> None:
-    path = tmp_path / "control.sock"
-    path.write_text("precious")
-
-    async def main() -> None:
-        with pytest.raises(LinkError, match="not a socket"):
+    async with ControlServer(path, _echo):
+        assert (await _all(path, {"command": "x"}))[-1]["kind"] == "result"
+        with pytest.raises(LinkError, match="another companion is running"):
             async with ControlServer(path, _echo):
                 pass
+        assert (await _all(path, {"command": "x"}))[-1]["kind"] == "result"
 
-    asyncio.run(main())
+
+async def test_a_file_in_the_way_is_not_removed(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    path.write_text("precious")
+    with pytest.raises(LinkError, match="not a socket"):
+        async with ControlServer(path, _echo):
+            pass
     assert path.read_text() == "precious"
 
 
@@ -110,18 +94,15 @@ def test_a_file_in_the_way_is_not_removed(tmp_path: Path) -> None:
         b'{"command": "record", "file": "a\\u0000b"}\n',
     ],
 )
-def test_garbage_is_answered_with_one_error_line(tmp_path: Path, line: bytes, caplog: pytest.LogCaptureFixture) -> None:
+async def test_garbage_is_answered_with_one_error_line(
+    tmp_path: Path, line: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "control.sock"
-
-    async def main() -> bytes:
-        async with ControlServer(path, _echo):
-            reader, writer = await asyncio.open_unix_connection(str(path))
-            writer.write(line)
-            answer = await reader.read()
-            writer.close()
-            return answer
-
-    answer = asyncio.run(main())
+    async with ControlServer(path, _echo):
+        reader, writer = await asyncio.open_unix_connection(str(path))
+        writer.write(line)
+        answer = await reader.read()
+        writer.close()
     assert b"request not understood" in answer
     assert answer.count(b"\n") == 1
     assert len(answer) < 300
@@ -143,22 +124,18 @@ async def _connected(path: Path, line: bytes = b"") -> tuple[asyncio.StreamReade
 
 
 @pytest.mark.parametrize("command", control.URGENT)
-def test_no_crowd_keeps_cancel_and_status_out(tmp_path: Path, command: str) -> None:
+async def test_no_crowd_keeps_cancel_and_status_out(tmp_path: Path, command: str) -> None:
     path = tmp_path / "control.sock"
-
-    async def main() -> None:
-        async with ControlServer(path, monitoring), asyncio.timeout(30.0):
-            deaf = [await _connected(path, b'{"command": "monitor"}\n') for _ in range(control.MAX_CLIENTS)]
-            for reader, _ in deaf:
-                await reader.readexactly(1)
-            silent = [await _connected(path) for _ in range(3 * control.MAX_CLIENTS)]
-            assert await _all(path, {"command": command}) == [{"kind": "result", "command": command}]
-            (full,) = await _all(path, {"command": "monitor"})
-            assert full == {"kind": "error", "reason": "the daemon has too many clients at once; try again"}
-            for _, writer in deaf + silent:
-                writer.transport.abort()
-
-    asyncio.run(main())
+    async with ControlServer(path, monitoring), asyncio.timeout(30.0):
+        deaf = [await _connected(path, b'{"command": "monitor"}\n') for _ in range(control.MAX_CLIENTS)]
+        for reader, _ in deaf:
+            await reader.readexactly(1)
+        silent = [await _connected(path) for _ in range(3 * control.MAX_CLIENTS)]
+        assert await _all(path, {"command": command}) == [{"kind": "result", "command": command}]
+        (full,) = await _all(path, {"command": "monitor"})
+        assert full == {"kind": "error", "reason": "the daemon has too many clients at once; try again"}
+        for _, writer in deaf + silent:
+            writer.transport.abort()
 
 
 def test_a_burst_of_silent_clients_leaves_no_descriptor_open(tmp_path: Path) -> None:
@@ -187,17 +164,13 @@ def test_a_burst_of_silent_clients_leaves_no_descriptor_open(tmp_path: Path) -> 
         gc.enable()
 
 
-def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "READ_TIMEOUT_S", 0.2)
     monkeypatch.setattr(control, "READ_TIMEOUT_S", 0.2)
     path = tmp_path / "control.sock"
-
-    async def main() -> None:
-        async with ControlServer(path, monitoring), asyncio.timeout(30.0):
-            deaf = [await _connected(path, b'{"command": "monitor"}\n') for _ in range(control.MAX_CLIENTS)]
-            while "too many clients" in str(await anext(ask(path, {"command": "monitor"}))):
-                await asyncio.sleep(0.05)
-            for _, writer in deaf:
-                writer.transport.abort()
-
-    asyncio.run(main())
+    async with ControlServer(path, monitoring), asyncio.timeout(30.0):
+        deaf = [await _connected(path, b'{"command": "monitor"}\n') for _ in range(control.MAX_CLIENTS)]
+        while "too many clients" in str(await anext(ask(path, {"command": "monitor"}))):
+            await asyncio.sleep(0.05)
+        for _, writer in deaf:
+            writer.transport.abort()

@@ -107,20 +107,19 @@ async def end_of(journal: WriteJournal, block: Block) -> BaseException | None:
         "the disk", "cancelled", "torn down", "no word", "an error after done", "an error after undone",
     ],
 )  # fmt: skip
-def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(tmp_path: Path, block: Block, over: bool) -> None:
-    async def main() -> None:
-        journal = opened(tmp_path)
-        await end_of(journal, block)
-        assert journal.pending is not over
-        assert on_disk(tmp_path) == (None if over else OLD)
-        if not over:
-            assert await asyncio.wait_for(journal.interrupted(), 30.0) == OLD
-            await journal.undone()
-            assert not journal.pending
-            assert on_disk(tmp_path) is None
-        assert await end_of(journal, raises(ALL_BACK)) is ALL_BACK  # the next one may write
-
-    asyncio.run(main())
+async def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(
+    tmp_path: Path, block: Block, over: bool
+) -> None:
+    journal = opened(tmp_path)
+    await end_of(journal, block)
+    assert journal.pending is not over
+    assert on_disk(tmp_path) == (None if over else OLD)
+    if not over:
+        assert await asyncio.wait_for(journal.interrupted(), 30.0) == OLD
+        await journal.undone()
+        assert not journal.pending
+        assert on_disk(tmp_path) is None
+    assert await end_of(journal, raises(ALL_BACK)) is ALL_BACK  # the next one may write
 
 
 @pytest.mark.parametrize(
@@ -128,22 +127,19 @@ def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(tmp_path: P
     [(raises(ALL_BACK), True), (raises(NOTHING), True), (WriteJournal.undone, False), (raises(HALF_BACK), False)],
     ids=["old values restored", "nothing written", "undone", "left changed"],
 )
-def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
+async def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
     tmp_path: Path, block: Block, kept: bool
 ) -> None:
-    async def main() -> None:
-        journal = opened(tmp_path)
-        await end_of(journal, lambda journal: journal.done(OLD))
-        await end_of(journal, block)
-        if journal.pending:  # the recovery brings the undo to its end
-            assert journal.is_undoable(OLD)
-            await journal.undone()
-        steps = (OLD,) if kept else ()
-        assert journal.steps(1) == opened(tmp_path).steps(1) == steps
-        assert (tmp_path / "undo-1.json").exists() is kept
-        assert on_disk(tmp_path) is None
-
-    asyncio.run(main())
+    journal = opened(tmp_path)
+    await end_of(journal, lambda journal: journal.done(OLD))
+    await end_of(journal, block)
+    if journal.pending:  # the recovery brings the undo to its end
+        assert journal.is_undoable(OLD)
+        await journal.undone()
+    steps = (OLD,) if kept else ()
+    assert journal.steps(1) == opened(tmp_path).steps(1) == steps
+    assert (tmp_path / "undo-1.json").exists() is kept
+    assert on_disk(tmp_path) is None
 
 
 def test_an_undo_of_two_writes_takes_both_steps_off_a_value_that_was_learned_in_between() -> None:
@@ -156,74 +152,62 @@ def test_an_undo_of_two_writes_takes_both_steps_off_a_value_that_was_learned_in_
     assert replaced.before == 0.18
 
 
-def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        journal = opened(tmp_path)
-        async with journal.transaction(OLD):
-            assert on_disk(tmp_path) == OLD
-            assert not journal.pending
-            await journal.update_pending(WIDER)
-            assert on_disk(tmp_path) == WIDER
-            await journal.done(WIDER)
+async def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: Path) -> None:
+    journal = opened(tmp_path)
+    async with journal.transaction(OLD):
+        assert on_disk(tmp_path) == OLD
         assert not journal.pending
-        assert on_disk(tmp_path) is None
-        assert ChangeLog(tmp_path).undo_of(1).read() == Undoable(1, (WIDER,))
-        assert journal.steps(1) == (WIDER,)
+        await journal.update_pending(WIDER)
+        assert on_disk(tmp_path) == WIDER
+        await journal.done(WIDER)
+    assert not journal.pending
+    assert on_disk(tmp_path) is None
+    assert ChangeLog(tmp_path).undo_of(1).read() == Undoable(1, (WIDER,))
+    assert journal.steps(1) == (WIDER,)
 
-    asyncio.run(main())
 
+async def test_nothing_is_written_whose_old_values_cannot_be_kept(tmp_path: Path) -> None:
+    disk, called = LedgerDisk(), []
+    journal = opened(tmp_path, disk)
+    disk.refuses = {"write"}
 
-def test_nothing_is_written_whose_old_values_cannot_be_kept(tmp_path: Path) -> None:
-    async def main() -> None:
-        disk, called = LedgerDisk(), []
-        journal = opened(tmp_path, disk)
-        disk.refuses = {"write"}
+    async def block(journal: WriteJournal) -> None:
+        called.append(journal)
 
-        async def block(journal: WriteJournal) -> None:
-            called.append(journal)
-
-        assert isinstance(await end_of(journal, block), StorageError)
-        assert not called
-        assert not journal.pending
-
-    asyncio.run(main())
+    assert isinstance(await end_of(journal, block), StorageError)
+    assert not called
+    assert not journal.pending
 
 
 @pytest.mark.parametrize("refused", ["write", "clear"])
-def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_to_undo(
+async def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_to_undo(
     tmp_path: Path, refused: str
 ) -> None:
-    async def main() -> None:
-        disk = LedgerDisk()
-        journal = opened(tmp_path, disk)
+    disk = LedgerDisk()
+    journal = opened(tmp_path, disk)
 
-        async def block(journal: WriteJournal) -> None:
-            disk.refuses = {refused}
-            await journal.done(OLD)
+    async def block(journal: WriteJournal) -> None:
+        disk.refuses = {refused}
+        await journal.done(OLD)
 
-        assert isinstance(await end_of(journal, block), StorageError)
-        assert journal.pending
+    assert isinstance(await end_of(journal, block), StorageError)
+    assert journal.pending
+    assert on_disk(tmp_path) == OLD
+    disk.refuses = set()
+    await journal.undone()
+    assert not journal.undoable
+    assert not opened(tmp_path).undoable
+
+
+async def test_a_second_write_does_not_take_the_place_of_one_that_is_open_or_was_interrupted(tmp_path: Path) -> None:
+    journal = opened(tmp_path)
+    async with journal.transaction(OLD):
+        with pytest.raises(AutopilotError, match="restoring old values"):
+            async with journal.transaction(WIDER):
+                raise AssertionError("written over")
+        assert not journal.pending
         assert on_disk(tmp_path) == OLD
-        disk.refuses = set()
-        await journal.undone()
-        assert not journal.undoable
-        assert not opened(tmp_path).undoable
-
-    asyncio.run(main())
-
-
-def test_a_second_write_does_not_take_the_place_of_one_that_is_open_or_was_interrupted(tmp_path: Path) -> None:
-    async def main() -> None:
-        journal = opened(tmp_path)
-        async with journal.transaction(OLD):
-            with pytest.raises(AutopilotError, match="restoring old values"):
-                async with journal.transaction(WIDER):
-                    raise AssertionError("written over")
-            assert not journal.pending
-            assert on_disk(tmp_path) == OLD
-        assert "restoring old values" in str(await end_of(journal, wordless)), "interrupted"
-        assert on_disk(tmp_path) == OLD
-        again = opened(tmp_path)
-        assert await asyncio.wait_for(again.interrupted(), 30.0) == OLD, "of a daemon that died"
-
-    asyncio.run(main())
+    assert "restoring old values" in str(await end_of(journal, wordless)), "interrupted"
+    assert on_disk(tmp_path) == OLD
+    again = opened(tmp_path)
+    assert await asyncio.wait_for(again.interrupted(), 30.0) == OLD, "of a daemon that died"

@@ -106,37 +106,31 @@ def opened(which: SerialDevice) -> tuple[SerialSensor, OpenPort, list[tuple[str,
 # --- roles
 
 
-def test_a_device_is_decoded_once_and_every_role_takes_what_it_needs() -> None:
-    async def main() -> None:
-        sensor, _, taken = opened(device(*BOTH))
-        sensor.receive(b"\r\n" + LINES, 1.0)
-        assert [name for name, _ in taken] == ["gradienter", "compass"] * 2
-        (tilt, heading) = (part for _, part in taken[:2])
-        assert isinstance(tilt, TiltSample)
-        assert isinstance(heading, CompassSample)
-        assert (tilt.x_deg, tilt.y_deg, heading.heading_deg) == (-3.0, 5.0, 40.1)
-        assert tilt.t_s == heading.t_s
-        assert sensor.decoder.accepted == 2
-
-    run_virtual(main())
+async def test_a_device_is_decoded_once_and_every_role_takes_what_it_needs() -> None:
+    sensor, _, taken = opened(device(*BOTH))
+    sensor.receive(b"\r\n" + LINES, 1.0)
+    assert [name for name, _ in taken] == ["gradienter", "compass"] * 2
+    (tilt, heading) = (part for _, part in taken[:2])
+    assert isinstance(tilt, TiltSample)
+    assert isinstance(heading, CompassSample)
+    assert (tilt.x_deg, tilt.y_deg, heading.heading_deg) == (-3.0, 5.0, 40.1)
+    assert tilt.t_s == heading.t_s
+    assert sensor.decoder.accepted == 2
 
 
-def test_headings_to_another_north_than_the_configured_one_are_refused_in_words() -> None:
-    async def main() -> None:
-        info = PROTOCOLS["compass"]["nmea"]
-        role = Role("compass", "compass", "magnetic")
-        sensor, _, taken = opened(SerialDevice("/nowhere", info, 19200, "none", read_only=True, roles=(role,)))
-        now_s = asyncio.get_running_loop().time
-        sensor.receive(sentence("HEHDT,86.2,T"), now_s())
-        assert taken == []
-        status = sensor.roles[0].status()
-        assert not status["good"]
-        assert 'its headings are true; set compass.reference = "true"' in str(status["summary"])
-        sensor.receive(sentence("HEHDM,92.0,M") + sentence("PTNTHPR,92.0,N,1.0,N,2.0,N"), now_s())
-        assert [part.heading_deg for _, part in taken if isinstance(part, CompassSample)] == [92.0, 92.0]
-        assert sensor.roles[0].status()["good"]
-
-    run_virtual(main())
+async def test_headings_to_another_north_than_the_configured_one_are_refused_in_words() -> None:
+    info = PROTOCOLS["compass"]["nmea"]
+    role = Role("compass", "compass", "magnetic")
+    sensor, _, taken = opened(SerialDevice("/nowhere", info, 19200, "none", read_only=True, roles=(role,)))
+    now_s = asyncio.get_running_loop().time
+    sensor.receive(sentence("HEHDT,86.2,T"), now_s())
+    assert taken == []
+    status = sensor.roles[0].status()
+    assert not status["good"]
+    assert 'its headings are true; set compass.reference = "true"' in str(status["summary"])
+    sensor.receive(sentence("HEHDM,92.0,M") + sentence("PTNTHPR,92.0,N,1.0,N,2.0,N"), now_s())
+    assert [part.heading_deg for _, part in taken if isinstance(part, CompassSample)] == [92.0, 92.0]
+    assert sensor.roles[0].status()["good"]
 
 
 def config(text: str) -> Config:
@@ -160,23 +154,19 @@ def test_what_one_section_leaves_open_the_other_says() -> None:
 # --- what is said
 
 
-def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest.LogCaptureFixture) -> None:
+async def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-
-    async def main() -> None:
-        sensor, port, _ = opened(device(*BOTH, dialogue=Chatterbox))
-        assert isinstance(sensor.dialogue, Talker)
-        sensor.dialogue.words = "said something"
-        running = asyncio.create_task(sensor.run())
-        await asyncio.sleep(0.3)
-        before = len(port.sent)
-        for _ in range(1000):
-            await asyncio.sleep(0.001)
-            sensor.receive(b"4", asyncio.get_running_loop().time())
-        assert 20 <= len(port.sent) - before <= 51
-        running.cancel()
-
-    run_virtual(main())
+    sensor, port, _ = opened(device(*BOTH, dialogue=Chatterbox))
+    assert isinstance(sensor.dialogue, Talker)
+    sensor.dialogue.words = "said something"
+    running = asyncio.create_task(sensor.run())
+    await asyncio.sleep(0.3)
+    before = len(port.sent)
+    for _ in range(1000):
+        await asyncio.sleep(0.001)
+        sensor.receive(b"4", asyncio.get_running_loop().time())
+    assert 20 <= len(port.sent) - before <= 51
+    running.cancel()
     assert [record.message for record in caplog.records].count("gradienter, compass: said something") == 1
 
 

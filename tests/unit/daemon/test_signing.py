@@ -81,91 +81,83 @@ class SigningBoard:
             (self.folder / SIGNING_FILE).write_bytes(kept)
 
 
-def test_in_1970_time_goes_on_behind_what_was_used_whatever_ends_it(
+async def test_in_1970_time_goes_on_behind_what_was_used_whatever_ends_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def main() -> None:
-        board = SigningBoard(tmp_path, monkeypatch, wall_s=0.0)
-        async with board.daemon() as first:
-            assert first.signing is not None
-            first.signing.clock.heard(NOW)
-            await asyncio.sleep(3.0)
-            used = first.signing.clock.next()
-            assert used >= NOW + 3 * TICKS_PER_S
-        for killed in (False, True, True):
-            # kill -9 and a restart within the same boot: on from where it was, however often.
-            async with board.daemon(killed=killed) as again:
-                assert again.signing is not None
-                now = again.signing.clock.next()
-                assert used < now < used + MARGIN
-                used = now
-        for _ in range(3):
-            board.power_cut()
-            async with board.daemon(killed=True) as anew:
-                assert anew.signing is not None
-                now = anew.signing.clock.next()
-                assert used < now <= used + int(AHEAD_S * TICKS_PER_S) + MARGIN
-                await asyncio.sleep(70.0)
-                used = anew.signing.clock.next()
-
-    run_virtual(main())
+    board = SigningBoard(tmp_path, monkeypatch, wall_s=0.0)
+    async with board.daemon() as first:
+        assert first.signing is not None
+        first.signing.clock.heard(NOW)
+        await asyncio.sleep(3.0)
+        used = first.signing.clock.next()
+        assert used >= NOW + 3 * TICKS_PER_S
+    for killed in (False, True, True):
+        # kill -9 and a restart within the same boot: on from where it was, however often.
+        async with board.daemon(killed=killed) as again:
+            assert again.signing is not None
+            now = again.signing.clock.next()
+            assert used < now < used + MARGIN
+            used = now
+    for _ in range(3):
+        board.power_cut()
+        async with board.daemon(killed=True) as anew:
+            assert anew.signing is not None
+            now = anew.signing.clock.next()
+            assert used < now <= used + int(AHEAD_S * TICKS_PER_S) + MARGIN
+            await asyncio.sleep(70.0)
+            used = anew.signing.clock.next()
 
 
 @pytest.mark.parametrize("wall_at_start_s", [NOW_S, 0.0])
-def test_a_clock_once_20_years_ahead_is_not_followed_in_that_boot(
+async def test_a_clock_once_20_years_ahead_is_not_followed_in_that_boot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wall_at_start_s: float
 ) -> None:
     """A board without a battery-backed clock has the time from a signed message instead."""
-
-    async def main() -> None:
-        board = SigningBoard(tmp_path, monkeypatch, wall_s=wall_at_start_s)
-        async with board.daemon() as first:
-            assert first.signing is not None
-            first.signing.clock.heard(NOW)
-            before = first.signing.clock.next()
-            board.wall_at_boot_s = NOW_S + 20 * YEAR_S
-            await asyncio.sleep(3.0)
-            assert first.signing.clock.next() < before + 5 * TICKS_PER_S
-            await asyncio.sleep(3.0)
-        async with board.daemon() as second:  # started again while the clock is wrong
-            assert second.signing is not None
-            assert second.signing.clock.next() < before + 10 * TICKS_PER_S
-        board.wall_at_boot_s = NOW_S
-        board.power_cut()
-        async with board.daemon() as third:
-            assert third.signing is not None
-            assert third.signing.clock.next() < before + int(AHEAD_S * TICKS_PER_S) + 10 * TICKS_PER_S
-
-    run_virtual(main())
+    board = SigningBoard(tmp_path, monkeypatch, wall_s=wall_at_start_s)
+    async with board.daemon() as first:
+        assert first.signing is not None
+        first.signing.clock.heard(NOW)
+        before = first.signing.clock.next()
+        board.wall_at_boot_s = NOW_S + 20 * YEAR_S
+        await asyncio.sleep(3.0)
+        assert first.signing.clock.next() < before + 5 * TICKS_PER_S
+        await asyncio.sleep(3.0)
+    async with board.daemon() as second:  # started again while the clock is wrong
+        assert second.signing is not None
+        assert second.signing.clock.next() < before + 10 * TICKS_PER_S
+    board.wall_at_boot_s = NOW_S
+    board.power_cut()
+    async with board.daemon() as third:
+        assert third.signing is not None
+        assert third.signing.clock.next() < before + int(AHEAD_S * TICKS_PER_S) + 10 * TICKS_PER_S
 
 
-def test_a_kept_time_far_ahead_is_named_with_the_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def main() -> None:
-        board = SigningBoard(tmp_path, monkeypatch, wall_s=NOW_S + 20 * YEAR_S)
-        async with board.daemon():
+async def test_a_kept_time_far_ahead_is_named_with_the_way_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = SigningBoard(tmp_path, monkeypatch, wall_s=NOW_S + 20 * YEAR_S)
+    async with board.daemon():
+        await asyncio.sleep(1.0)
+    board.wall_at_boot_s = NOW_S
+    board.power_cut()
+
+    def autopilot_says(found: LinkSigning) -> bool:
+        assert found.signing is not None
+        ticks = int((board.wall_s() - EPOCH_S) * TICKS_PER_S)
+        return found.signing.admits(HEARTBEAT.pack(peer(KEY, ticks)))
+
+    async with board.daemon() as deaf:
+        for _ in range(6):
+            assert not autopilot_says(deaf)
             await asyncio.sleep(1.0)
-        board.wall_at_boot_s = NOW_S
-        board.power_cut()
-
-        def autopilot_says(found: LinkSigning) -> bool:
-            assert found.signing is not None
-            ticks = int((board.wall_s() - EPOCH_S) * TICKS_PER_S)
-            return found.signing.admits(HEARTBEAT.pack(peer(KEY, ticks)))
-
-        async with board.daemon() as deaf:
-            for _ in range(6):
-                assert not autopilot_says(deaf)
-                await asyncio.sleep(1.0)
-            way_back = "far ahead of this board's clock: stop the companion, delete mavlink-signing-time.json, start it"
-            assert way_back in str(deaf.warning)
-            assert way_back in str(deaf.rejecting)
-        (tmp_path / SIGNING_FILE).unlink()
-        async with board.daemon() as hears:
-            assert autopilot_says(hears)
-            await asyncio.sleep(6.0)
-            assert hears.rejecting is None
-
-    run_virtual(main())
+        way_back = "far ahead of this board's clock: stop the companion, delete mavlink-signing-time.json, start it"
+        assert way_back in str(deaf.warning)
+        assert way_back in str(deaf.rejecting)
+    (tmp_path / SIGNING_FILE).unlink()
+    async with board.daemon() as hears:
+        assert autopilot_says(hears)
+        await asyncio.sleep(6.0)
+        assert hears.rejecting is None
 
 
 def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(

@@ -17,7 +17,6 @@ from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.machine import Machine, State
 from companion.storage.changes import ChangeLog, Origin
-from tests.support.virtual_time import run_virtual
 
 PLANNED = [Change("INS_GYROFFS_X", 0.0, 0.001)]
 MADE = [*PLANNED, Change("INS_GYR2OFFS_X", 0.0, 0.002)]
@@ -69,15 +68,12 @@ class WritePathAircraft:
         await self.path.commit(PLANNED, Origin("calibration"), [], apply, verify)
 
 
-def test_a_verified_write_can_be_undone_with_all_that_it_changed(tmp_path: Path) -> None:
-    async def main() -> None:
-        aircraft = WritePathAircraft(tmp_path)
-        await aircraft.commit()
-        (step,) = aircraft.journal.steps(1)
-        assert step.names == [change.parameter for change in MADE]
-        assert not aircraft.writer.restored
-
-    run_virtual(main())
+async def test_a_verified_write_can_be_undone_with_all_that_it_changed(tmp_path: Path) -> None:
+    aircraft = WritePathAircraft(tmp_path)
+    await aircraft.commit()
+    (step,) = aircraft.journal.steps(1)
+    assert step.names == [change.parameter for change in MADE]
+    assert not aircraft.writer.restored
 
 
 @pytest.mark.parametrize(
@@ -90,26 +86,20 @@ def test_a_verified_write_can_be_undone_with_all_that_it_changed(tmp_path: Path)
     ],
     ids=["no effect", "a restart owed is not kept", "cancelled", "no undo can be kept"],
 )
-def test_a_write_that_must_not_stay_is_restored_at_once(
+async def test_a_write_that_must_not_stay_is_restored_at_once(
     tmp_path: Path, verdict: Exception | None, full: bool, raised: type[Exception]
 ) -> None:
-    async def main() -> None:
-        aircraft = WritePathAircraft(tmp_path)
-        with pytest.raises(raised, match=r"; old values restored$"):
-            await aircraft.commit(verdict, full=full)
-        assert aircraft.writer.restored == MADE
-        assert aircraft.journal.steps(1) == ()
-        assert aircraft.journal.pending is full, "a disk that cannot forget the write leaves it to the recovery"
-
-    run_virtual(main())
+    aircraft = WritePathAircraft(tmp_path)
+    with pytest.raises(raised, match=r"; old values restored$"):
+        await aircraft.commit(verdict, full=full)
+    assert aircraft.writer.restored == MADE
+    assert aircraft.journal.steps(1) == ()
+    assert aircraft.journal.pending is full, "a disk that cannot forget the write leaves it to the recovery"
 
 
-def test_values_that_could_not_be_restored_are_named_and_left_to_the_recovery(tmp_path: Path) -> None:
-    async def main() -> None:
-        aircraft = WritePathAircraft(tmp_path)
-        aircraft.writer.fails = WriteFailedError("armed in the middle", "armed", {}, ("INS_GYROFFS_X",))
-        with pytest.raises(AutopilotError, match="old values NOT restored in INS_GYROFFS_X: restored once disarmed"):
-            await aircraft.commit(AutopilotError("not followed"))
-        assert aircraft.journal.pending
-
-    run_virtual(main())
+async def test_values_that_could_not_be_restored_are_named_and_left_to_the_recovery(tmp_path: Path) -> None:
+    aircraft = WritePathAircraft(tmp_path)
+    aircraft.writer.fails = WriteFailedError("armed in the middle", "armed", {}, ("INS_GYROFFS_X",))
+    with pytest.raises(AutopilotError, match="old values NOT restored in INS_GYROFFS_X: restored once disarmed"):
+        await aircraft.commit(AutopilotError("not followed"))
+    assert aircraft.journal.pending

@@ -121,7 +121,6 @@ def test_beyond_what_was_seen_it_goes_straight_on_and_says_so() -> None:
 
 
 def of_the_air(board_degc: Array, air_degc: float) -> Array:
-    """A draught."""
     return np.asarray(air_degc + 2.0 * np.sin(np.arange(len(board_degc)) / 150.0 + air_degc))
 
 

@@ -33,8 +33,6 @@ GYRO_BIAS = np.array([300.0, -200.0, 100.0]) * DEG_H
 
 
 class Later(NamedTuple):
-    """Later pose, and texts about it."""
-
     pose: Pose
     solution: Solution
 

@@ -45,13 +45,11 @@ class Stand:
         self.feed.change = lambda name, _t, rows: rows + more if not names or name in names else rows
 
     def turn(self, rate_deg_s: float) -> None:
-        """The platform begins to turn."""
         since_s, from_deg = self.feed.now_s, self.heading(self.feed.now_s)
         self.heading = lambda t: from_deg + rate_deg_s * (t - since_s)
         self.add((0.0, 0.0, rate_deg_s))
 
     def warnings(self) -> tuple[str, ...]:
-        """Warnings of a calibration now."""
         model = CompassModel(magnetic=False, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0)
         window = self.collector.window(self.feed.now_s)
         return solve(window, local_earth(Whereabouts(45.0)), None, model, What.GYROS).warnings

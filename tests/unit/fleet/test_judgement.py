@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +23,6 @@ from tests.support.collecting import NOW, rows_of
 
 MOVED = 80.0
 """deg/h, 16 of the simulated scatters."""
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> str:
-    return str(tmp_path / "fleet.sqlite")
-
-
-@pytest.fixture
-def store(database: str) -> Iterator[Store]:
-    one = Store(database)
-    one.prepare()
-    yield one
-    one.close()
 
 
 def flown(one: Aircraft, flights: int, days: float, until: float = 0.0) -> None:
@@ -64,7 +51,6 @@ def changed(one: Aircraft, sequence: int, **news: Any) -> None:
 
 
 def judged(store: Store, database: str, messages: Sequence[Incoming]) -> list[Any]:
-    """The findings, once all is judged."""
     store.take(messages)
     while store.judge():
         pass

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
@@ -15,19 +13,6 @@ from companion.fleet.store import Store
 from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> str:
-    return str(tmp_path / "fleet.sqlite")
-
-
-@pytest.fixture
-def store(database: str) -> Iterator[Store]:
-    one = Store(database)
-    one.prepare()
-    yield one
-    one.close()
 
 
 def tell(store: Store, *fleet: Aircraft) -> None:

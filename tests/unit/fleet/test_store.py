@@ -6,8 +6,6 @@ import contextlib
 import datetime
 import json
 import sqlite3
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import hypothesis
@@ -25,19 +23,6 @@ from companion.mqtt.fleet import MOST_RANGES
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, items_in, rows_of, told_by
 from tests.support.fleet import check
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> str:
-    return str(tmp_path / "fleet.sqlite")
-
-
-@pytest.fixture
-def store(database: str) -> Iterator[Store]:
-    one = Store(database)
-    one.prepare()
-    yield one
-    one.close()
 
 
 def aircraft(flights: int = 5, number: int = 1) -> Aircraft:

@@ -56,23 +56,20 @@ def test_on_a_lossy_radio_one_press_is_one_calibration_and_its_end_is_heard(bloc
     assert ends.count("heard") >= 47
 
 
-def test_answers_to_others_and_of_others_are_not_ours() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        async with bench(ground=station) as b:
-            asked = exchange(station)
-            asking = asyncio.create_task(asked.run())
-            await asyncio.sleep(0.5)
-            for source, command in (
-                (COMPANION._replace(component_id=1), CALIBRATE),
-                (COMPANION._replace(system_id=2), CALIBRATE),
-                (COMPANION, UNDO),
-            ):
-                station.on_ack.tell(source, {"command": command, "result": mavlink.MAV_RESULT_DENIED})
-            await asyncio.sleep(0.5)
-            assert not asking.done()
-            b.service.jobs[0].finish("done")
-            await asking
-            assert (asked.result, asked.unanswered) == (ACCEPTED, False)
-
-    run_virtual(main())
+async def test_answers_to_others_and_of_others_are_not_ours() -> None:
+    station = StationOnTheWire()
+    async with bench(ground=station) as b:
+        asked = exchange(station)
+        asking = asyncio.create_task(asked.run())
+        await asyncio.sleep(0.5)
+        for source, command in (
+            (COMPANION._replace(component_id=1), CALIBRATE),
+            (COMPANION._replace(system_id=2), CALIBRATE),
+            (COMPANION, UNDO),
+        ):
+            station.on_ack.tell(source, {"command": command, "result": mavlink.MAV_RESULT_DENIED})
+        await asyncio.sleep(0.5)
+        assert not asking.done()
+        b.service.jobs[0].finish("done")
+        await asking
+        assert (asked.result, asked.unanswered) == (ACCEPTED, False)

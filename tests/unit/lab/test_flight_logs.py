@@ -41,7 +41,6 @@ def log(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def storage(folder: Path) -> list[str]:
-    """A configuration with a history of its own."""
     path = folder / "companion.toml"
     imu = '[[imu]]\nname = "fc"\nsource = "autopilot"\n'
     path.write_text(f'[mavlink]\nurl = "udpin:127.0.0.1:14550"\n[storage]\ndirectory = "{folder}"\n{imu}')

@@ -123,21 +123,18 @@ def path(tmp_path: Path) -> Path:
 # Serial ---------------------------------------------------------------------------------------------------------------
 
 
-def test_bytes_arrive_with_the_time_of_the_loop(path: Path) -> None:
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path) as port:
-                await port.state(connected=True)
-                before_s = asyncio.get_running_loop().time()
-                os.write(pty.master, b"123.4, 18.6, -0.5\r\n")
-                data, t_s = await asyncio.wait_for(port.chunks.get(), 40)
-                assert data == b"123.4, 18.6, -0.5\r\n"
-                assert before_s <= t_s <= asyncio.get_running_loop().time()
-                assert port.link.bytes_received == 19
-                assert port.link.connected
-                assert port.link.last_error == ""
-
-    asyncio.run(main())
+async def test_bytes_arrive_with_the_time_of_the_loop(path: Path) -> None:
+    with plugged(path) as pty:
+        async with running(path) as port:
+            await port.state(connected=True)
+            before_s = asyncio.get_running_loop().time()
+            os.write(pty.master, b"123.4, 18.6, -0.5\r\n")
+            data, t_s = await asyncio.wait_for(port.chunks.get(), 40)
+            assert data == b"123.4, 18.6, -0.5\r\n"
+            assert before_s <= t_s <= asyncio.get_running_loop().time()
+            assert port.link.bytes_received == 19
+            assert port.link.connected
+            assert port.link.last_error == ""
 
 
 async def collecting(port: ScriptedPort, pty: Pty) -> None:
@@ -150,85 +147,71 @@ async def collecting(port: ScriptedPort, pty: Pty) -> None:
     assert reads == QUICK_READS
 
 
-def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
+async def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+    with plugged(path) as pty:
+        async with running(path, FAST) as port:
+            await port.state(connected=True)
+            await collecting(port, pty)
+            for number in range(5):
+                os.write(pty.master, bytes([number]))
+            chunk, _ = await asyncio.wait_for(port.chunks.get(), 40)
+            assert chunk == bytes(range(5))  # written in one turn of the loop, they come together
+            async with asyncio.timeout(40):
+                while port.link._collecting is not None:
+                    await asyncio.sleep(0.001)
+            await collecting(port, pty)  # as at the start: each byte by itself
 
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path, FAST) as port:
+
+async def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+    async with running(path, FAST) as port:
+        for _ in range(2):
+            with plugged(path) as pty:
                 await port.state(connected=True)
                 await collecting(port, pty)
-                for number in range(5):
-                    os.write(pty.master, bytes([number]))
-                chunk, _ = await asyncio.wait_for(port.chunks.get(), 40)
-                assert chunk == bytes(range(5))  # written in one turn of the loop, they come together
-                async with asyncio.timeout(40):
-                    while port.link._collecting is not None:
-                        await asyncio.sleep(0.001)
-                await collecting(port, pty)  # as at the start: each byte by itself
-
-    asyncio.run(main())
+                pty.unplug()
+                assert "the device is gone" in await port.state(connected=False)
+                assert port.link._collecting is None
 
 
-def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
-
-    async def main() -> None:
-        async with running(path, FAST) as port:
-            for _ in range(2):
-                with plugged(path) as pty:
-                    await port.state(connected=True)
-                    await collecting(port, pty)
-                    pty.unplug()
-                    assert "the device is gone" in await port.state(connected=False)
-                    assert port.link._collecting is None
-
-    asyncio.run(main())
-
-
-def test_an_unplugged_device_is_closed_at_once_and_found_again_under_another_name(path: Path) -> None:
-    async def main() -> None:
-        with plugged(path) as first:
-            async with running(path) as port:
+async def test_an_unplugged_device_is_closed_at_once_and_found_again_under_another_name(path: Path) -> None:
+    with plugged(path) as first:
+        async with running(path) as port:
+            await port.state(connected=True)
+            os.write(first.master, b"one")
+            assert await port.data(3) == b"one"
+            descriptors = open_descriptors()
+            first.unplug()
+            reason = await port.state(connected=False)
+            assert reason == f"{path}: the device is gone; unplugged?"
+            assert port.link.last_error == reason
+            assert not port.link.connected
+            assert open_descriptors() == descriptors - 2  # the test's end and the link's
+            assert "no such device; is it plugged in?" in await port.state(connected=False)
+            # Another pty under the old one's link: only opening the link afresh can find it.
+            with plugged(path) as second:
                 await port.state(connected=True)
-                os.write(first.master, b"one")
-                assert await port.data(3) == b"one"
-                descriptors = open_descriptors()
-                first.unplug()
-                reason = await port.state(connected=False)
-                assert reason == f"{path}: the device is gone; unplugged?"
-                assert port.link.last_error == reason
-                assert not port.link.connected
-                assert open_descriptors() == descriptors - 2  # the test's end and the link's
-                assert "no such device; is it plugged in?" in await port.state(connected=False)
-                # Another pty under the old one's link: only opening the link afresh can find it.
-                with plugged(path) as second:
-                    await port.state(connected=True)
-                    os.write(second.master, b"two")
-                    assert await port.data(3) == b"two"
-                    assert port.link.reconnects == 1
-
-    asyncio.run(main())
+                os.write(second.master, b"two")
+                assert await port.data(3) == b"two"
+                assert port.link.reconnects == 1
 
 
-def test_a_second_reader_is_refused_and_told_who_is_first(path: Path) -> None:
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path) as first:
-                await first.state(connected=True)
-                async with running(path) as second:
-                    reason = await second.state(connected=False)
-                    assert reason.startswith(f"{path}: in use by another program (")
-                    assert f"process {os.getpid()})" in reason
-                    os.write(pty.master, b"for the first")
-                    assert await first.data(13) == b"for the first"
-                    assert second.link.bytes_received == 0
-
-    asyncio.run(main())
+async def test_a_second_reader_is_refused_and_told_who_is_first(path: Path) -> None:
+    with plugged(path) as pty:
+        async with running(path) as first:
+            await first.state(connected=True)
+            async with running(path) as second:
+                reason = await second.state(connected=False)
+                assert reason.startswith(f"{path}: in use by another program (")
+                assert f"process {os.getpid()})" in reason
+                os.write(pty.master, b"for the first")
+                assert await first.data(13) == b"for the first"
+                assert second.link.bytes_received == 0
 
 
 def run_as_nobody(code: str) -> str:
@@ -273,18 +256,14 @@ def test_even_a_reader_that_asks_for_no_lock_is_kept_out(path: Path) -> None:
             os.close(descriptor)
 
 
-def test_a_port_that_was_given_back_can_be_opened_by_others(path: Path) -> None:
+async def test_a_port_that_was_given_back_can_be_opened_by_others(path: Path) -> None:
     """A pseudo-terminal whose other end stays open would keep the lock for ever."""
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path) as port:
-                await port.state(connected=True)
-            give_to_nobody(pty)
-            code = f"os.close(os.open({pty.name!r}, os.O_RDWR | os.O_NOCTTY))\nprint('open')\n"
-            assert await asyncio.to_thread(run_as_nobody, code) == "open"
-
-    asyncio.run(main())
+    with plugged(path) as pty:
+        async with running(path) as port:
+            await port.state(connected=True)
+        give_to_nobody(pty)
+        code = f"os.close(os.open({pty.name!r}, os.O_RDWR | os.O_NOCTTY))\nprint('open')\n"
+        assert await asyncio.to_thread(run_as_nobody, code) == "open"
 
 
 def test_what_is_no_port_is_said_to_be_none(tmp_path: Path) -> None:
@@ -343,7 +322,9 @@ def test_a_speed_that_cannot_be_is_refused(path: Path) -> None:
         open_serial(str(path), 99_999_999_999, "none")
 
 
-def test_a_port_that_dies_as_soon_as_it_is_open_is_not_hammered(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_port_that_dies_as_soon_as_it_is_open_is_not_hammered(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Hung-up ttys are readable for ever and give nothing: each is closed, and the pauses grow."""
     opened: list[float] = []
 
@@ -355,14 +336,10 @@ def test_a_port_that_dies_as_soon_as_it_is_open_is_not_hammered(path: Path, monk
 
     monkeypatch.setattr(serial_port, "open_serial", open_dead)
     before = open_descriptors()
-
-    async def main() -> None:
-        async with running(path) as port:
-            for _ in range(4):
-                await port.state(connected=True)
-                assert "the device is gone" in await port.state(connected=False)
-
-    asyncio.run(main())
+    async with running(path) as port:
+        for _ in range(4):
+            await port.state(connected=True)
+            assert "the device is gone" in await port.state(connected=False)
     pauses = [later - earlier for earlier, later in itertools.pairwise(opened)]
     for pause, least in zip(pauses, (0.2, 0.4, 0.8), strict=False):  # a busy machine takes longer, never shorter
         assert 0.8 * least < pause < least + 5.0
@@ -427,22 +404,18 @@ def test_an_unexpected_fault_while_opening_is_an_event_and_no_silence(monkeypatc
         asyncio.run(SerialOpener("/dev/imu", 9600, "none").open())
 
 
-def test_one_warning_a_loss_and_word_when_it_is_back(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_one_warning_a_loss_and_word_when_it_is_back(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, logger="companion.links.system.connection")
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path) as port:
+    with plugged(path) as pty:
+        async with running(path) as port:
+            await port.state(connected=True)
+            pty.unplug()
+            assert "gone" in await port.state(connected=False)
+            assert "no such device" in await port.state(connected=False)
+            with plugged(path) as again:
                 await port.state(connected=True)
-                pty.unplug()
-                assert "gone" in await port.state(connected=False)
-                assert "no such device" in await port.state(connected=False)
-                with plugged(path) as again:
-                    await port.state(connected=True)
-                    again.unplug()
-                    await port.state(connected=False)
-
-    asyncio.run(main())
+                again.unplug()
+                await port.state(connected=False)
     told = [(record.levelname, record.getMessage()) for record in caplog.records]
     assert told[0] == ("INFO", f"compass: {path} is open")
     assert told[1] == ("WARNING", f"compass: {path}: the device is gone; unplugged?")
@@ -454,39 +427,32 @@ def test_one_warning_a_loss_and_word_when_it_is_back(path: Path, caplog: pytest.
 # Writing --------------------------------------------------------------------------------------------------------------
 
 
-def test_writing(path: Path) -> None:
-    async def main() -> None:
-        async with running(path) as port:
-            assert not port.link.write(b"nobody there")
-            with plugged(path) as pty:
-                await port.state(connected=True)
-                assert port.link.write(b"*Q\r\n")
-                assert await asyncio.to_thread(os.read, pty.master, 100) == b"*Q\r\n"
-
-    asyncio.run(main())
-
-
-def test_what_the_device_does_not_take_waits_up_to_a_bound_and_is_never_sent_in_part(path: Path) -> None:
-    block = bytes(range(32, 96)) * 8
-
-    async def main() -> None:
+async def test_writing(path: Path) -> None:
+    async with running(path) as port:
+        assert not port.link.write(b"nobody there")
         with plugged(path) as pty:
-            async with running(path) as port:
-                await port.state(connected=True)
-                taken = 0
-                while port.link.write(block):
-                    taken += 1
-                    assert taken < 1000
-                assert taken * len(block) > OUT_BUFFER_BYTES - len(block)
-                assert len(port.link._out) <= OUT_BUFFER_BYTES
-                assert not port.link.write(block)
-                received = b""
-                while len(received) < taken * len(block):
-                    received += await asyncio.to_thread(os.read, pty.master, 65536)
-                assert received == block * taken
-                assert port.link.write(b"room again")
+            await port.state(connected=True)
+            assert port.link.write(b"*Q\r\n")
+            assert await asyncio.to_thread(os.read, pty.master, 100) == b"*Q\r\n"
 
-    asyncio.run(main())
+
+async def test_what_the_device_does_not_take_waits_up_to_a_bound_and_is_never_sent_in_part(path: Path) -> None:
+    block = bytes(range(32, 96)) * 8
+    with plugged(path) as pty:
+        async with running(path) as port:
+            await port.state(connected=True)
+            taken = 0
+            while port.link.write(block):
+                taken += 1
+                assert taken < 1000
+            assert taken * len(block) > OUT_BUFFER_BYTES - len(block)
+            assert len(port.link._out) <= OUT_BUFFER_BYTES
+            assert not port.link.write(block)
+            received = b""
+            while len(received) < taken * len(block):
+                received += await asyncio.to_thread(os.read, pty.master, 65536)
+            assert received == block * taken
+            assert port.link.write(b"room again")
 
 
 # TCP ------------------------------------------------------------------------------------------------------------------
@@ -510,51 +476,43 @@ def reset(peer: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("ending", ["close", "half-close", "reset"])
-def test_a_socket_serves_like_a_port_and_comes_back(ending: str) -> None:
+async def test_a_socket_serves_like_a_port_and_comes_back(ending: str) -> None:
     before = open_descriptors()
-
-    async def main() -> None:
-        with server() as (listening, url):
-            async with running(url) as port:
-                peer = await accept(listening)
+    with server() as (listening, url):
+        async with running(url) as port:
+            peer = await accept(listening)
+            await port.state(connected=True)
+            peer.sendall(b"one")
+            assert await port.data(3) == b"one"
+            assert port.link.write(b"hello")
+            assert await asyncio.get_running_loop().sock_recv(peer, 10) == b"hello"
+            if ending == "close":
+                peer.close()
+            elif ending == "half-close":
+                peer.shutdown(socket.SHUT_WR)
+            else:
+                reset(peer)
+            reason = await port.state(connected=False)
+            assert ("reset" if ending == "reset" else "the other side closed the connection") in reason
+            with peer, await accept(listening) as again:
                 await port.state(connected=True)
-                peer.sendall(b"one")
-                assert await port.data(3) == b"one"
-                assert port.link.write(b"hello")
-                assert await asyncio.get_running_loop().sock_recv(peer, 10) == b"hello"
-                if ending == "close":
-                    peer.close()
-                elif ending == "half-close":
-                    peer.shutdown(socket.SHUT_WR)
-                else:
-                    reset(peer)
-                reason = await port.state(connected=False)
-                assert ("reset" if ending == "reset" else "the other side closed the connection") in reason
-                with peer, await accept(listening) as again:
-                    await port.state(connected=True)
-                    again.sendall(b"two")
-                    assert await port.data(3) == b"two"
-                    assert port.link.reconnects == 1
-
-    asyncio.run(main())
+                again.sendall(b"two")
+                assert await port.data(3) == b"two"
+                assert port.link.reconnects == 1
     assert open_descriptors() == before
 
 
-def test_a_peer_that_vanishes_without_a_word_is_probed() -> None:
+async def test_a_peer_that_vanishes_without_a_word_is_probed() -> None:
     """No packet is lost on loopback, so what is checked is that the kernel will ask: 5 s idle, then 3 times in 6 s."""
-
-    async def main() -> None:
-        with server() as (listening, url):
-            async with running(url) as port:
-                with await accept(listening):
-                    await port.state(connected=True)
-                    assert port.link._descriptor is not None
-                    with socket.socket(fileno=os.dup(port.link._descriptor)) as ours:
-                        assert ours.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
-                        assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 5
-                        assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT) == 3
-
-    asyncio.run(main())
+    with server() as (listening, url):
+        async with running(url) as port:
+            with await accept(listening):
+                await port.state(connected=True)
+                assert port.link._descriptor is not None
+                with socket.socket(fileno=os.dup(port.link._descriptor)) as ours:
+                    assert ours.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+                    assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 5
+                    assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT) == 3
 
 
 @pytest.mark.parametrize(
@@ -568,12 +526,9 @@ def test_a_peer_that_vanishes_without_a_word_is_probed() -> None:
         ("tcp://" + "a" * 80 + ".invalid:80", "no connection: unknown host "),
     ],
 )
-def test_an_address_that_cannot_be_is_reported_and_does_not_end_the_link(url: str, message: str) -> None:
-    async def main() -> None:
-        async with running(url) as port:
-            assert message in await port.state(connected=False)
-
-    asyncio.run(main())
+async def test_an_address_that_cannot_be_is_reported_and_does_not_end_the_link(url: str, message: str) -> None:
+    async with running(url) as port:
+        assert message in await port.state(connected=False)
 
 
 # Settings -------------------------------------------------------------------------------------------------------------

@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 
 from companion.links.system.events import comes
-from tests.support.virtual_time import run_virtual
 
 
-def test_a_clean_up_of_a_cancelled_task_waits_no_longer_than_it_says() -> None:
+async def test_a_clean_up_of_a_cancelled_task_waits_no_longer_than_it_says() -> None:
     """Before Python 3.11.4 `asyncio.timeout` raises CancelledError there, and the rest of the clean-up is lost."""
     came: list[bool] = []
 
@@ -18,11 +17,8 @@ def test_a_clean_up_of_a_cancelled_task_waits_no_longer_than_it_says() -> None:
         finally:
             came.append(await comes(asyncio.Event(), 1.0))
 
-    async def main() -> None:
-        task = asyncio.create_task(work())
-        await asyncio.sleep(0.0)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-    run_virtual(main())
+    task = asyncio.create_task(work())
+    await asyncio.sleep(0.0)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
     assert came == [False]

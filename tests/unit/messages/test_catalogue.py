@@ -75,7 +75,6 @@ def test_every_other_text_of_the_catalogue_can_be_said(said: list[Message]) -> N
 
 
 def calls() -> list[tuple[str, ast.Call]]:
-    """All calls of `message` in the code, with their places."""
     return [
         (f"{path.relative_to(ROOT)}:{node.lineno}", node)
         for path in sorted((ROOT / "companion").rglob("*.py"))

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from companion.mqtt.daemon import MAX_PENDING, REMEMBER_S, REMEMBERED, Request, Requests, parse
-from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]
 
@@ -56,119 +55,101 @@ class Daemon:
         await asyncio.sleep(0.3)
 
 
-def test_a_calibration_is_answered_twice_with_its_transaction() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        await daemon.take(b'{"transaction": "a b", "what": "gyros", "timeout_s": 60, "reboot": true}')
-        assert daemon.asked == [
-            {"command": "calibrate", "what": "gyros", "timeout_s": 60, "reboot": True, "wait": True}
-        ]
-        daemon.end.set()
-        await asyncio.sleep(1.0)
-        assert daemon.responses == [
-            ("calibrate", {"transaction": "a b", "state": "accepted", "reason": "calibration started"}),
-            (
-                "calibrate",
-                {
-                    "transaction": "a b",
-                    "state": "done",
-                    "reason": "sigma 3 deg/h",
-                    "record": {"state": "done", "reason": "sigma 3 deg/h"},
-                },
-            ),
-        ]
-
-    run_virtual(main())
-
-
-def test_a_repeated_transaction_gets_the_same_answer_and_starts_nothing() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        await daemon.take(b'{"transaction": 1}')
-        await daemon.take(b'{"transaction": 1}')
-        assert len(daemon.asked) == 1
-        assert daemon.responses[1][1] == {**daemon.responses[0][1], "repeated": True}
-        await daemon.take(b'{"transaction": 1, "what": "gyros"}')
-        assert daemon.responses[2][1]["refusal"] == "request"
-        daemon.end.set()
-        await daemon.take(b"{}", "cancel")
-        await daemon.take(b'{"transaction": 1}')
-        assert daemon.states()[-1] == "done"
-        assert [request["command"] for request in daemon.asked] == ["calibrate", "cancel"]
-        await asyncio.sleep(REMEMBER_S)
-        await daemon.take(b'{"transaction": 1}')
-        assert len(daemon.asked) == 3
-
-    run_virtual(main())
-
-
-def test_what_was_refused_may_be_asked_again_under_its_transaction() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        daemon.refusal = ("armed", "armed: disarm first")
-        await daemon.take(b'{"transaction": "x"}')
-        daemon.refusal = None
-        await daemon.take(b'{"transaction": "x"}')
-        assert daemon.responses[0] == (
+async def test_a_calibration_is_answered_twice_with_its_transaction() -> None:
+    daemon = Daemon()
+    await daemon.take(b'{"transaction": "a b", "what": "gyros", "timeout_s": 60, "reboot": true}')
+    assert daemon.asked == [{"command": "calibrate", "what": "gyros", "timeout_s": 60, "reboot": True, "wait": True}]
+    daemon.end.set()
+    await asyncio.sleep(1.0)
+    assert daemon.responses == [
+        ("calibrate", {"transaction": "a b", "state": "accepted", "reason": "calibration started"}),
+        (
             "calibrate",
-            {"transaction": "x", "state": "refused", "refusal": "armed", "reason": "armed: disarm first"},
-        )
-        assert daemon.states() == ["refused", "accepted"]
-        await daemon.requests.close(0.0)
-
-    run_virtual(main())
-
-
-def test_a_flood_is_refused_as_busy_and_leaves_nothing_behind() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        for number in range(5000):
-            daemon.requests.accept("cancel", b'{"transaction": %d}' % number, retained=False)
-        assert len(asyncio.all_tasks()) == MAX_PENDING + 1
-        assert daemon.states() == ["refused"] * (5000 - MAX_PENDING)
-        assert {response["refusal"] for _, response in daemon.responses} == {"busy"}
-        daemon.end.set()
-        await asyncio.sleep(1.0)
-        for number in range(5000):
-            await daemon.take(b'{"transaction": %d}' % number, "cancel")
-        assert len(daemon.requests._known) <= REMEMBERED
-        assert len(asyncio.all_tasks()) == 1
-
-    run_virtual(main())
+            {
+                "transaction": "a b",
+                "state": "done",
+                "reason": "sigma 3 deg/h",
+                "record": {"state": "done", "reason": "sigma 3 deg/h"},
+            },
+        ),
+    ]
 
 
-def test_a_fault_of_the_program_is_answered_too() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        daemon.fault = ZeroDivisionError()
-        await daemon.take(b"")
-        assert daemon.responses[0][1]["state"] == "failed"
-        assert "internal error" in daemon.responses[0][1]["reason"]
+async def test_a_repeated_transaction_gets_the_same_answer_and_starts_nothing() -> None:
+    daemon = Daemon()
+    await daemon.take(b'{"transaction": 1}')
+    await daemon.take(b'{"transaction": 1}')
+    assert len(daemon.asked) == 1
+    assert daemon.responses[1][1] == {**daemon.responses[0][1], "repeated": True}
+    await daemon.take(b'{"transaction": 1, "what": "gyros"}')
+    assert daemon.responses[2][1]["refusal"] == "request"
+    daemon.end.set()
+    await daemon.take(b"{}", "cancel")
+    await daemon.take(b'{"transaction": 1}')
+    assert daemon.states()[-1] == "done"
+    assert [request["command"] for request in daemon.asked] == ["calibrate", "cancel"]
+    await asyncio.sleep(REMEMBER_S)
+    await daemon.take(b'{"transaction": 1}')
+    assert len(daemon.asked) == 3
 
-    run_virtual(main())
+
+async def test_what_was_refused_may_be_asked_again_under_its_transaction() -> None:
+    daemon = Daemon()
+    daemon.refusal = ("armed", "armed: disarm first")
+    await daemon.take(b'{"transaction": "x"}')
+    daemon.refusal = None
+    await daemon.take(b'{"transaction": "x"}')
+    assert daemon.responses[0] == (
+        "calibrate",
+        {"transaction": "x", "state": "refused", "refusal": "armed", "reason": "armed: disarm first"},
+    )
+    assert daemon.states() == ["refused", "accepted"]
+    await daemon.requests.close(0.0)
 
 
-def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request(caplog: pytest.LogCaptureFixture) -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        for _ in range(3):  # three connections
-            await daemon.take(b'{"transaction": "old"}', retained=True)
-        assert [record.getMessage().partition(" is ignored")[0] for record in caplog.records] == [
-            "mqtt: the retained request at companion/1/request/calibrate"
-        ]
-        assert daemon.states() == ["refused"] * 3
-        await daemon.take(b"")  # on MQTT 3.1.1 its deletion looks like this
-        assert daemon.asked == []
-        await daemon.take(b"")
-        assert len(daemon.asked) == 1
+async def test_a_flood_is_refused_as_busy_and_leaves_nothing_behind() -> None:
+    daemon = Daemon()
+    for number in range(5000):
+        daemon.requests.accept("cancel", b'{"transaction": %d}' % number, retained=False)
+    assert len(asyncio.all_tasks()) == MAX_PENDING + 1
+    assert daemon.states() == ["refused"] * (5000 - MAX_PENDING)
+    assert {response["refusal"] for _, response in daemon.responses} == {"busy"}
+    daemon.end.set()
+    await asyncio.sleep(1.0)
+    for number in range(5000):
+        await daemon.take(b'{"transaction": %d}' % number, "cancel")
+    assert len(daemon.requests._known) <= REMEMBERED
+    assert len(asyncio.all_tasks()) == 1
+
+
+async def test_a_fault_of_the_program_is_answered_too() -> None:
+    daemon = Daemon()
+    daemon.fault = ZeroDivisionError()
+    await daemon.take(b"")
+    assert daemon.responses[0][1]["state"] == "failed"
+    assert "internal error" in daemon.responses[0][1]["reason"]
+
+
+async def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    daemon = Daemon()
+    for _ in range(3):  # three connections
         await daemon.take(b'{"transaction": "old"}', retained=True)
-        await daemon.take(b"", retained=True)  # on MQTT 5 like this
-        await daemon.take(b"", "cancel")
-        assert [request["command"] for request in daemon.asked] == ["calibrate", "cancel"]
-        daemon.end.set()
-        await daemon.requests.close(1.0)
-
-    run_virtual(main())
+    assert [record.getMessage().partition(" is ignored")[0] for record in caplog.records] == [
+        "mqtt: the retained request at companion/1/request/calibrate"
+    ]
+    assert daemon.states() == ["refused"] * 3
+    await daemon.take(b"")  # on MQTT 3.1.1 its deletion looks like this
+    assert daemon.asked == []
+    await daemon.take(b"")
+    assert len(daemon.asked) == 1
+    await daemon.take(b'{"transaction": "old"}', retained=True)
+    await daemon.take(b"", retained=True)  # on MQTT 5 like this
+    await daemon.take(b"", "cancel")
+    assert [request["command"] for request in daemon.asked] == ["calibrate", "cancel"]
+    daemon.end.set()
+    await daemon.requests.close(1.0)
 
 
 @pytest.mark.parametrize(

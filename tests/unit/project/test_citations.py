@@ -38,7 +38,6 @@ def sections(document: str) -> set[str]:
 
 
 def place(name: str, text: str, start: int) -> str:
-    """File and line of a character."""
     return f"{name}:{text[:start].count(chr(10)) + 1}"
 
 

@@ -63,7 +63,6 @@ def clean(words: str) -> str:
 
 @pytest.fixture(scope="module")
 def replies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Object]:
-    """Answers of a daemon by command."""
     found: dict[str, Object] = {}
 
     async def asked() -> None:

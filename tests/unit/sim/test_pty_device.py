@@ -58,84 +58,69 @@ TIOCGEXCL = 0x80045440
 """<asm-generic/ioctls.h>; the termios module has only the two that set and clear it."""
 
 
-def test_a_reader_that_was_killed_leaves_no_lock(tmp_path: Path) -> None:
+async def test_a_reader_that_was_killed_leaves_no_lock(tmp_path: Path) -> None:
     """The kernel keeps it, and root alone may open what is locked."""
-
-    async def main() -> None:
-        async with PtyDevice(HMR3300(VirtualAircraft(Pose())), path := tmp_path / "compass"):
-            killed = Port(path)
-            fcntl.ioctl(killed.descriptor, termios.TIOCEXCL)
-            await killed.wait_for(1)
-            killed.close()
-            async with asyncio.timeout(30.0):
-                while True:
-                    with contextlib.suppress(OSError):
-                        port = Port(path)
-                        if not any(fcntl.ioctl(port.descriptor, TIOCGEXCL, bytes(4))):
-                            break
-                        port.close()
-                    await asyncio.sleep(0.01)
-            await port.wait_for(1)
-            port.close()
-
-    asyncio.run(main())
+    async with PtyDevice(HMR3300(VirtualAircraft(Pose())), path := tmp_path / "compass"):
+        killed = Port(path)
+        fcntl.ioctl(killed.descriptor, termios.TIOCEXCL)
+        await killed.wait_for(1)
+        killed.close()
+        async with asyncio.timeout(30.0):
+            while True:
+                with contextlib.suppress(OSError):
+                    port = Port(path)
+                    if not any(fcntl.ioctl(port.descriptor, TIOCGEXCL, bytes(4))):
+                        break
+                    port.close()
+                await asyncio.sleep(0.01)
+        await port.wait_for(1)
+        port.close()
 
 
-def test_the_path_is_raw_and_says_its_banner_to_the_first_reader(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with PtyDevice(
-            HMR3300(VirtualAircraft(Pose(0.0, 0.0, 123.4)), heading_noise_deg=0.0), tmp_path / "c"
-        ) as pty:
-            opened = [pty.opened]
-            port = Port(tmp_path / "c")
-            opened.append(pty.opened)
-            local = termios.tcgetattr(port.descriptor)[3]
-            assert not local & (termios.ICANON | termios.ECHO)
-            data = await port.wait_for(30)
-            port.close()
-        assert opened == [False, True]
-        assert data.split(b"\r\n")[0].startswith(b"HMR3300")
-        assert data.split(b"\r\n")[1] == b"123.4, 0.0, 0.0"
-        assert not (tmp_path / "c").is_symlink()
-
-    asyncio.run(main())
+async def test_the_path_is_raw_and_says_its_banner_to_the_first_reader(tmp_path: Path) -> None:
+    async with PtyDevice(HMR3300(VirtualAircraft(Pose(0.0, 0.0, 123.4)), heading_noise_deg=0.0), tmp_path / "c") as pty:
+        opened = [pty.opened]
+        port = Port(tmp_path / "c")
+        opened.append(pty.opened)
+        local = termios.tcgetattr(port.descriptor)[3]
+        assert not local & (termios.ICANON | termios.ECHO)
+        data = await port.wait_for(30)
+        port.close()
+    assert opened == [False, True]
+    assert data.split(b"\r\n")[0].startswith(b"HMR3300")
+    assert data.split(b"\r\n")[1] == b"123.4, 0.0, 0.0"
+    assert not (tmp_path / "c").is_symlink()
 
 
-def test_unplugging_hangs_up_and_replugging_brings_the_path_back(tmp_path: Path) -> None:
-    async def main() -> None:
-        path = tmp_path / "gradienter"
-        async with PtyDevice(Gradienter(VirtualAircraft(), noise_deg=0.0), path) as pty:
-            port = Port(path)
-            await port.wait_for(44)
-            pty.unplug()
-            assert not path.exists()
-            assert hung_up(port.descriptor)
-            port.close()
-            await asyncio.sleep(0.05)
-            pty.replug()
-            port = Port(path)
-            assert (await port.wait_for(22))[:22] == b"X=+00.000\r\nY=+00.000\r\n"
-            port.close()
-
-    asyncio.run(main())
+async def test_unplugging_hangs_up_and_replugging_brings_the_path_back(tmp_path: Path) -> None:
+    path = tmp_path / "gradienter"
+    async with PtyDevice(Gradienter(VirtualAircraft(), noise_deg=0.0), path) as pty:
+        port = Port(path)
+        await port.wait_for(44)
+        pty.unplug()
+        assert not path.exists()
+        assert hung_up(port.descriptor)
+        port.close()
+        await asyncio.sleep(0.05)
+        pty.replug()
+        port = Port(path)
+        assert (await port.wait_for(22))[:22] == b"X=+00.000\r\nY=+00.000\r\n"
+        port.close()
 
 
-def test_commands_reach_the_device_and_a_muted_one_is_silent(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with PtyDevice(Gradienter(VirtualAircraft(), noise_deg=0.0), tmp_path / "g") as pty:
-            port = Port(tmp_path / "g")
-            await port.wait_for(22)
-            os.write(port.descriptor, b"sV")
-            async with asyncio.timeout(30.0):
-                while b"DPL2" not in port.read():
-                    await asyncio.sleep(0.01)
-            os.write(port.descriptor, b"S")
-            await port.wait_for(len(port.data) + 22)
-            pty.muted = True
-            await asyncio.sleep(0.05)
-            before = len(port.read())
-            await asyncio.sleep(0.25)
-            assert len(port.read()) == before
-            port.close()
-
-    asyncio.run(main())
+async def test_commands_reach_the_device_and_a_muted_one_is_silent(tmp_path: Path) -> None:
+    async with PtyDevice(Gradienter(VirtualAircraft(), noise_deg=0.0), tmp_path / "g") as pty:
+        port = Port(tmp_path / "g")
+        await port.wait_for(22)
+        os.write(port.descriptor, b"sV")
+        async with asyncio.timeout(30.0):
+            while b"DPL2" not in port.read():
+                await asyncio.sleep(0.01)
+        os.write(port.descriptor, b"S")
+        await port.wait_for(len(port.data) + 22)
+        pty.muted = True
+        await asyncio.sleep(0.05)
+        before = len(port.read())
+        await asyncio.sleep(0.25)
+        assert len(port.read()) == before
+        port.close()

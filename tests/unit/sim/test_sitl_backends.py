@@ -44,13 +44,10 @@ def test_a_servo_packet_has_magic_rate_count_and_channels(channels: int, magic: 
     assert decode_servos(data) == ServoPacket(400, 7, tuple(range(channels)))
 
 
-def test_a_json_frame_is_the_truth_of_the_tilted_aircraft_between_newlines() -> None:
-    async def main() -> bytes:
-        aircraft, imu = tilted()
-        async with JsonBackend(aircraft, imu) as backend:
-            return backend.answer(packet(0, rate=400), PEER)
-
-    data = asyncio.run(main())
+async def test_a_json_frame_is_the_truth_of_the_tilted_aircraft_between_newlines() -> None:
+    aircraft, imu = tilted()
+    async with JsonBackend(aircraft, imu) as backend:
+        data = backend.answer(packet(0, rate=400), PEER)
     assert data[:1] == data[-1:] == b"\n"
     frame = json.loads(data)
     assert frame["timestamp"] == 1 / 400
@@ -113,21 +110,16 @@ class FakePx4:
         self.writer.close()
 
 
-def test_px4_gets_both_imus_magnetometer_barometer_and_gnss_at_their_rates() -> None:
+async def test_px4_gets_both_imus_magnetometer_barometer_and_gnss_at_their_rates() -> None:
     aircraft, imu = tilted()
     other = ImuModel(aircraft, "perfect", gyro_bias_rad_s=[0, 0, -50 * DEG_H])
-
-    async def main() -> FakePx4:
-        px4 = FakePx4()
-        async with HilBackend(aircraft, [imu, other]) as backend:
-            await px4.connect(backend.port)
-            await px4.run(FRAME_HZ)
-            assert backend.armed
-            assert backend.locked
-            px4.close()
-        return px4
-
-    px4 = asyncio.run(main())
+    px4 = FakePx4()
+    async with HilBackend(aircraft, [imu, other]) as backend:
+        await px4.connect(backend.port)
+        await px4.run(FRAME_HZ)
+        assert backend.armed
+        assert backend.locked
+        px4.close()
     first, second = px4.sensors(0), px4.sensors(1)
     assert [m.time_usec for m in first] == [4000 * n for n in range(1, FRAME_HZ + 1)]
     assert abs(len(second) - len(first)) <= 1
@@ -150,25 +142,22 @@ def test_px4_gets_both_imus_magnetometer_barometer_and_gnss_at_their_rates() -> 
     assert fixes[0].time_usec // 10**12 == 1795
 
 
-def test_px4_frames_keep_to_the_wall_clock_and_wait_for_the_answer() -> None:
-    async def main() -> None:
-        aircraft, imu = tilted()
-        loop = asyncio.get_running_loop()
-        async with HilBackend(aircraft, [imu]) as backend:
-            px4 = FakePx4()
-            await px4.connect(backend.port)
-            begun_s = loop.time()
-            await px4.run(100)
-            assert loop.time() - begun_s > 0.39
-            px4.silent = True
-            before = backend.frames
-            await asyncio.sleep(0.15)
-            assert backend.frames <= before + 1  # it waits...
-            await asyncio.sleep(0.3)
-            assert backend.unanswered >= 1  # ...but not for ever
-            px4.close()
-
-    asyncio.run(main())
+async def test_px4_frames_keep_to_the_wall_clock_and_wait_for_the_answer() -> None:
+    aircraft, imu = tilted()
+    loop = asyncio.get_running_loop()
+    async with HilBackend(aircraft, [imu]) as backend:
+        px4 = FakePx4()
+        await px4.connect(backend.port)
+        begun_s = loop.time()
+        await px4.run(100)
+        assert loop.time() - begun_s > 0.39
+        px4.silent = True
+        before = backend.frames
+        await asyncio.sleep(0.15)
+        assert backend.frames <= before + 1  # it waits...
+        await asyncio.sleep(0.3)
+        assert backend.unanswered >= 1  # ...but not for ever
+        px4.close()
 
 
 @pytest.mark.parametrize("part", ["white_only", "icm42688p"])
