@@ -149,7 +149,7 @@ class PrearmWatch:
         return means
 
     def _row(self, message: Any) -> Array:
-        field = np.multiply((message.xmag, message.ymag, message.zmag), self._vehicle.kind.corrected_field is None)
+        field = np.multiply((message.xmag, message.ymag, message.zmag), not self._vehicle.kind.raw_fields)
         gyro, accel = (message.xgyro, message.ygyro, message.zgyro), (message.xacc, message.yacc, message.zacc)
         return np.concatenate([np.multiply(gyro, MRAD), np.multiply(accel, MG), field, [message.temperature * 0.01]])
 
