@@ -33,6 +33,7 @@ _PREFIX: Final = re.compile(r"(PreArm|Arm|Preflight Fail): *")
 _REPEATED_S: Final = 40.0  # Age at which a text is void without SYS_STATUS: ArduPilot repeats its list every 30 s
 _LIST_S: Final = 3.0  # Longest time between texts of one list, which replaces the list before
 _CHUNK: Final = 50  # Length of all chunks of a text but the last
+_LONGEST: Final = 400  # Length at which a text is cut
 _MOST: Final = 32  # Reasons stored, as any device on the link can send texts
 _CHECKS: Final[int] = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 _BITS: Final = {1: "gyro", 2: "accelerometer", 4: "compass", 32: "GNSS", 16384: "position"}  # Of MAV_SYS_STATUS_SENSOR
@@ -119,7 +120,8 @@ class PrearmWatch:
             self._reasons = {}
 
     def _on_text(self, message: mavlink.MAVLink_statustext_message, t_s: float) -> None:
-        text = (self._chunks[1] if message.chunk_seq and self._chunks[0] == message.id else "") + message.text
+        begun = self._chunks[1] if message.chunk_seq and self._chunks[0] == message.id else ""
+        text = (begun + message.text)[:_LONGEST]
         self._chunks = message.id, text
         whole = not message.id or len(message.text) < _CHUNK
         if whole and _PREFIX.match(text) and message.severity <= mavlink.MAV_SEVERITY_WARNING:
