@@ -137,7 +137,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             await read_the_record(here, record)
 
             remedy = "document.querySelector('#remedy').textContent"
-            assert await tab.value(remedy) == "Keep the aircraft still, or hold CALIBRATE."
+            assert await tab.value(remedy) == "Hold CALIBRATE, and keep still."
             # A short tap is no order, and says why.
             await tab.touch("#calibrate")
             await tab.lift()

@@ -185,6 +185,7 @@ class Arming(Subsystem):
                     "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
                     "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
                     "held_back": list(imu.held_back),
+                    "unchanged": list(imu.unchanged),
                 }
                 for imu in record.imus
             ],

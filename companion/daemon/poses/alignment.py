@@ -219,7 +219,7 @@ class ByHand:
             what="level" if board else record.kind,
             state=result.outcome,
             measured_at=record.measured_at,
-            reason=result.reason,
+            reason=result.reason.partition("; now: ")[0],
             system_id=self._vehicle.system_id,
             written={name: one.after for name, one in kept},
             heading_sigma_deg={f"compass {one.number}": one.heading_sigma_deg for one in record.compasses}

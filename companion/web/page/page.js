@@ -108,7 +108,7 @@ function quality(status) {
   $("quality").textContent = `goal ${rows.join(", ")} not met${warming ? ": still warming" : ""}`;
   $("head").classList.toggle("coarse", shown);
 }
-function axes(names, digits, biases, sigmas, unit, title, held, before) {
+function axes(names, digits, biases, sigmas, unit, title, held, unchanged, before) {
   if (!biases) return [];
   const full = Math.max(...biases.map((bias, k) => Math.abs(bias) + sigmas[k])) * 1.08 || 1;
   const rows = names.map((name, k) => {
@@ -126,7 +126,9 @@ function axes(names, digits, biases, sigmas, unit, title, held, before) {
   const words = held ? [make("p", "held back: measured, not written; what was in force before still is", "note")] : [];
   if (before) {
     const most = Math.max(...biases.map((bias, k) => Math.abs(bias - before.bias[k])));
-    words.push(make("p", `changed by ${most.toFixed(digits)} ${unit.split(" ")[0]} at most since ${utc(before.at)}`, "note"));
+    const change = `${most.toFixed(digits)} ${unit.split(" ")[0]}`;
+    words.push(make("p", unchanged ? `measured ${change} off ${utc(before.at)}: too little to write`
+      : `changed by ${change} at most since ${utc(before.at)}`, "note"));
   }
   return [make("h3", `${title}, ${unit}${held ? ", held back" : ""}`), ...words, ...rows];
 }
@@ -166,9 +168,9 @@ function calibration(found, arming) {
     if (imu.temperature_now_degc !== null) warm.push(`now ${imu.temperature_now_degc.toFixed(1)} °C`);
     return [make("h3", `${imu.name}${warm.length ? ": " + warm.join(", ") : ""}`), ...imu.when_warm.map(words => make("p", words, "note")),
       ...axes(["x", "y", "z"], 1, imu.gyro_bias_deg_h, imu.gyro_sigma_deg_h, "°/h ± sigma", "gyro bias", imu.held_back.includes("gyro"),
-        earlier(found, imu.name, "gyro")),
+        imu.unchanged.includes("gyro"), earlier(found, imu.name, "gyro")),
       ...axes(["x", "y", "z"], 2, imu.accel_bias_mg, imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"),
-        earlier(found, imu.name, "accel"))];
+        imu.unchanged.includes("accel"), earlier(found, imu.name, "accel"))];
   }));
 }
 let shownByHand = null;

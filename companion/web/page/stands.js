@@ -103,7 +103,7 @@ function stands(found, status) {
 // How an alignment ended, and what has become of it since; `key` tells it from others that were dismissed.
 function end(found, status) {
   if (found === null) return null;
-  const one = status.by_hand.find(({what, reason}) => what === found.what && reason === found.words);
+  const one = status.by_hand.find(({what, reason}) => what === found.what && found.words.startsWith(reason));
   const outcome = one && one.undone_at ? "undone" : found.outcome;
   const title = END[outcome] + (outcome === "done" && ["faces", "tilts"].includes(found.what) ? ": put it down" : "");
   const words = outcome === "undone" ? "the old values are restored" : inPageWords(found.words);
