@@ -206,3 +206,27 @@ def test_px4s_missing_gnss_is_named_and_its_return_lets_the_aircraft_arm(tmp_pat
             await arms(ground)
 
     asyncio.run(main())
+
+
+RISE_K, TCONST_S, LASTS_K, BOOT_S = 20.0, 100.0, 3.0, 5.0
+
+
+async def test_the_countdown_of_a_cold_start_holds_the_truth(tmp_path: Path) -> None:
+    """By the simulator's law of temperature; a calibration lasts from 3 K below the end."""
+    async with bench(tmp_path) as b:
+        ramp = {"SIM_IMUT_START": 5.0, "SIM_IMUT_END": 5.0 + RISE_K, "SIM_IMUT_TCONST": TCONST_S}
+        await b.ground.put_all({**ramp, "SIM_IMUT_FIXED": 0.0})
+        await b.vehicle.sleep(3.0)  # until it is stored
+        await b.vehicle.power_cycle()
+        lasts_s = asyncio.get_running_loop().time() + TCONST_S * math.log(RISE_K / LASTS_K)
+        holds: list[bool] = []
+        async with b.daemon(MANUAL) as daemon:
+            while (left_s := lasts_s - asyncio.get_running_loop().time()) > 0.0:
+                if (shown := (await daemon.ask("status"))["arming"]["warm_up"]) is not None:
+                    holds.append(shown["low_s"] - BOOT_S <= left_s <= shown["high_s"] + BOOT_S)
+                    print(f"{left_s:.0f} s left; {shown}", flush=True)
+                await asyncio.sleep(5.0)
+            await asyncio.sleep(TCONST_S)
+            assert (await daemon.ask("status"))["arming"]["warm_up"] is None
+        assert len(holds) > 10
+        assert np.mean(holds) >= 0.9
