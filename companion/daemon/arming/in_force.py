@@ -298,7 +298,7 @@ class ActiveCalibration:
 
     def _leave_out(self, key: Key, state: _TriadState) -> None:
         state.present = None
-        if state.held is Why.NEVER and state.judged and len(self._judged) > 1:
+        if state.held in (Why.NEVER, Why.UNDONE) and state.judged and len(self._judged) > 1:
             logger.warning("%s %s is not judged: the last calibration could not measure it", key[1], key[0])
             state.judged = False
 

@@ -1,0 +1,36 @@
+"""After an undo, sensors that the telemetry cannot show do not count as undone for ever."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.config import parse
+from companion.daemon.process.service import Service
+from companion.estimation.records.validity import Why
+from tests.support.mqtt_daemon import ALONE
+
+pytestmark = pytest.mark.real_clock
+
+SECOND = '[[imu]]\nname = "second"\nsource = "autopilot"\ninstance = 2\n'
+
+
+async def test_a_triad_that_no_window_can_measure_is_left_out_after_an_undo(tmp_path: Path) -> None:
+    config = parse(ALONE.format(folder=tmp_path, more=SECOND), "test.toml")
+    in_force = Service(config).arming.readiness.in_force
+    first, *others = in_force._triads
+    assert others
+    for state in in_force._triads.values():
+        state.held = Why.UNDONE
+    imu = SimpleNamespace(
+        name=first[0], temperature_degc=None, use_covariance=np.eye(6), covariance=np.eye(6), biases=(None, None)
+    )
+    solution: Any = SimpleNamespace(imus=(imu,), unknown={first})
+    in_force._note(solution, 20.0, 10.0)
+    assert not in_force._triads[first].judged
+    assert [in_force._triads[key].held for key in others] == [Why.UNDONE] * len(others)
+    assert in_force.findings(20.0)
