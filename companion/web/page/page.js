@@ -197,7 +197,7 @@ function link(good, name, words, remedy) {
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
-const FIXES = {gyros: "calibrates the gyros", accelerometers: "calibrates the accelerometers", 
+const FIXES = {gyros: "calibrates the gyros", accelerometers: "calibrates the accelerometers",
   "autopilot gyro calibration": "the autopilot calibrates its gyros"};
 // Reasons of the autopilot against arming; the headline shows the first one.
 function diagnosis(found, shown, held) {
