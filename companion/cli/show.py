@@ -136,7 +136,7 @@ def explained_lines(found: Sequence[tuple[str, messages.Entry]]) -> list[str]:
 
 def undo_line(steps: Sequence[Object]) -> str:
     if not steps:
-        return "undo: nothing to undo"
+        return "undo: no write left to revert"
     step, more = steps[0], len(steps) - 1
     when = f" of {_minute(step['at'])} UTC" if step["at"] else ""
     several = f" and all since {_minute(step['since'])}" if step["since"] != step["at"] else ""
@@ -159,8 +159,6 @@ def _reading_lines(status: Object) -> list[str]:
     if alignment is not None and alignment["in_force"]:
         (x, y), measured = alignment["offset_deg"], f"measured {alignment['measured_at'][:10]}"
         lines.append(f"gradienter zero: x {x:+.3f} y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, {measured}")
-    elif alignment is not None:
-        lines.append(f"alignment not used: {alignment['unused_because']}")
     return lines
 
 
@@ -169,7 +167,8 @@ def end_lines(status: Object) -> list[str]:
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
     found = "none yet"
     if last is not None:
-        found = f"{last['state']} at {_minute(last['started_at'])} UTC: {last['reason']}"
+        undone = ", undone" if last["undone_at"] else ""
+        found = f"{last['state']} at {_minute(last['started_at'])} UTC{undone}: {last['reason']}"
     return [*lines, f"last calibration: {found}"]
 
 

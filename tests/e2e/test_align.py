@@ -104,6 +104,7 @@ async def test_a_zero_from_a_slope_does_not_replace_a_better_one(tmp_path: Path)
     async with made.running():
         await made.ready()
         result = await aligned(made, hands)
+        assert result.outcome == "done"
         assert "the active zero agrees and has 0.010: kept" in result.reason
         assert made.service.calibrating.alignment.record is None
         assert any("better on flatter ground" in words for words in made.ground.texts())
@@ -127,7 +128,7 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
 
     async def again(changes: dict[str, Any], words: str | None, *, forget: bool = False) -> tuple[float, Record | None]:
         fresh, _ = rig(tmp_path, placement_deg=0.0)
-        fresh.config = replaced(fresh.config, gradienter=changes)
+        fresh.config = replaced(fresh.config, gradienter=changes, calibration={"at_arm": "warn" if words else "off"})
         async with fresh.running():
             await fresh.ready()
             status = fresh.service.status()["alignment"]
@@ -136,9 +137,12 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
             else:
                 assert status["in_force"] is False
                 assert words in status["unused_because"]
+            stays_off = fresh.service.arming.automatic.why_not()
             result, record = await calibrated(fresh)
             assert result.outcome == "done", result
             assert (record.alignment is None) == (words is not None)
+            for shown in (stays_off or "", fresh.service.status()["headline"]["reason"], " ".join(record.warnings)):
+                assert ("alignment not used" in shown) == (words is not None)
             if forget:
                 replies = [r async for r in fresh.service.faces.answer({"command": "align", "action": "forget"})]
                 assert replies[-1]["state"] == "done"

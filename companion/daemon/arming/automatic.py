@@ -25,6 +25,7 @@ from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import NO_CALIBRATION, Job
+from companion.daemon.poses.alignment import ActiveAlignment
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.records.validity import Why
 from companion.storage.state import BoundedList
@@ -47,8 +48,11 @@ TIMEOUT_S: Final = 180.0
 class Automatic:
     """Starts automatic calibrations; `run` decides when."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], in_force: ActiveCalibration) -> None:
+    def __init__(
+        self, core: Core, imus: Mapping[str, AutopilotImu], in_force: ActiveCalibration, alignment: ActiveAlignment
+    ) -> None:
         self._core, self._manager, self._imus, self._in_force = core, in_force.manager, imus, in_force
+        self._alignment = alignment
         self._file = BoundedList(core.config.storage.path / "automatic.json", dict[str, float], PER_DAY + 8)
         self._writes: list[dict[str, float]] = []
         self._unsaved = False
@@ -67,6 +71,8 @@ class Automatic:
         """Return the waiting time or the remedy, as text, if no automatic calibration can start now; otherwise None."""
         if not self.wanted or self.stopped is not None:
             return "calibrate"
+        if self._alignment.contradicted:  # with a wrong mounting, new accelerometer offsets would be wrong
+            return self._alignment.warning
         if self._writes_today() >= PER_DAY:
             return f"calibrate ({PER_DAY} writes today)"
         now_s = asyncio.get_running_loop().time()

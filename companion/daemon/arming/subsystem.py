@@ -124,7 +124,7 @@ class Arming(Subsystem):
         self.manager = calibrating.manager
         self._recovery = offsets.recovery
         self.in_force = ActiveCalibration(core, devices.imus, calibrating)
-        self.automatic = Automatic(core, devices.imus, self.in_force)
+        self.automatic = Automatic(core, devices.imus, self.in_force, calibrating.alignment)
         # The order matters: `Automatic` reads the state of `ActiveCalibration`.
         calibrating.manager.on_ended.add(self.in_force.on_ended)
         calibrating.manager.on_ended.add(self.automatic.on_ended)

@@ -182,6 +182,7 @@ class CalibrationRun(Job):
         estimator = self._parts.estimator
         solution, where, otherwise = await estimator.solve(self.measured, self.what)
         self.alignment, self.solution = estimator.alignment.used, solution
+        self.log.warnings += filter(None, [estimator.alignment.warning])
         for name, words in memory.forgotten().items():
             self.log.warn(name, words)
         expectation: Expectation = await core.offload(memory.expectation, solution, unix_s)

@@ -107,12 +107,13 @@ class Calibrating(Subsystem):
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
             "compasses": self.compasses.rows,
-            "warnings": self.compasses.warnings,
+            "warnings": [*filter(None, [self.alignment.warning]), *self.compasses.warnings],
             "stands": None if stands is None or stands.job is not manager.asked else stands.shown(),
             "last": None
             if last is None
             else {
                 "state": last.state,
+                "undone_at": last.undone_at,
                 "started_at": last.started_at,
                 "reason": last.reason,
                 "magnetic": msgspec.to_builtins(last.magnetic),

@@ -10,6 +10,7 @@ from companion.component.service import ArmAnswer
 from companion.daemon.arming.readiness import NEEDED
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.manager import Precondition
+from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.subsystem import Heading
@@ -30,11 +31,14 @@ Headline = tuple[str, str, Tone]  # One to three words, the reason in one line, 
 class Headlines:
     """Composes the headline that all interfaces show."""
 
-    def __init__(self, core: Core, devices: Devices, arming: Arming, heading: Heading, diagnosis: Diagnosis) -> None:
+    def __init__(
+        self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming, heading: Heading,
+        diagnosis: Diagnosis,
+    ) -> None:  # fmt: skip
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
         self._devices, self._heading, self._warm_up = devices, heading, arming.warm_up
-        self._diagnosis = diagnosis
+        self._alignment, self._diagnosis = calibrating.alignment, diagnosis
 
     def now(self) -> Object:
         word, reason, tone = self._now()
@@ -46,7 +50,8 @@ class Headlines:
             remedy = first["remedy"]
         good = tone == "good"
         devices = self._devices
-        concern = devices.watch.implausible() or devices.signing.warning or self._heading.concern
+        contradicted = self._alignment.warning if self._alignment.contradicted else None
+        concern = devices.watch.implausible() or contradicted or devices.signing.warning or self._heading.concern
         if concern is not None and (good or word == ARMED):
             reason, tone = f"{concern}; {reason}", "wait" if good else tone
         if remedy is None:

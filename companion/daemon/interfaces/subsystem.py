@@ -82,7 +82,7 @@ class Interfaces(Subsystem):
         )
         calibrating.manager.on_ended.add(self._show_result)
         self.diagnosis = Diagnosis(core, devices, offsets, calibrating, heading.pose)
-        self._headlines = Headlines(core, devices, arming, heading, self.diagnosis)
+        self._headlines = Headlines(core, devices, calibrating, arming, heading, self.diagnosis)
         self._pose, self._readiness = heading.pose, arming.readiness
         self._manager = calibrating.manager
         self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)

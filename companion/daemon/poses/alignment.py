@@ -35,6 +35,7 @@ from companion.estimation.records.record import AlignmentUsed
 from companion.estimation.solution.truth import aged_m_s2
 from companion.formats import Object, utc_now
 from companion.links.system.events import Listeners
+from companion.messages import message
 from companion.physics.units import MG
 from companion.storage.changes import PREDICTION, ChangeSet
 from companion.storage.records import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot
@@ -57,7 +58,7 @@ class ActiveAlignment:
         if self._store.unusable is not None:
             self.unused = self._store.unusable
         elif self.unused is not None:
-            logger.warning("alignment not used: %s", self.unused)
+            logger.warning("%s", self.warning)
 
     async def keep(self, record: AlignmentRecord) -> None:
         """Save a new alignment and make it the active one; a StorageError leaves the previous one active."""
@@ -87,6 +88,15 @@ class ActiveAlignment:
     def model(self) -> GradienterModel | None:
         return models.aligned(models.gradienter_model(self._gradienter), self.used)
 
+    @property
+    def warning(self) -> str | None:
+        return None if self.unused is None else message("alignment_not_used", reason=self.unused)
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the gradienter or its mounting is configured otherwise than when the saved zero was measured."""
+        return self.record is not None and self.unused is not None and self._gradienter is not None
+
     def status(self) -> dict[str, object] | None:
         if self.record is None and self.unused is None:
             return None
@@ -104,7 +114,7 @@ class ActiveAlignment:
         different = [key for key in now.__struct_fields__ if getattr(record.gradienter, key) != getattr(now, key)]
         if different:
             names = ", ".join(f"gradienter.{key}" for key in different)
-            self.unused = f"measured with another {names}: companion align zero, or companion align forget"
+            self.unused = f"measured with another {names}: correct it, or align zero"
 
 
 class ActiveSixPosition:

@@ -119,6 +119,7 @@ class ZeroTask(SamePlaceTask):
     def __init__(self, core: Core, request: AlignmentRequest, kept: ActiveAlignment) -> None:
         super().__init__(core, request)
         self.fit_from = LEAST_POSES
+        self._kept_instead = ""  # Text if the new zero is less exact than the active one, which it confirms
         self._kept, self._compass = kept, models.compass_model(core.config.compass)
         gradienter = models.gradienter_model(core.config.gradienter)
         assert gradienter is not None
@@ -192,11 +193,15 @@ class ZeroTask(SamePlaceTask):
         zero_deg, sigma_deg = (used.offset_deg, used.sigma_deg) if used else ((0.0, 0.0), self._gradienter.sigma_deg)
         apart_deg = max(abs(new - old) for new, old in zip(record.offset_deg, zero_deg, strict=True))
         if record.kind == "zero" and sigma_deg < record.sigma_deg and apart_deg < 2.0 * record.sigma_deg:
-            words = f"sigma {record.sigma_deg:.3f} deg; the active zero agrees and has {sigma_deg:.3f}: kept"
-            raise CalibrationRefusedError(words)
-        await self._kept.keep(record)
+            self._kept_instead = (
+                f"sigma {record.sigma_deg:.3f} deg; the active zero agrees and has {sigma_deg:.3f}: kept"
+            )
+        else:
+            await self._kept.keep(record)
 
     def summary(self) -> str:
+        if self._kept_instead:
+            return self._kept_instead
         (x_deg, y_deg), sigma_deg = self.result.offset_deg, self.result.offset_sigma_deg.max()
         return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {sigma_deg:.3f}; now: companion calibrate"
 
