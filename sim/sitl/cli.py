@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from sim.aircraft import Pose
 from sim.hands import Hands
 from sim.imu_model import PARTS
 from sim.motions import motions_of
@@ -26,6 +25,7 @@ from sim.serve import (
     configuration,
     describe,
     hands_of,
+    pose_of,
     run_until_stopped,
     serve,
 )
@@ -87,9 +87,8 @@ def _add_aircraft(command: argparse.ArgumentParser) -> None:
 
 
 def scenario_of(arguments: argparse.Namespace) -> Scenario:
-    pitch, roll, heading = arguments.pose
     return demo(
-        pose=Pose(pitch, roll, heading),
+        pose=pose_of(arguments),
         seed=arguments.seed,
         unix_s=time.time(),
         motions=motions_of(arguments.motion, seed=arguments.seed, turn_deg_s=arguments.turn),

@@ -189,7 +189,9 @@ async def run_check(
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
-    no_tilt = message("sensor_missing", sensor="gradienter", sensors="accelerometers")
+    no_tilt = (
+        f"{message('sensor_missing', sensor='gradienter', sensors='accelerometers')}: by hand, companion align faces"
+    )
     for kind, words in (("gradienter", no_tilt), ("compass", message("no_heading", reason="no compass"))):
         if getattr(config, kind) is None:
             findings.append(CheckLine(kind, good=True, words=words))
