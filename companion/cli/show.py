@@ -57,13 +57,14 @@ def _magnetic_lines(magnetic: Object | None) -> list[str]:
 def _imu_lines(imu: Object) -> list[str]:
     degc = imu["temperature_degc"]
     lines = [f"{imu['name']}: {imu['samples']} samples" + (f", {degc:.1f} degC" if degc is not None else "")]
-    for triad, unit, scale, form, bias, sigma, left in (
-        ("gyro", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s", "residual_gyro_rad_s"),
-        ("accel", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2", "residual_accel_m_s2"),
+    for triad, unit, scale, form, si, left in (
+        ("gyro", "deg/h", DEG_H, "+9.1f", "rad_s", "residual_gyro_rad_s"),
+        ("accel", "mg   ", MG, "+9.3f", "m_s2", "residual_accel_m_s2"),
     ):
-        if imu[bias] is None:
+        if imu[bias := f"{triad}_bias_{si}"] is None:
             continue
-        lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
+        sigma = imu.get(f"{triad}_sigma_in_force_{si}") or imu[f"{triad}_sigma_use_{si}"]
+        lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], sigma, form, scale)}{_held_back(imu, triad)}")
         if imu["written"] and imu.get(left) not in (None, imu[bias]):
             lines.append(f"      change {unit} {axes(imu[left], None, form, scale)}")
     if not imu["written"] and imu.get("residual_gyro_rad_s") is imu.get("residual_accel_m_s2") is None:

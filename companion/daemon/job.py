@@ -60,7 +60,7 @@ class Job:
         self.hold_still_s: int | None = None
         """Seconds for which the aircraft must be held motionless, if the job waits for nothing else; otherwise None."""
         self.act: Act | None = None  # None: no alignment, or not begun
-        self.progress_percent = 0  # 0 to 100; it never falls
+        self.progress_percent = 0  # 0 to 100; it falls only where a measurement begins again
         self._until_s = 0.0
         self.cancelled_by: str | None = None
         self._nudge = asyncio.Event()

@@ -175,7 +175,7 @@ def _imu(imu: ImuRecord) -> Markup:
 
 
 def _column(imu: ImuRecord, triad: Triad) -> list[str]:
-    bias, _, use, *_ = imu.of(triad)
+    bias, use = imu.of(triad).bias, imu.sigma_in_force(triad)
     assert bias is not None
     assert use is not None
     return [" ± ".join(with_sigma(bias[k], use[k], UNITS[triad].si)) for k in range(3)]

@@ -67,6 +67,7 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         status = made.service.status()
         stands, (step, _) = status["stands"], status["undoable"]
         assert (stands["what"], stands["write"], stands["outcome"], step["before"]) == ("faces", True, "done", old)
+        assert stands["number"] == stands["total"] == len(stands["done"]), "the last pose is seen as the last"
         record = job.product
         assert isinstance(record, FacesRecord)
         assert 11 <= len(record.stands) <= 14
@@ -109,6 +110,9 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
             assert result.reason.endswith(f"old values restored: {what}")
             assert {name: made.double.parameter(name) for name in gyros} == gyros
         assert accel_sigma_mg(made) is None
+        assert (await calibrated(made, What.GYROS))[0].outcome == "done"
+        lacks = "; accel not calibrated: companion align faces --write"
+        await made.until(lambda: made.service.status()["headline"]["reason"].endswith(lacks), 10.0)
         assert {name: made.double.parameter(name) for name in old} == old
         again = ByHand(made.service.core, made.service.devices.imus)
         again.load()

@@ -47,12 +47,14 @@ class Watch:
     def __init__(self, rig: Rig) -> None:
         self.words: list[str] = []
         self.seconds: list[int] = []
+        self.percents: list[int | None] = []
         self._rig = rig
         self._task = asyncio.create_task(self._look())
 
     async def _look(self) -> None:
         while True:
             word = headline(self._rig)[1]
+            self.percents.append(self._rig.service.status()["progress"])
             if word.startswith("HOLD STILL") and (match := re.search(r"\d+", word)):
                 self.seconds.append(int(match[0]))
             short = re.sub(r" \d+ (%|s)$", "", word)
@@ -118,6 +120,11 @@ async def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: P
         result, record = await calibrated(rig)
         await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
         assert result.outcome == "done"
+        # A movement begins the measurement again, and its percentage with it.
+        percents = [percent for percent in watch.percents if percent is not None]
+        last = max(k for k, percent in enumerate(percents) if percent == 0)
+        assert max(percents[:last]) > 0
+        assert percents[last:] == sorted(percents[last:])
         words = await watch.stop()
         assert words[-5:] == ["HOLD STILL", "MEASURING", "WRITING", "CHECKING", "READY"] or words[-6:] == [
             "HOLD STILL", "MEASURING", "WRITING", "CHECKING", "SETTLING", "READY",
@@ -142,6 +149,7 @@ async def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: P
         rig.double.arm()
         await rig.until(lambda: headline(rig)[:2] == ("bad", "ARMED"), 3.0)
         assert "not calibrated" in headline(rig)[2]
+        assert "disarm" in rig.service.status()["headline"]["remedy"]
 
 
 async def test_left_alone_it_says_how_long_to_hold_still_until_it_is_ready(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ from companion.estimation.records.validity import (
 from companion.estimation.solution.doubt import Inconsistency
 from companion.estimation.solution.solve import Solution
 from companion.physics.frames import vector
-from companion.samples import TRIADS, Triad, rows_of
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class ActiveCalibration:
         """Biases that an automatic calibration estimates: of gyros, and with a gradienter also of accelerometers."""
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
-        self._names, self._faces = names, calibrating.faces
+        self._names, self.faces = names, calibrating.faces
         self.temperatures_degc: dict[str, float] = {}  # Temperatures of the IMUs at the last check of their output
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
@@ -158,17 +158,25 @@ class ActiveCalibration:
         known = [held.confirmed_s for held in self._judged if isinstance(held, Held)]
         return min(known) if known and len(known) == len(self._judged) else None
 
-    def sigma(self, triad: Triad) -> float | None:
-        """Return the largest sigma of the active gyro or accel calibrations, rad/s or m/s^2; None if there is none.
+    def active(self, name: str, triad: Triad) -> tuple[Vector, float | None] | None:
+        """Return sigma and event-loop time (None: only checked) of the calibration or faces alignment of one triad.
 
-        Accelerometers count with the calibration or the written faces alignment, whichever has the smaller sigma.
+        Accelerometers count with the one that has the smaller sigma, rad/s or m/s^2. None: neither is active.
         """
-        held = {name: state.held for (name, of), state in self._triads.items() if of == triad}
-        found = {name: max(each.sigma_use) for name, each in held.items() if isinstance(each, Held)}
-        for name in self._names if triad == "accel" else ():
-            by_faces = self._faces.sigma_m_s2(name, self.temperatures_degc.get(name))
-            found |= {} if by_faces is None else {name: min(by_faces, found.get(name, math.inf))}
-        return max(found.values(), default=None)
+        held = state.held if (state := self._triads.get((name, triad))) is not None else None
+        by_faces = self.faces.sigma_m_s2(name, self.temperatures_degc.get(name)) if triad == "accel" else None
+        if by_faces is not None and (not isinstance(held, Held) or by_faces < max(held.sigma_use)):
+            return (by_faces,) * 3, self.faces.measured_s(name)
+        return (held.sigma_use, held.calibrated_s) if isinstance(held, Held) else None
+
+    def worst(self, triad: Triad) -> tuple[float | None, float | None]:
+        """Return the largest sigma of the active gyro or accel calibrations, and the time of the oldest one."""
+        found = [one for name in self._names if (one := self.active(name, triad)) is not None]
+        times = [time_s for _, time_s in found if time_s is not None]
+        return max((max(sigma) for sigma, _ in found), default=None), min(times, default=None)
+
+    def sigma(self, triad: Triad) -> float | None:
+        return self.worst(triad)[0]
 
     def record_of(self, name: str) -> ImuRecord | None:
         states = [state for key, state in self._triads.items() if key[0] == name and state.judged]
@@ -299,7 +307,7 @@ class ActiveCalibration:
     def _leave_out(self, key: Key, state: _TriadState) -> None:
         state.present = None
         if state.held in (Why.NEVER, Why.UNDONE) and state.judged and len(self._judged) > 1:
-            logger.warning("%s %s is not judged: the last calibration could not measure it", key[1], key[0])
+            logger.warning("%s %s left out of READY: its telemetry is too coarse to show a bias", key[1], key[0])
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:

@@ -52,6 +52,8 @@ _WAITS: Final = {
     Precondition.ARM_STATE_KNOWN: "no heartbeat from the autopilot",
     Precondition.RESTORED: f"{_STEPS[State.UNDOING]}: wait",
 }
+NO_FACES: Final = "accel not calibrated: companion align faces --write"
+AGES_APART_S: Final = 180.0  # Difference of two ages beyond which both are shown
 LATE_S: Final = 2.0
 """Longest delay before telemetry is checked: the check uses only complete one-second intervals."""
 
@@ -209,12 +211,21 @@ class Readiness:
         in_force = self.in_force
         if against := next((one.against for one in self._reasons(now_s) if one.against), None):
             return "uncalibrated", against
-        sigmas = sigma_texts(in_force.sigma("gyro"), in_force.sigma("accel"))
         if in_force.calibrated_s is not None:
-            return "calibrated", ", ".join([f"calibrated {_ago(now_s - in_force.calibrated_s)} ago", *sigmas])
+            return "calibrated", self._figures(now_s, "calibrated", in_force.worst("gyro")[1] or in_force.calibrated_s)
         if in_force.confirmed_s is not None:
-            return "checked", ", ".join([f"offsets checked {_ago(now_s - in_force.confirmed_s)} ago", *sigmas])
+            return "checked", self._figures(now_s, "offsets checked", in_force.confirmed_s)
         return "uncalibrated", "not calibrated yet" if in_force.held_back is None else ""
+
+    def _figures(self, now_s: float, words: str, since_s: float) -> str:
+        """Format age and sigmas of the active calibration; the accelerometers' own age if it differs by minutes."""
+        in_force = self.in_force
+        (gyro, _), (accel, accel_s) = in_force.worst("gyro"), in_force.worst("accel")
+        parts = [f"{words} {_ago(now_s - since_s)}", *sigma_texts(gyro, accel)]
+        if accel_s is not None and abs(accel_s - since_s) > AGES_APART_S:
+            parts[-2:] = [f"{parts[-2]}; accel {_ago(now_s - accel_s)}", parts[-1]]
+        lacks = f"; {NO_FACES}" if accel is None and in_force.faces.record is not None else ""
+        return ", ".join(parts) + lacks
 
     def _quality(self, triad: Triad, unit: float) -> dict[str, object]:
         sigma, settings = self.in_force.sigma(triad), self._wanted.settings
@@ -242,4 +253,6 @@ class Readiness:
 
 
 def _ago(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 99.5 else f"{seconds / 60:.0f} min"
+    if math.isinf(seconds):
+        return "before this start"
+    return f"{seconds:.0f} s ago" if seconds < 99.5 else f"{seconds / 60:.0f} min ago"

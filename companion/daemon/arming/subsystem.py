@@ -22,10 +22,10 @@ from companion.daemon.core import REREAD_EVERY_S, Core, Handler, RepeatedRead, S
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import StorageError
-from companion.estimation.records.record import ArmingRecord
+from companion.estimation.records.record import ArmingRecord, ImuRecord
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 from companion.storage.records import armings_in, stored_history
 
 logger = logging.getLogger(__name__)
@@ -181,15 +181,20 @@ class Arming(Subsystem):
                     "when_warm": [] if imu.when_warm is None else list(imu.when_warm.words),
                     "temperature_now_degc": in_force.temperatures_degc.get(imu.name),
                     "gyro_bias_deg_h": _scaled(imu.gyro_bias_rad_s, DEG_H, 2),
-                    "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),
+                    "gyro_sigma_deg_h": _scaled(self._sigma(imu, "gyro"), DEG_H, 2),
                     "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
-                    "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
+                    "accel_sigma_mg": _scaled(self._sigma(imu, "accel"), MG, 4),
                     "held_back": list(imu.held_back),
                     "unchanged": list(imu.unchanged),
                 }
                 for imu in record.imus
             ],
         }
+
+    def _sigma(self, imu: ImuRecord, triad: Triad) -> Vector | None:
+        """Return the sigma of the active offsets, as the headline shows it; of a held-back result, its own sigma."""
+        active = None if triad in imu.held_back or imu.of(triad).bias is None else self.in_force.active(imu.name, triad)
+        return imu.sigma_in_force(triad) if active is None else active[0]
 
     async def _answer_history(self, request: History, _face: str) -> AsyncIterator[Object]:
         # Reading a thousand records would block the event loop too long.

@@ -19,7 +19,7 @@ from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.estimation.machine import State
 from companion.formats import Object
-from companion.messages import explain, message
+from companion.messages import catalogue, explain, message
 
 ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
@@ -54,7 +54,9 @@ class Headlines:
         concern = devices.watch.implausible() or contradicted or devices.signing.warning or self._heading.concern
         if concern is not None and (good or word == ARMED):
             reason, tone = f"{concern}; {reason}", "wait" if good else tone
-        if remedy is None:
+        if remedy is None and word == ARMED and tone != "good" and concern is None:
+            remedy = catalogue()["armed_uncalibrated"].remedy
+        elif remedy is None:
             explained = explain(reason) if tone in ("bad", "wait") else None
             remedy = "" if explained is None else explained[1].remedy
         if (left := self._warm_up.words()) is not None and word.startswith(("HOLD STILL", "NOT ", "WAIT")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Mapping
 
 import msgspec
@@ -166,6 +167,11 @@ class ActiveSixPosition:
         if now is None or (np.abs(now.figures[BIAS]) > now.sigma[BIAS]).any():
             return None
         return float(now.sigma[BIAS].max())
+
+    def measured_s(self, name: str) -> float:
+        """Return the event-loop time of a measurement; -inf: before the start of the computer."""
+        when = next((imu.running for imu in self.record.imus if imu.name == name), None) if self.record else None
+        return when.started_s + when.up_s if when is not None and when.host == self._host else -math.inf
 
     def _now(self, name: str, temperature_degc: float | None) -> Sides | None:
         calibration = self._imus[name].calibration if name in self._imus else None

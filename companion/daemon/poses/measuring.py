@@ -97,6 +97,8 @@ class Measuring:
                 self._check_imus(failures)
                 self.show(measuring=waiting_for is None)
                 words = waiting_for or status.measuring
+                if status.still_s == 0.0:
+                    job.progress_percent = 0  # the measurement begins again
                 job.progress(MEASURED_PERCENT * status.progress, words, hold_still_s)
                 if waiting_for is None and status.enough:
                     self._machine.on(Event.ENOUGH)

@@ -42,7 +42,7 @@ LEAST_POSES: Final = 3
 READING_SIGMA_DEG: Final = 0.005  # Noise of one mean of a gradienter (docs/reference/method.md section 3.4, table)
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
-EXPECTED: Final = 12  # Usual number of poses in a six-position alignment
+EXPECTED: Final = 11  # Least number of poses in a six-position alignment
 MOST: Final = 24  # Maximum
 NOT_WRITTEN: Final = "not written (--write does)"
 _FIRST: Final = PoseRequest("any side down, propped up, hands off")
@@ -332,6 +332,7 @@ class SixPositionTask(PoseTask):
             found = faces([self._face(one) for one in means], local.gravity_m_s2, local.gravity_sigma_m_s2, wander)
             self._by_imu[name] = found
             self._missing = self._missing or missing(found, calibration.orientation)
+            self.total = max(self.total, found.least_poses)
         if not self._by_imu:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
         return [

@@ -106,6 +106,10 @@ class FacesEstimate:
     def sigma(self) -> Array:
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def least_poses(self) -> int:
+        return FIGURES + LEAST_SPARE + len(self.left_out)
+
 
 def faces(
     stands: Sequence[Face], gravity_m_s2: float, gravity_sigma_m_s2: float, wander_m_s2: Array | None = None
@@ -193,7 +197,7 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> PoseRequest | 
     sigma = np.sqrt(np.diag(found.by_stands))[: SCALE.stop]
     share = sigma / np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale])
     worst_first = [int(which) for which in np.argsort(-share) if share[which] > 1.0]
-    unchecked = len(found.up) - len(found.left_out) < FIGURES + LEAST_SPARE
+    unchecked = len(found.up) < found.least_poses
     if not worst_first and not unchecked and not found.in_doubt:
         return None
     # Once all sides were seen, ask again for the most informative one.

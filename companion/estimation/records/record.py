@@ -84,7 +84,7 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     wander_deg: float | None
 
     def in_words(self) -> str:
-        bound = "heading error bound unknown"
+        bound = "heading not checked for iron nearby"
         if self.heading_bound_deg is not None:
             useless = self.heading_bound_deg >= 180.0
             bound = "shows no heading here" if useless else f"heading good to {self.heading_bound_deg:.1f} deg"
@@ -99,7 +99,7 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
                 earths = "" if expected is None else f" (the Earth's {expected:{form}})"
                 parts.append(f"{what} {found:{form}} {unit}{earths}")
         if self.wander_deg is not None:
-            parts.append(f"wandered {self.wander_deg:.1f} deg")
+            parts.append(f"steady to {self.wander_deg:.1f} deg")
         return ", ".join(parts)
 
 

@@ -88,7 +88,9 @@ function show(status) {
   // Disable only buttons that make no sense: the daemon decides whether an action is allowed, and gives the reason.
   $("calibrate").disabled = busy || away;
   for (const button of document.querySelectorAll("#align button")) button.disabled = busy || away;
-  for (const it of document.querySelectorAll(".wants-gradienter")) it.hidden = !status.devices.some(({name}) => name === "gradienter");
+  const gradienter = status.devices.some(({name}) => name === "gradienter");
+  for (const it of document.querySelectorAll(".wants-gradienter")) it.hidden = !gradienter;
+  $("attitude").hidden = status.pose === null && !gradienter;
   $("cancel").disabled = !busy;
   $("undo").disabled = busy || away || status.why_no_undo !== null;
   const [step] = status.undoable;
@@ -96,17 +98,30 @@ function show(status) {
   const key = JSON.stringify([status.last, status.headline.word === "READY", busy]);
   if (key !== shownRecords) { shownRecords = key; records(); }
 }
-// Configured targets that the active calibration has not reached.
+// Configured targets that the active calibration has not reached, if its record shows what helps.
 function quality(status) {
-  const rows = [["gyro", "deg/h", 1], ["accel", "mg", 2]].flatMap(([triad, unit, digits]) => {
-    const {wanted, met} = status.arming.quality[triad];
-    return met === false ? [`${+wanted.toFixed(digits)} ${unit}`] : [];
-  });
-  const shown = rows.length > 0 && status.headline.tone === "good";
-  const warming = status.last !== null && status.last.when_warm.length > 0;
-  $("quality").hidden = !shown;
-  $("quality").textContent = `goal ${rows.join(", ")} not met${warming ? ": still warming" : ""}`;
-  $("head").classList.toggle("coarse", shown);
+  const one = status.calibration && recordsRead.find(({record}) => record.started_at === status.calibration.started_at);
+  const found = status.arming.quality, goals = {}, good = status.headline.tone === "good";
+  const unmet = [["gyro", "deg/h", 1, "rad_s", DEG_H], ["accel", "mg", 2, "m_s2", MG]].filter(([triad]) => found[triad].met === false);
+  for (const [triad, unit, digits, si, scale] of unmet) {
+    const help = one && helps(one.record, triad, si, found[triad].sigma * scale, status.devices);
+    if (help) (goals[help] ||= []).push(`${+found[triad].wanted.toFixed(digits)} ${unit}`);
+  }
+  const rows = Object.entries(goals).map(([help, wanted]) => `goal ${wanted.join(", ")} not met: ${help}`);
+  $("quality").hidden = !good || !rows.length;
+  $("quality").textContent = rows.join("; ");
+  $("head").classList.toggle("coarse", good && unmet.length > 0);
+}
+// What would lower the largest sigma in use, in rad/s or m/s^2; "" where its largest part is not known.
+function helps(record, triad, si, sigma, devices) {
+  const largest = (imu, kind) => Math.max(...imu[`${triad}_sigma_${kind}_${si}`] || [0]);
+  const imu = record.imus.find(one => Math.abs((largest(one, "in_force") || largest(one, "use")) / sigma - 1) < 0.01);
+  if (!imu) return "";
+  const isHalf = kind => largest(imu, kind) ** 2 > sigma ** 2 / 2, has = wanted => devices.some(({name}) => name === wanted);
+  if (isHalf("warm_up") || (imu.when_warm && imu.when_warm.words.length)) return "calibrate again when warm";
+  if (isHalf("stat")) return "set a larger calibration.max_s";
+  if (triad === "gyro") return record.pose && record.pose.psi_deg === null && !has("compass") ? "connect a compass" : "";
+  return has("gradienter") && !record.alignment ? "hold ZERO once" : "";
 }
 function axes(names, digits, biases, sigmas, unit, title, held, unchanged, before) {
   if (!biases) return [];
@@ -240,8 +255,8 @@ function figures(imu, undone) {
   const part = (bias, sigma, unit, digits, name, triad) => bias === null ? "" :
     ` ${name[0]}${held(triad)} ${bias.map((value, k) => `${signed(value / unit, digits)} ± ${(sigma[k] / unit).toFixed(digits)}`).join(", ")} ${name[1]};`;
   const written = Object.keys(imu.written).length;
-  return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
-    + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written${undone ? ", then undone" : ""}` : "");
+  return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_in_force_rad_s || imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
+    + part(imu.accel_bias_m_s2, imu.accel_sigma_in_force_m_s2 || imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written${undone ? ", then undone" : ""}` : "");
 }
 // The page's server draws the plots, as in reports, and only on request.
 async function temperature() {

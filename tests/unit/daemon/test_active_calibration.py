@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -47,5 +48,31 @@ async def test_accelerometers_have_the_smaller_sigma_of_calibration_and_faces(
         sigma=(0.009, 0.004, 0.004), expected=(0.0, 0.0, 0.0), seen=True, averaged_s=60.0,
     )  # fmt: skip
     in_force._triads[name, "accel"] = SimpleNamespace(held=held)
-    in_force._faces = SimpleNamespace(sigma_m_s2=lambda _name, _degc: by_faces)
+    in_force.faces = SimpleNamespace(sigma_m_s2=lambda _name, _degc: by_faces, measured_s=lambda _name: 0.0)
     assert in_force.sigma("accel") == shown
+
+
+@pytest.mark.parametrize(
+    ("faces_s", "sigma_m_s2", "shown"),
+    [
+        (100.0, 0.5e-3 * 9.80665, "calibrated 20 min ago, 13 deg/h, 0.50 mg"),
+        (1240.0, 0.5e-3 * 9.80665, "calibrated 20 min ago, 13 deg/h; accel 60 s ago, 0.50 mg"),
+        (-math.inf, 0.5e-3 * 9.80665, "calibrated 20 min ago, 13 deg/h; accel before this start, 0.50 mg"),
+        (1240.0, None, "calibrated 20 min ago, 13 deg/h; accel not calibrated: companion align faces --write"),
+    ],
+)
+async def test_ready_shows_when_gyros_and_accelerometers_were_measured(
+    tmp_path: Path, faces_s: float, sigma_m_s2: float | None, shown: str
+) -> None:
+    readiness: Any = Service(parse(ALONE.format(folder=tmp_path, more=""), "test.toml")).arming.readiness
+    in_force = readiness.in_force
+    ((name, _),) = in_force._triads
+    gyro = (13.0 * math.radians(1.0) / 3600.0,) * 3
+    in_force._triads[name, "gyro"].held = Held(
+        calibrated_s=100.0, confirmed_s=1300.0, temperature_degc=25.0, sigma_use=gyro,
+        sigma=gyro, expected=(0.0, 0.0, 0.0), seen=True, averaged_s=60.0,
+    )  # fmt: skip
+    in_force.faces = SimpleNamespace(
+        record="measured once", sigma_m_s2=lambda _name, _degc: sigma_m_s2, measured_s=lambda _name: faces_s
+    )
+    assert readiness._figures(1300.0, "calibrated", in_force.calibrated_s) == shown

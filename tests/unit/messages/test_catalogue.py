@@ -40,6 +40,7 @@ NOT_MESSAGES = {
     "left side down", "right side down", "… (after … more like this, left out)", "TURN IT", "PUT IT DOWN", "HOLD STILL",
     ": type companion fix",
     "the board would sit more than 10 deg askew: no level is for that", "learned from … h at rest in …, saved …",
+    "before this start", "steady to … deg",
 }  # fmt: skip
 
 PATTERNS = [pattern for entry in catalogue().values() for pattern in entry.patterns]
