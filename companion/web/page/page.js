@@ -108,7 +108,7 @@ function quality(status) {
     if (help) (goals[help] ||= []).push(`${+found[triad].wanted.toFixed(digits)} ${unit}`);
   }
   const rows = Object.entries(goals).map(([help, wanted]) => `goal ${wanted.join(", ")} not met: ${help}`);
-  $("quality").hidden = !good || !rows.length;
+  $("quality").hidden = !good || !rows.length || status.headline.word === "ARMED";
   $("quality").textContent = rows.join("; ");
   $("head").classList.toggle("coarse", good && unmet.length > 0);
 }
@@ -117,9 +117,10 @@ function helps(record, triad, si, sigma, devices) {
   const largest = (imu, kind) => Math.max(...imu[`${triad}_sigma_${kind}_${si}`] || [0]);
   const imu = record.imus.find(one => Math.abs((largest(one, "in_force") || largest(one, "use")) / sigma - 1) < 0.01);
   if (!imu) return "";
-  const isHalf = kind => largest(imu, kind) ** 2 > sigma ** 2 / 2, has = wanted => devices.some(({name}) => name === wanted);
-  if (isHalf("warm_up") || (imu.when_warm && imu.when_warm.words.length)) return "calibrate again when warm";
-  if (isHalf("stat")) return "set a larger calibration.max_s";
+  const [warm, noise] = ["warm_up", "stat"].map(kind => largest(imu, kind) ** 2), rest = sigma ** 2 - warm - noise;
+  if (warm > Math.max(noise, rest) || (imu.when_warm && imu.when_warm.words.length)) return "calibrate again when warm";
+  if (noise > rest) return "set a larger calibration.max_s";
+  const has = wanted => devices.some(({name}) => name === wanted);
   if (triad === "gyro") return record.pose && record.pose.psi_deg === null && !has("compass") ? "connect a compass" : "";
   return has("gradienter") && !record.alignment ? "hold ZERO once" : "";
 }
