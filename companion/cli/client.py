@@ -37,7 +37,7 @@ ALIGNMENTS: Final = {
         "accelerometers without a gradienter, by turning on one place",
         ("headings", "level", "write", "timeout_s"),
     ),
-    "faces": ("accelerometers by hand, in about 12 poses on any side", ("write", "timeout_s")),
+    "faces": ("accelerometers by hand, in about 11 poses on any side", ("write", "timeout_s")),
     "compass": (
         "the autopilot's compasses, by turning on one place (no heading need be known)",
         ("headings", "heading", "sides", "write", "timeout_s"),

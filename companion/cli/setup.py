@@ -397,7 +397,7 @@ def next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: 
     yield f"{command} calibrate   (disarmed, standing still, hands off)"
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
-        yield f"{command} align faces --write   (once: accelerometers too, in about 12 poses, held by hand, 5 min)"
+        yield f"{command} align faces --write   (once: accelerometers too, in about 11 poses, held by hand, 5 min)"
 
 
 def _zero_is_known(parsed: Config) -> bool:
