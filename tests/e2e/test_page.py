@@ -10,7 +10,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 
+from companion.cli.show import record_lines
 from companion.estimation.machine import What
 from companion.estimation.records.validity import Held
 from sim.motions import Handling
@@ -150,6 +152,22 @@ async def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: P
         await rig.until(lambda: headline(rig)[:2] == ("bad", "ARMED"), 3.0)
         assert "not calibrated" in headline(rig)[2]
         assert "disarm" in rig.service.status()["headline"]["remedy"]
+
+
+async def test_the_bars_have_the_sigma_of_the_headline_where_old_offsets_stay(tmp_path: Path) -> None:
+    async with Rig(tmp_path, max_s=12.0).running() as rig:
+        await rig.ready()
+        assert (await calibrated(rig))[0].outcome == "done"
+        await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
+        result, record = await calibrated(rig)
+        assert record.imus[0].unchanged == ("accel", "gyro"), result
+        await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
+        status = rig.service.status()
+        (bars,) = status["calibration"]["imus"]
+        sigma = max(bars["gyro_sigma_deg_h"])
+        assert f", {sigma:.{1 if sigma < 10.0 else 0}f} deg/h, {max(bars['accel_sigma_mg']):.2f} mg" in headline(rig)[2]
+        shown = [line for line in record_lines(msgspec.to_builtins(record)) if line.startswith("  gyro  bias")]
+        assert max(float(one) for one in re.findall(r"\+- ([\d.]+)", shown[0])) == pytest.approx(sigma, abs=0.06)
 
 
 async def test_left_alone_it_says_how_long_to_hold_still_until_it_is_ready(tmp_path: Path) -> None:
