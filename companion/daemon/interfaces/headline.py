@@ -84,7 +84,7 @@ class Headlines:
                 return ARMED, words, "good"
             if not self._armings.seen_disarmed and self._readiness.in_force.earlier is not None:
                 return ARMED, f"companion started in flight: {words}", "wait"
-            return ARMED, f"not calibrated: {words}", "bad"
+            return ARMED, words if words.startswith("not calibrated") else f"not calibrated: {words}", "bad"
         if unmet is not None:
             return "TWO COMPANIONS", reason, "bad"
         if self._readiness.at_arm == "gate":
