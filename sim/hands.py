@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import re
+import stat
 import sys
 from collections.abc import Callable
 from typing import Final
@@ -188,7 +190,12 @@ async def take_lines(hands: Hands, aircraft: VirtualAircraft, say: Callable[[str
     """Read lines from standard input, a terminal or a script, and obey each, until the input ends."""
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    mode = os.fstat(sys.stdin.fileno()).st_mode
+    if sys.stdin.isatty() or stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
+        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    else:  # a file, or /dev/null: asyncio waits for neither
+        reader.feed_data(sys.stdin.buffer.read())
+        reader.feed_eof()
     while line := await reader.readline():
         words = line.decode(errors="replace")
         if (waiting := re.fullmatch(r"\s*wait\s+([0-9.]+)\s*", words)) is not None:

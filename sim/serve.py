@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import hashlib
 import os
+import shlex
 import signal
 import sys
 import tempfile
@@ -164,6 +165,11 @@ def address(text: str) -> tuple[str, int]:
 def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str, int] | None) -> str:
     """Return a companion configuration for the devices and autopilot that are served; comments say what is missing."""
     lines = ["[mavlink]"]
+    if udp is not None and directory is not None:
+        ports = " ".join(shlex.quote(str(directory / name)) for name in scenario.ports)
+        lines.insert(
+            0, f"# Or without these lines, by questions: companion -c companion.toml setup {ports} --udp {udp[1]}"
+        )
     if udp is None:
         lines.append("# no autopilot is simulated here; `python -m sim autopilot` is one")
     lines.append(f'url = "udpin:{udp[0]}:{udp[1]}"' if udp else f'url = "udpin:{DEFAULT_UDP}"')
@@ -333,7 +339,7 @@ async def run_until_stopped(
 
     async def announce() -> None:
         await started.wait()
-        print("# Ready. Save these lines as companion.toml and run: companion run -c companion.toml")
+        print("# Ready. Save these lines as companion.toml and run: companion -c companion.toml run")
         print("# Ctrl-C ends the simulation.")
         print(text(), flush=True)
 

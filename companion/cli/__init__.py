@@ -50,8 +50,8 @@ class _Overview(Parser):
         lines = ["companion: field self-calibration of gyro and accelerometer biases"]
         for title, names in GROUPS.items():
             lines += [f"{title}:", *(f"  {name:11}{self.commands[name].description}" for name in names)]
-        lines += ["", "companion COMMAND --help describes a command. All take --json (one JSON object on stdout),"]
-        lines += [f"and -c FILE (configuration; default {config.DEFAULT_PATH}). companion --version."]
+        lines += ["", "companion COMMAND --help describes a command. All take --json (one JSON object on stdout)."]
+        lines += [f"companion -c FILE COMMAND (default: {config.DEFAULT_PATH}). companion --version."]
         return "\n".join([*lines, ""])
 
 

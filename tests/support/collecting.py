@@ -34,7 +34,7 @@ class CollectorProcess:
         self.log = folder / f"{name}.log"
         config = folder / f"{name}.toml"
         config.write_text(one.section(keepalive_s=5, **({} if username is None else {"username": username})))
-        command = [sys.executable, "-m", "companion", "fleet", "run", "-c", str(config), "--database", database, *more]
+        command = [sys.executable, "-m", "companion", "-c", str(config), "fleet", "run", "--database", database, *more]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log)
 

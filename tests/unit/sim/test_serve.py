@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import config
 from sim.__main__ import main
+from sim.hands import Hands, take_lines
 from sim.scenario import COMPASSES, GRADIENTERS, IMUS, demo
 from sim.serve import configuration, serve
 from sim.station import Station, open_udp
@@ -40,13 +41,16 @@ def test_the_simulator_takes_nothing_from_the_science_it_judges() -> None:
 
 def test_the_printed_configuration_is_one_the_companion_takes(tmp_path: Path) -> None:
     scenario = demo()
-    both = config.parse(configuration(scenario, directory=tmp_path, udp=("127.0.0.1", 14650)), "both")
+    printed = configuration(scenario, directory=tmp_path, udp=("127.0.0.1", 14650))
+    both = config.parse(printed, "both")
     assert both.mavlink.url == "udpin:127.0.0.1:14650"
     assert [(imu.name, imu.source) for imu in both.imu] == [("fc", "autopilot"), ("own", "serial")]
     assert both.gradienter is not None
     assert both.gradienter.port == str(tmp_path / "gradienter")
     assert both.compass is not None
     assert both.compass.protocol == "hmr3300"
+    words = printed.splitlines()[0].partition("companion -c companion.toml setup ")[2].split()
+    assert words == [*(str(tmp_path / name) for name in scenario.ports), "--udp", "14650"]
     devices = config.parse(configuration(scenario, directory=tmp_path, udp=None), "devices")
     assert devices.vehicle.latitude_deg == 40.0
     autopilot = config.parse(configuration(scenario, directory=None, udp=("127.0.0.1", 14650)), "autopilot")
@@ -138,3 +142,16 @@ def test_an_autopilot_that_was_given_a_passphrase_speaks_and_listens_to_who_has_
     key = hashlib.sha256(b"a field of words").digest()
     assert data[2] & mavlink.MAVLINK_IFLAG_SIGNED
     assert hashlib.sha256(key + data[:-6]).digest()[:6] == data[-6:]
+
+
+@pytest.mark.parametrize("typed", ["", "turn 90\nleap\n"])
+async def test_hands_read_a_file_or_the_null_device_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: str
+) -> None:
+    file = tmp_path / "typed" if typed else Path(os.devnull)
+    file.write_text(typed)
+    aircraft, said = demo().aircraft, list[str]()
+    with file.open(encoding="utf-8") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        await take_lines(Hands(aircraft), aircraft, said.append)
+    assert [words.split(maxsplit=1)[0] for words in said] == (["moving", "found"] if typed else [])
