@@ -12,7 +12,7 @@ from typing import Any, Final
 from companion.errors import LinkError
 from companion.links.mavlink.transport import parse_url
 from companion.links.serial.listening import Heard, listen_to_all
-from companion.links.serial.ports import ROOT, resolve
+from companion.links.serial.ports import ROOT, find_udp_holders, how_to_free, in_use, resolve
 from companion.links.system.events import comes
 from companion.protocols.guess import Heartbeat, Line, heartbeats
 from companion.protocols.registry import Kind, main_kind
@@ -60,6 +60,8 @@ async def listen_udp(port: int) -> HeardUdp:
             local_addr=("0.0.0.0", port),  # noqa: S104
         )
     except OSError as error:
+        if holders := find_udp_holders(port):
+            raise LinkError(f"{in_use(f'UDP {port}', holders)}: {how_to_free(holders[0])}") from None
         raise LinkError(f"UDP {port}: {error.strerror or error}") from None
     try:
         for _ in range(LISTEN_TURNS):

@@ -14,7 +14,7 @@ from typing import Final
 
 from companion.errors import LinkError
 from companion.links.serial.port import DRIVER_REFUSES, SerialOpener, close_serial
-from companion.links.serial.ports import ROOT, SerialPort, find_holders, in_use
+from companion.links.serial.ports import ROOT, SerialPort, find_holders, how_to_free, in_use
 from companion.links.system.events import comes
 from companion.messages import message
 from companion.protocols.guess import (
@@ -77,7 +77,7 @@ async def listen_to_all(
 async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
     """Try line settings, likely ones first, for half a minute at most; raise LinkError if the port cannot be opened."""
     if holders := [holder for holder in find_holders(path, root) if holder.pid != os.getpid()]:
-        raise LinkError(in_use(path, holders))
+        raise LinkError(f"{in_use(path, holders)}: {how_to_free(holders[0])}")
     heard, plain = 0, dict[int, float]()
     bauds: list[int] = []
     for number, line in enumerate(lines_to_try(first)):

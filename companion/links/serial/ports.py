@@ -20,6 +20,7 @@ from companion.messages import message
 ROOT = Path("/")
 _BY_ID, _BY_PATH = "/dev/serial/by-id/", "/dev/serial/by-path/"
 _TEXT_LIMIT = 80
+COMPANION: Final = "the companion"  # Name of our daemon among the programs that use a port
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +65,26 @@ def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     return tuple(_holders_by_device(root).get(resolve(root, device), ()))
 
 
+def find_udp_holders(port: int, root: Path = ROOT) -> tuple[Holder, ...]:
+    try:
+        rows = [line.split() for line in (root / "proc/net/udp").read_text().splitlines()[1:]]
+    except OSError:
+        return ()
+    sockets = {f"socket:[{row[9]}]" for row in rows if int(row[1].rpartition(":")[2], 16) == port}
+    return tuple(one for name, holders in _holders_by_device(root).items() if name in sockets for one in holders)
+
+
 def in_use(port: str, holders: Sequence[Holder]) -> str:
     """Return the message that a port is in use; `holders`: programs that use it, empty if we lack the right to see."""
     programs = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
     return message("port_in_use", port=port, programs=f" ({programs})" if programs else "")
+
+
+def how_to_free(holder: Holder) -> str:
+    """Return the command that ends a program which uses a port."""
+    if holder.name == COMPANION:
+        return f"sudo systemctl stop companion (without the service: kill {holder.pid})"
+    return _MODEM_REMEDY if holder.name == "ModemManager" else f"sudo kill {holder.pid}, and end its service"
 
 
 def _describe(
@@ -157,11 +174,16 @@ def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
                 target = os.readlink(descriptor)
             except OSError:
                 continue
-            if target.startswith("/dev/") and target not in seen:
+            if target.startswith(("/dev/", "socket:")) and target not in seen:
                 seen.add(target)
-                holder = Holder(int(process.name), read_attribute(process / "comm") or "?")
-                found.setdefault(target, []).append(holder)
+                found.setdefault(target, []).append(Holder(int(process.name), _name(process)))
     return found
+
+
+def _name(process: Path) -> str:
+    if "companion.daemon" in (read_attribute(process / "cmdline", limit=4096) or ""):
+        return COMPANION  # the kernel names it after its Python
+    return read_attribute(process / "comm") or "?"
 
 
 def _consoles(root: Path) -> set[str]:
@@ -224,9 +246,7 @@ def port_faults(
     faults = [*_console(device, found, holders, root)]
     for holder in holders:
         if not _GETTY.fullmatch(holder.name):
-            remedy = f"sudo kill {holder.pid}, and end the service that starts it"
-            remedy = _MODEM_REMEDY if holder.name == "ModemManager" else remedy
-            faults.append(PortFault(in_use(device, [holder]), remedy))
+            faults.append(PortFault(in_use(device, [holder]), how_to_free(holder)))
     if found is None:
         return faults
     if found.latency_timer_ms is not None and found.latency_timer_ms > SLOW_TIMER_MS:

@@ -137,6 +137,14 @@ def test_a_second_reader_is_named_unless_it_is_ours(board: CheckedBoard) -> None
     assert len(system_findings(config(), [], board.root)) == 2
 
 
+def test_a_running_companion_is_named_with_how_it_is_stopped(board: CheckedBoard) -> None:
+    words = ("-m", "companion.daemon", "/etc/companion/companion.toml")
+    board.process(900, "python3", *words, opened=("/dev/ttyUSB0",))
+    (finding,) = system_findings(config(), [], board.root)
+    assert finding.words.startswith("/dev/ttyUSB0: in use by another program (the companion, process 900): ")
+    assert finding.remedy == "sudo systemctl stop companion (without the service: kill 900)"
+
+
 def test_the_ftdi_timer_is_wrong_for_an_imu_and_a_remark_for_a_gradienter(board: CheckedBoard) -> None:
     board.timer("ttyUSB0", 16)
     (fault,) = port_faults(FTDI_ID, is_fast=True, root=board.root)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import socket
 from pathlib import Path
 
 import pytest
 
 from companion import cli, config
+from companion.errors import LinkError
 from companion.links.serial.listening import Heard
 from companion.protocols.guess import Heartbeat, Line
 from companion.setup import draft as drafting
-from companion.setup.survey import HeardUdp, Survey
+from companion.setup.survey import HeardUdp, Survey, listen_udp
 
 PX4, STATION = Heartbeat(1, 1, 2, 12), Heartbeat(255, 190, 6, 8)
 SILENT = Heard(None, None, None, 0)
@@ -45,6 +48,15 @@ def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
         f"serial:{alias}:57600",
     )
     assert [found.checked_url(url) for url in urls] == [False, True, False, False, True]
+
+
+async def test_whoever_has_a_udp_port_is_named_with_how_it_is_ended() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        held.bind(("127.0.0.1", 0))
+        port, ours = held.getsockname()[1], os.getpid()
+        reason = rf"^UDP {port}: in use by another program \(.+, process {ours}\): sudo kill {ours}, "
+        with pytest.raises(LinkError, match=reason):
+            await listen_udp(port)
 
 
 def _nobody() -> HeardUdp:
