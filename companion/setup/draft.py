@@ -162,7 +162,7 @@ class Draft:
         )
         if (gradienter := self.section("gradienter")) is not None:
             known = PROTOCOLS["gradienter"][gradienter["protocol"]].law
-            unknown = "Its data sheet tells; a wrong one costs milli-g. A test of a minute finds out: two tilts."
+            unknown = "Its data sheet tells; a wrong one costs milli-g. A test finds out: two tilts by 20 deg."
             guessed = LAW_KEY in self.guessed
             yield Question(
                 f"What do the gradienter's readings mean: axis, slope{', euler or test?' if guessed else ' or euler?'}",

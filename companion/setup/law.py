@@ -8,6 +8,7 @@ the laws differ by 1.2 deg (companion/physics/gradienter.py).
 from __future__ import annotations
 
 import itertools
+import re
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, get_args
@@ -22,12 +23,17 @@ from companion.physics.units import G
 STEADY_S: Final = 3  # Seconds without movement that make a tilt
 SPREAD_DEG: Final = 0.5  # Largest spread of the readings of these seconds
 LEAST_DEG: Final = 15.0  # Least size of both readings: below, the laws differ by less than 0.5 deg
+ENOUGH_DEG, ABOUT_DEG, MOST_DEG = 17, 20, 26
+"""Tilts to ask for, so that by every law both readings are above `LEAST_DEG` and within a range of 30 deg."""
+MOVED_DEG: Final = 5.0  # Change of a tilt that is worth a line
 _FITS_DEG: Final = 1.0  # Largest difference from the readings of the right law
 _CLEARLY_DEG: Final = 0.5  # Least advantage of the best law over the second best
+_BOTH: Final = f"both by about {ABOUT_DEG} deg ({ENOUGH_DEG} to {MOST_DEG}). Hold it still."
 STEPS: Final = (
-    "Tilt 1 of 2: lift the nose and lower the right side, both by 20 to 40 deg. Hold it still.",
-    "Tilt 2 of 2: now lower the nose and lift the right side, both by 20 to 40 deg. Hold it still.",
+    f"Tilt 1 of 2: lift the nose and lower the right side, {_BOTH}",
+    f"Tilt 1 is measured. Tilt 2 of 2: lower the nose and lift the right side, {_BOTH}",
 )
+SIDES: Final = (("Nose up", "right side down"), ("Nose down", "right side up"))
 
 
 class Tilt(NamedTuple):
@@ -38,11 +44,12 @@ class Tilt(NamedTuple):
 
 
 class TiltTest:
-    """Collects two opposite tilts from one-second means."""
+    """Collects two opposite tilts from one-second means, and tells the operator how far each angle is."""
 
     def __init__(self, say: Callable[[str], object]) -> None:
         self.tilts: list[Tilt] = []
         self._recent: deque[tuple[int, Tilt]] = deque(maxlen=STEADY_S)
+        self._key, self._said_deg = "", np.zeros(2)
         self._say = say
         say(STEPS[0])
 
@@ -51,18 +58,41 @@ class TiltTest:
         return len(self.tilts) == len(STEPS)
 
     def add(self, second: int, tilt: Tilt) -> None:
+        """Add the means of one second; a gradienter beyond its range has the readings NaN."""
         if self.complete or (self._recent and second <= self._recent[-1][0]):
             return
         self._recent.append((second, tilt))
-        readings = np.array([each.readings_deg for _, each in self._recent])
-        mean = readings.mean(axis=0)
-        if len(readings) < STEADY_S or np.ptp(readings, axis=0).max() > SPREAD_DEG or np.abs(mean).min() < LEAST_DEG:
+        readings, forces = (np.array(each) for each in zip(*(each for _, each in self._recent), strict=True))
+        angles_deg = readings_from_up("euler", tilt.force_m_s2)[::-1] * (-1.0 if self.tilts else 1.0)
+        spread_deg = np.ptp(readings, axis=0).max()
+        is_enough = angles_deg.min() >= LEAST_DEG and np.abs(readings).min() >= LEAST_DEG
+        if not (is_enough and spread_deg <= SPREAD_DEG) or len(readings) < STEADY_S:
+            self._guide(angles_deg, spread_deg, reads=not np.isnan(tilt.readings_deg).any())
             return
-        if self.tilts and (np.sign(mean) == np.sign(self.tilts[0].readings_deg)).any():
-            return
-        self.tilts.append(Tilt(mean, np.mean([each.force_m_s2 for _, each in self._recent], axis=0)))
-        if not self.complete:
-            self._say(STEPS[len(self.tilts)])
+        self.tilts.append(Tilt(readings.mean(axis=0), forces.mean(axis=0)))
+        self._say((*STEPS, "Tilt 2 is measured.")[len(self.tilts)])
+
+    def _guide(self, angles_deg: Floats, spread_deg: float, *, reads: bool) -> None:
+        """Say how far the aircraft is tilted, and what is wanted, if that has changed.
+
+        `angles_deg` (2,): pitch and roll, positive towards the tilt that is wanted now.
+        """
+        most_deg = MOST_DEG if reads else ENOUGH_DEG + 1
+
+        def advice(by_deg: float) -> str:
+            if ENOUGH_DEG <= by_deg <= most_deg:
+                return "good"
+            return f"{abs(min(ABOUT_DEG, most_deg) - by_deg):.0f} deg {'back' if by_deg > most_deg else 'more'}"
+
+        pairs = zip(SIDES[len(self.tilts)], angles_deg.round() + 0.0, strict=True)
+        words = "; ".join(f"{side} {angle:.0f} deg: {advice(angle)}" for side, angle in pairs)
+        words += "." if reads else ". The gradienter gives no reading: over its range?"
+        if spread_deg > SPREAD_DEG and words.count("good") == len(angles_deg):
+            words += " It moves: hold it still."
+        key = re.sub(r"[-\d]+", "", words)
+        if key != self._key or np.abs(angles_deg - self._said_deg).max() > MOVED_DEG:
+            self._key, self._said_deg = key, angles_deg
+            self._say(f"  {words}")
 
 
 def law_of(tilts: Sequence[Tilt]) -> tuple[Law, int]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 import msgspec
+import numpy as np
 
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.config.sections import UNKNOWN, Config, Imu
@@ -37,6 +38,7 @@ HEARTBEAT_WITHIN_S: Final = 4.0
 IMUS_MOST_S: Final = 30.0
 """Longest wait until an autopilot's IMUs are known: enough for all retries on a slow line that loses packets."""
 TRIED_BYTES: Final = 2**20  # Size of the file by which the check tries the storage
+GONE_S: Final = 3  # Without a reading of the gradienter for so long, the guided test asks to tilt back
 TILTS_WITHIN_S: Final = 120.0  # Longest wait for the two tilts of the gradienter's test
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
@@ -226,8 +228,11 @@ async def find_law(config: Config, say: Callable[[str], object]) -> tuple[Law, i
         tilt, imus = collector.tilt_second(), collector.imu_seconds()
         # Only the autopilot's samples are in the vehicle's axes, whatever the mountings.
         seconds = [imus[imu.name] for imu in config.imu if imu.source == "autopilot" and imu.name in imus]
-        if tilt is not None and seconds and seconds[0].slot == tilt.slot:
-            test.add(tilt.slot, Tilt(tilt.mean[:2], seconds[0].mean[3:]))
+        if tilt is not None and seconds:
+            late_s = seconds[0].slot - tilt.slot
+            readings_deg = tilt.mean[:2] if late_s == 0 else np.full(2, np.nan)
+            if late_s == 0 or late_s >= GONE_S:
+                test.add(seconds[0].slot, Tilt(readings_deg, seconds[0].mean[3:]))
         return not test.complete and listened_s < TILTS_WITHIN_S
 
     await service.listen(goes_on)
