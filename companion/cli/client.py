@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
+import os
 import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -72,27 +74,28 @@ def add_commands(top: CommandGroup, autopilot: CommandGroup, log: CommandGroup) 
         add_fields(sub, commands.Align, commands.Interface.COMMAND_LINE, fields)
 
 
-class _Progress:
-    """Progress on stderr: on a terminal the last line counts in place; elsewhere a line is printed per step or 10 %."""
+class Progress:
+    """Progress on stderr: on a terminal the last text counts in place; elsewhere a line is printed per step or 10 %."""
 
     def __init__(self) -> None:
-        self._in_place = sys.stderr.isatty()
-        self._line, self._step = "", ""
+        self._in_place = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+        self._rows: list[str] = []
+        self._step = ""
 
     def show(self, percent: int, words: str) -> None:
-        line = f"[{percent:3d} %] {words}"
+        rows = [f"[{percent:3d} %] {words}"]
         step = FIGURES.sub("", words) + ("" if self._in_place else f" {percent // 10}")
-        if self._in_place and line != self._line:
-            width = shutil.get_terminal_size().columns - 1
-            start = "\r" if step == self._step else "\n" if self._line else ""
-            sys.stderr.write(start)
-            print_lines(line[:width].ljust(len(self._line[:width])), end="", error=True)
+        if self._in_place and (rows := textwrap.wrap(rows[0], shutil.get_terminal_size().columns - 1)) != self._rows:
+            up = f"\x1b[{len(self._rows) - 1}A" if len(self._rows) > 1 else ""
+            sys.stderr.write(f"\r{up}\x1b[J" if step == self._step else "\n" if self._rows else "")
+            print_lines(*rows[:-1], error=True)
+            print_lines(rows[-1], end="", error=True)
         elif step != self._step:
-            print_lines(line, error=True)
-        self._line, self._step = line, step
+            print_lines(*rows, error=True)
+        self._rows, self._step = rows, step
 
     def close(self) -> None:
-        if self._in_place and self._line:
+        if self._in_place and self._rows:
             print_lines("", error=True)
 
 
@@ -105,7 +108,7 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
         DaemonRefusedError: the daemon refuses the request.
     """
     reply: Object = {}
-    progress = _Progress()
+    progress = Progress()
     ends = "Ctrl-C ends the waiting alone" if at_interrupt is None else "Ctrl-C cancels"
     waiting = f"waiting for the daemon's answer; {ends}"
     silent = asyncio.get_running_loop().call_later(SILENT_S, lambda: print_lines(waiting, error=True))
