@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import os
 import sys
 from collections.abc import AsyncGenerator
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from companion.cli.terminal import print_address, print_lines
 from companion.errors import CalibrationRefusedError, CompanionError, ConfigError
@@ -33,17 +34,17 @@ class Interview:
     def say(self, *lines: str) -> None:
         print_lines(*lines, error=self._error)
 
-    async def ask(self, question: Question) -> None:
-        """Ask a question until its answer is valid; an empty answer means the present one.
+    async def ask(self, question: Question) -> Any:
+        """Ask a question until its answer is valid, return what `put` returns; an empty answer is the present one.
 
         Raises:
             CompanionError: stdin has ended; or no questions are asked and the present answer is not valid.
         """
         now = question.now
         if self.yes:
-            question.put(now)
+            found = question.put(now)
             self.say(f"{question.words.rstrip('?')}: {now}")
-            return
+            return found
         self.say("", question.words, *([f"  {question.hint}"] if question.hint else []))
         while True:
             self._prompt(now)
@@ -54,24 +55,17 @@ class Interview:
                 self.say(f"  {question.more or question.hint or 'docs/guide.md explains every step.'}")
                 continue
             try:
-                question.put(answer)
+                return question.put(answer)
             except ConfigError as error:
                 self.say(f"  {error}")
-            else:
-                return
 
     def _prompt(self, now: str) -> None:
         print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
 
     async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
-        found = by_default
-
-        def put(words: str) -> None:
-            nonlocal found
-            found = one_of(words, ("yes", "no")) == "yes"
-
-        await self.ask(Question(question, "yes" if by_default else "no", put, hint, ("yes", "no")))
-        return found
+        choices = ("yes", "no")
+        put = functools.partial(one_of, allowed=choices)
+        return bool(await self.ask(Question(question, choices[not by_default], put, hint, choices)) == "yes")
 
     async def _line(self) -> str:
         """Read a line from stdin; unlike Python's `input`, stop waiting at Ctrl-C at once."""
@@ -88,14 +82,12 @@ class Interview:
 async def _read(descriptor: int) -> bytes:
     loop = asyncio.get_running_loop()
     ready = asyncio.Event()
-    try:
+    with contextlib.suppress(PermissionError):  # a regular file is always ready
         loop.add_reader(descriptor, ready.set)
-    except PermissionError:
-        return os.read(descriptor, _MOST_BYTES)  # a regular file is always ready
-    try:
-        await ready.wait()
-    finally:
-        loop.remove_reader(descriptor)
+        try:
+            await ready.wait()
+        finally:
+            loop.remove_reader(descriptor)
     return os.read(descriptor, _MOST_BYTES)
 
 
@@ -111,6 +103,7 @@ class PageInterview(Interview):
         self._question: Object | None = None
         self._answered: asyncio.Future[str] | None = None
         self._number = 0
+        self._end: Object | None = None  # Last headline, which browsers show after the page has closed
         self._page = Page(bind, storage, self._answer)
 
     async def __aenter__(self) -> Self:
@@ -129,10 +122,16 @@ class PageInterview(Interview):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if error is not None:
+            self._end = {"word": "SET-UP ENDED", "reason": str(error), "tone": "bad"}
         if kind is None or issubclass(kind, CompanionError):
-            self.say("", f"ended: {error}" if error is not None else "All is done.")
             await asyncio.sleep(SHOWN_S)
         await self._close()
+
+    async def finish(self, then: str) -> None:
+        """Wait until the operator has read the page; it keeps showing the next action `then` after it has closed."""
+        await self.agrees("Read all of it? Then this page closes.", hint=then)
+        self._end = {"word": "SET-UP DONE", "reason": then, "tone": "good"}
 
     async def _close(self) -> None:
         self._serving.cancel()
@@ -146,11 +145,10 @@ class PageInterview(Interview):
         super().say(*lines)
         self._lines += lines
 
-    async def ask(self, question: Question) -> None:
-        shown = ("words", "hint", "now", "choices", "more")
-        self._question = {key: getattr(question, key) for key in shown}
+    async def ask(self, question: Question) -> Any:
+        self._question = {key: getattr(question, key) for key in ("words", "hint", "now", "choices", "more")}
         try:
-            await super().ask(question)
+            return await super().ask(question)
         finally:
             self._question = None
 
@@ -177,9 +175,9 @@ class PageInterview(Interview):
 
     def _status(self) -> Object:
         question = None if self._question is None else {**self._question, "number": self._number}
+        headline: Object = {"word": "YOUR ANSWER", "reason": "", "tone": "wait"}
         if question is None:
             latest = next((line for line in reversed(self._lines) if line.strip()), "")
-            headline = {"word": "SETTING UP", "reason": latest.strip(), "tone": "busy"}
-        else:
-            headline = {"word": "YOUR ANSWER", "reason": "", "tone": "wait"}
-        return {"headline": headline, "setup": {"lines": self._lines, "question": question}}
+            headline = self._end or {"word": "SETTING UP", "reason": latest.strip(), "tone": "busy"}
+        ended = self._end is not None
+        return {"headline": headline, "setup": {"lines": self._lines, "question": question, "ended": ended}}

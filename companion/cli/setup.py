@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import functools
 import logging
 import math
 import os
@@ -52,8 +53,7 @@ async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
         async with PageInterview(_bind(options), _storage(options)) as asking:
             session = _Session(options, asking, goes_on=goes_on)
             await session.run()
-            then = "the companion starts, and its own page follows" if goes_on else "this page closes"
-            await asking.agrees(f"Read all of it? Then {then}.")
+            await asking.finish(session.then)
     if options.json:
         print_json(session.answer)
     return DONE if session.answer["state"] != "failed" else FAILED
@@ -78,6 +78,7 @@ def _storage(options: argparse.Namespace) -> Path:
 class _Session:
     def __init__(self, options: argparse.Namespace, asking: Interview, *, goes_on: bool = False) -> None:
         self.asking, self._goes_on = asking, goes_on
+        self.then = ""  # Next action after the page has closed
         self._so_far = "nothing was written"
         self._measured: set[str] = set()  # Keys that the guided test has answered
         self._options = options
@@ -218,16 +219,15 @@ class _Session:
 
     async def _ask_for_autopilot(self, draft: Draft) -> bool:
         """Ask where the autopilot is; return False for a further search."""
-        again = False
 
-        def put(words: str) -> None:
-            nonlocal again
-            if not (again := words.strip().lower() in ("", SEARCH)):
+        def put(words: str) -> bool:
+            if is_found := words.strip().lower() not in ("", SEARCH):
                 draft.take_url(words)
+            return is_found
 
         self.asking.say("No autopilot was heard. Has it power? Is its port set to MAVLink 2? TX to RX, RX to TX?")
-        await self.asking.ask(Question("Where is the autopilot?", SEARCH, put, PLACES, (SEARCH, *USUAL_URLS), PLACES))
-        return not again
+        places = (SEARCH, *USUAL_URLS)
+        return bool(await self.asking.ask(Question("Where is the autopilot?", SEARCH, put, PLACES, places, PLACES)))
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
         """Choose one of the detected devices of a kind; keep the configured one if its port is in use."""
@@ -258,17 +258,9 @@ class _Session:
             self.asking.say(f"{what}: {names[0]}")
             return names[0]
         self.asking.say(*(f"  {number}. {name}" for number, name in enumerate(names, 1)))
-        chosen = names[0]
-
-        def put(words: str) -> None:
-            nonlocal chosen
-            if not words.isdigit() or not 1 <= int(words) <= len(names):
-                raise ConfigError(f"found {shown(words)}; allowed: 1 to {len(names)}")
-            chosen = names[int(words) - 1]
-
         numbers = [str(number) for number in range(1, len(names) + 1)]
-        await self.asking.ask(Question(f"{what}: which?", "1", put, choices=numbers))
-        return chosen
+        put = functools.partial(one_of, allowed=numbers)
+        return names[int(await self.asking.ask(Question(f"{what}: which?", "1", put, choices=numbers))) - 1]
 
     async def _ask(self, draft: Draft, questions: Iterator[Question], given: dict[str, str]) -> None:
         left = dict(given)
@@ -295,19 +287,15 @@ class _Session:
 
     async def _ask_one(self, draft: Draft, question: Question) -> None:
         """Ask a question; for the law of the gradienter's readings, offer the guided test too."""
-        while True:
-            tests = False
 
-            def put(words: str, question: Question = question) -> None:
-                nonlocal tests
-                # With no answer, and with a wrong one, name "test" among the allowed ones.
-                tests = question.key == LAW_KEY and one_of(words, question.choices) == "test"
-                if not tests:
-                    question.put(words)
+        def put(words: str) -> bool:
+            # With no answer, and with a wrong one, name "test" among the allowed ones.
+            is_test = question.key == LAW_KEY and one_of(words, question.choices) == "test"
+            if not is_test:
+                question.put(words)
+            return is_test
 
-            await self.asking.ask(dataclasses.replace(question, put=put))
-            if not tests:
-                return
+        while await self.asking.ask(dataclasses.replace(question, put=put)):
             from companion.daemon.process.check import find_law  # takes seconds on a small board
 
             try:
@@ -340,6 +328,14 @@ class _Session:
         command, runs = own_name(self._options), runs or started
         steps = [*next_steps(parsed, command, is_old=is_old, runs=runs, good=good, checks=checks)]
         self.answer["next"] = steps
+        if parsed.web is not None and self._options.page is not None:
+            from companion.web.access import page_url, split_address
+
+            page = f"open {page_url(*split_address(parsed.web.bind))}"
+            if parsed.web.bind == self._options.page:
+                page = "this page shows the companion"
+            first = f", on the board: {steps[0].partition('   ')[0]}. Then"
+            self.then = f"Next{':' if runs and good and not is_old else first} {page}."
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
 
     async def _check(self, parsed: Config) -> bool:

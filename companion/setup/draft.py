@@ -48,8 +48,8 @@ class Question:
 
     words: str
     now: str  # Present answer
-    put: Callable[[str], None]
-    """Function that stores the operator's answer in the draft; it raises ConfigError for a wrong answer."""
+    put: Callable[[str], Any]
+    """Function that stores the operator's answer in the draft, or returns it; it raises ConfigError for a wrong one."""
     hint: str = ""
     choices: Sequence[str] = ()  # Answers that a page shows as buttons
     more: str = ""  # Answer to "?" and "help"
@@ -251,7 +251,8 @@ def storage_beside(path: Path) -> Path:
 
 
 def one_of(words: str, allowed: Sequence[str]) -> str:
-    found = [choice for choice in allowed if words and choice.startswith(words.strip().lower())]
+    word = words.strip().lower()
+    found = [word] if word in allowed else [choice for choice in allowed if word and choice.startswith(word)]
     if len(found) != 1:
         raise ConfigError(f"found {shown(words)}; allowed: {', '.join(allowed)}")
     return found[0]

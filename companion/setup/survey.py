@@ -21,8 +21,6 @@ AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 11
 """Baud rates to try first on a serial port: ArduPilot's default, PX4's for TELEM 2, and one that owners often set."""
 Believed = Mapping[str, Line]
 """Line settings of the configured ports, tried first: a USB device without a UART can be read at any baud rate."""
-
-
 USUAL_PORTS: Final = (14540, 14550, 14551)
 """Usual UDP ports: PX4's for companion computers, that of ground stations, and the second one of MAVLink routers."""
 LISTEN_S: Final = 3.0

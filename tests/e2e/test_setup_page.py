@@ -63,8 +63,14 @@ async def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> N
         await press("yes")
         await asks("Read all of it?")
         assert "Next:" in await tab.value("$('told').textContent")
+        then = f"Next, on the board: companion -c {made.file} run. Then this page shows the companion."
+        assert await tab.value("$('hint').textContent") == then
         await press("yes")
         assert await terminal.ended() == 0, terminal.screen
+        # Its page is gone, and a browser still shows what comes next.
+        await tab.until("Date.now() - heardAt > 2 * GONE_MS")
+        shown = await tab.value("[$('word').textContent.trim(), $('reason').textContent, document.body.className]")
+        assert shown == ["SET-UP DONE", then, "setup"]
         found = made.configuration()
         assert (found["gradienter"]["law"], found["gradienter"]["mounting"]) == ("euler", "ROTATION_YAW_180")
         assert found["imu"] == [{"name": "fc", "source": "autopilot", "profile": "icm42688p"}]

@@ -308,7 +308,8 @@ function watch() {
   // Browsers stop a page that nobody sees: that silence tells nothing about the companion.
   if (asleep) { awakeAt = now; listen(); }
   const silent = now - Math.max(heardAt, awakeAt);
-  if (silent < GONE_MS) headline("gone", "RECONNECTING", "this page was asleep");
+  if (ended) { /* the set-up's page has closed: its last headline stays */ }
+  else if (silent < GONE_MS) headline("gone", "RECONNECTING", "this page was asleep");
   else headline("gone", "NO LINK", refused || (heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
     : "no word from the companion yet"));
   $("progress").hidden = true;

@@ -1,10 +1,11 @@
 "use strict";
 // First-run set-up: shows the texts and questions of `companion setup`, and sends the answers back.
-let asked = 0;
+let asked = 0, ended = false;
 
 function firstRun(found) {
   document.body.classList.toggle("setup", found !== null);
   $("setup").hidden = found === null;
+  ended = found !== null && found.ended;
   if (found === null) return;
   $("vehicle").textContent = "companion setup";
   const told = found.lines.join("\n").trim();
