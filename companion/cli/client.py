@@ -83,9 +83,10 @@ class Progress:
         self._step = ""
 
     def show(self, percent: int, words: str) -> None:
-        rows = [f"[{percent:3d} %] {words}"]
+        line = f"[{percent:3d} %] {words}"
+        rows = textwrap.wrap(line, max(shutil.get_terminal_size().columns - 1, 20)) if self._in_place else [line]
         step = FIGURES.sub("", words) + ("" if self._in_place else f" {percent // 10}")
-        if self._in_place and (rows := textwrap.wrap(rows[0], shutil.get_terminal_size().columns - 1)) != self._rows:
+        if self._in_place and rows != self._rows:
             up = f"\x1b[{len(self._rows) - 1}A" if len(self._rows) > 1 else ""
             sys.stderr.write(f"\r{up}\x1b[J" if step == self._step else "\n" if self._rows else "")
             print_lines(*rows[:-1], error=True)

@@ -73,10 +73,7 @@ class TiltTest:
         self._say((*STEPS, "Tilt 2 is measured.")[len(self.tilts)])
 
     def _guide(self, angles_deg: Floats, spread_deg: float, *, reads: bool) -> None:
-        """Say how far the aircraft is tilted, and what is wanted, if that has changed.
-
-        `angles_deg` (2,): pitch and roll, positive towards the tilt that is wanted now.
-        """
+        """Say pitch and roll (2,), positive towards the wanted tilt, and what each still wants, if that has changed."""
         most_deg = MOST_DEG if reads else ENOUGH_DEG + 1
 
         def advice(by_deg: float) -> str:

@@ -19,7 +19,9 @@ import pytest
 
 from companion import cli, config
 from companion.installation import install as installing
+from sim.aircraft import VirtualAircraft
 from sim.firmware.double import AutopilotDouble
+from sim.hands import AHEAD_S, Hands
 from sim.pty_device import PtyDevice, Setting, heard, reader_setting
 from sim.scenario import demo
 from sim.station import open_udp
@@ -45,10 +47,11 @@ UNKNOWN_PARTS = {f"INS_{half}{number}_ID": 0x3A0002 for half in ("GYR", "ACC") f
 class SetupBench:
     """Simulated devices on ports below a folder, an autopilot, and how to call the command."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, aircraft: VirtualAircraft | None = None) -> None:
         self.folder, self.file, self.udp = folder, folder / "companion.toml", free_udp()
         self.told: list[bytes] = []
         """Everything sent to the autopilot."""
+        self.aircraft = aircraft
 
     def words(self, *ports: str, silent: int = 0) -> list[str]:
         """Arguments: these ports, and the autopilot's UDP port or one where nobody is."""
@@ -73,7 +76,8 @@ async def bench(
     answers_after_s: float = 0.0,
 ) -> AsyncIterator[SetupBench]:
     """The demonstration's aircraft: devices as from the factory, the autopilot on UDP or on a serial port."""
-    made, scenario = SetupBench(folder), demo(firmware=firmware)
+    scenario = demo(firmware=firmware)
+    made = SetupBench(folder, scenario.aircraft)
     loop = asyncio.get_running_loop()
     scenario.aircraft.begin(loop.time())
     autopilot, receive = scenario.autopilot, scenario.autopilot.receive
@@ -300,6 +304,26 @@ async def test_a_law_that_nothing_tells_is_not_guessed(tmp_path: Path) -> None:
         await terminal.answer("", "boat")
         await terminal.answer("axis, slope, euler or test")
         await terminal.says("found ''; allowed: axis, slope, euler, test")
+
+
+async def test_two_tilts_tell_the_law_and_a_tilt_beyond_the_range_is_led_back(tmp_path: Path) -> None:
+    async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
+        assert made.aircraft is not None
+        aircraft, hands, loop = made.aircraft, Hands(made.aircraft, takes_s=2.0), asyncio.get_running_loop()
+
+        def hold(pitch_deg: float, roll_deg: float) -> None:
+            hands.hold(aircraft.time_at(loop.time()) + AHEAD_S, pitch_deg, roll_deg)
+
+        await terminal.answer("on the ground")
+        await terminal.answer("axis, slope, euler or test", "test")
+        await terminal.says("Nose up 5 deg: 15 deg more; right side down -3 deg: 23 deg more")
+        hold(33.0, 26.0)
+        await terminal.says("Nose up 33 deg: 15 deg back; .* The gradienter gives no reading: over its range")
+        hold(18.0, 18.0)
+        await terminal.says("Tilt 1 is measured")
+        hold(-20.0, -20.0)
+        await terminal.says("Tilt 2 is measured")
+        await terminal.says("The gradienter reads axis, and is turned by 0 deg")
 
 
 @pytest.mark.parametrize("works", [True, False])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from companion import cli, config
-from companion.errors import LinkError
+from companion.errors import ConfigError, LinkError
 from companion.links.serial.listening import Heard
 from companion.protocols.guess import Heartbeat, Line
 from companion.setup import draft as drafting
@@ -96,3 +96,11 @@ def test_where_nothing_can_be_written_that_is_said_first(
     assert (
         capsys.readouterr().err == f"{missing}: no such file: companion setup makes it (or give another with -c FILE)\n"
     )
+
+
+def test_a_whole_answer_wins_over_a_longer_choice() -> None:
+    numbers = [str(number) for number in range(1, 13)]
+    assert (drafting.one_of("1", numbers), drafting.one_of(" 12 ", numbers)) == ("1", "12")
+    for wrong in ("", " ", "13"):
+        with pytest.raises(ConfigError, match="allowed: 1, 2, "):
+            drafting.one_of(wrong, numbers)
