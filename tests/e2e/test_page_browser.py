@@ -188,7 +188,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'center'}})")
             await tab.touch(button)
             await tab.until("$('standing').textContent === 'TURN: 1 of 5' && $('wish').textContent")
-            assert await tab.value("$('writes').textContent") == "will not be written: WRITE is not ticked"
+            assert await tab.value("$('writes').textContent") == "will be written to the autopilot"
             await tab.lift()
             assert await tab.value("document.querySelectorAll('#how .nose').length") == 4
             await tab.value("scrollTo(0, 0)")

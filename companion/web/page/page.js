@@ -376,7 +376,6 @@ for (const button of document.querySelectorAll("button.hold")) {
       if (navigator.vibrate) navigator.vibrate(80);
       const body = JSON.parse(button.dataset.body || "{}");
       if ($("write").checked && ["faces", "turn", "compass"].includes(body.action) && !body.level) body.write = true;
-      if (body.write) $("write").checked = false;  // the next one is not written by accident
       act(name + (body.write ? " with WRITE" : ""), path, body);
     }, HOLD_MS);
   };
