@@ -31,7 +31,7 @@ HANDS: Final = (
     "turn DEG: clockwise on its spot; tilt PITCH ROLL: nose up and right side down against its spot (tilt 20 0); hold"
     " PITCH ROLL: against the horizon (hold 0 180: on its back; hold 45 0: between level and nose up); spot PITCH"
     " ROLL: onto another spot, which slopes so; back: onto its spot; bump PITCH ROLL: the spot tips; grip SECONDS: a"
-    " hand stays on it; wait SECONDS: before the next line"
+    " hand stays on it; wait SECONDS: before the next line; truth: pose, and biases of the last minute"
 )
 """Typed lines, each with its meaning."""
 SIDES: Final = {
@@ -186,8 +186,13 @@ def _up(pitch_deg: float, roll_deg: float) -> Array:
     return -body_from_ned(math.radians(roll_deg), math.radians(pitch_deg), 0.0)[:, 2]
 
 
-async def take_lines(hands: Hands, aircraft: VirtualAircraft, say: Callable[[str], None]) -> None:
-    """Read lines from standard input, a terminal or a script, and obey each, until the input ends."""
+async def take_lines(
+    hands: Hands, aircraft: VirtualAircraft, say: Callable[[str], None], truth: Callable[[float], str]
+) -> None:
+    """Read lines from standard input, a terminal or a script, and obey each, until the input ends.
+
+    `truth` describes the true pose and biases at an aircraft time.
+    """
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader()
     mode = os.fstat(sys.stdin.fileno()).st_mode
@@ -200,5 +205,7 @@ async def take_lines(hands: Hands, aircraft: VirtualAircraft, say: Callable[[str
         words = line.decode(errors="replace")
         if (waiting := re.fullmatch(r"\s*wait\s+([0-9.]+)\s*", words)) is not None:
             await asyncio.sleep(float(waiting[1]))
+        elif words.strip() == "truth":
+            say(truth(aircraft.time_at(loop.time())))
         elif words.strip():
             say(hands.obey(words, aircraft.time_at(loop.time()) + AHEAD_S))

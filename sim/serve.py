@@ -38,6 +38,8 @@ from sim.station import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
 FLAT_POSE = Pose(0.6, -0.4, 40.0)  # On a steeper spot the gradienter's zero is less exact: `align zero` warns
+TRUTH_S = 60.0
+"""Duration over which `describe` averages biases: the longest measurement of a calibration."""
 _PROFILES = {"white_only": "icm42688p", "perfect": "icm42688p"}
 """Noise profiles to tell the companion for sensor types that only the simulator has."""
 FIRMWARE_COMMANDS = {
@@ -212,20 +214,21 @@ def _device_lines(scenario: Scenario, directory: Path, role: str) -> list[str]:
     return lines
 
 
-def describe(scenario: Scenario, *, devices: bool, autopilot: bool) -> str:
-    """Describe the truth in a few lines: the result that a calibration should find."""
-    pose = scenario.aircraft.pose
+def describe(scenario: Scenario, *, devices: bool, autopilot: bool, t_s: float = 0.0) -> str:
+    """Describe the truth in a few lines: pose at aircraft time `t_s`, biases averaged over the minute before."""
+    pose = scenario.aircraft.pose_at(t_s) if t_s else scenario.aircraft.pose
+    when = f"of the last minute, at {t_s:.0f} s" if t_s else "at the start"
     angles = f"pitch {pose.pitch_deg:g}, roll {pose.roll_deg:g}, heading {pose.heading_deg:g} deg"
-    lines = [f"# The truth at the start: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
+    lines = [f"# The truth {when}: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
     models: list[tuple[str, ImuModel]] = []
     if autopilot:
         models += [(f"autopilot IMU {n}", model) for n, model in enumerate(scenario.flight_controller_imus, 1)]
     if devices:
         models.append(("serial IMU", scenario.serial_imu))
     for name, model in models:
-        gyro, accel = model.true_bias_in_vehicle(0.0)
-        rates = ", ".join(f"{value / DEG_H:.1f}" for value in gyro)
-        forces = ", ".join(f"{value / MG:.3f}" for value in accel)
+        gyro, accel = model.mean_bias(max(t_s - TRUTH_S, 0.0), t_s)
+        rates = ", ".join(f"{value / DEG_H:.1f}" for value in model.mounting @ gyro)
+        forces = ", ".join(f"{value / MG:.3f}" for value in model.mounting @ accel)
         lines.append(f"# {name} ({model.spec.name}): gyro bias {rates} deg/h; accelerometer bias {forces} mg")
     return "\n".join(lines) + "\n"
 
@@ -259,7 +262,13 @@ async def serve(
             station = await open_udp(scenario.autopilot.ground, target=ground)
             stack.callback(station.close)
         if hands is not None:
-            told = take_lines(hands, scenario.aircraft, lambda words: print(f"# {words}", flush=True))
+
+            def truth(t_s: float) -> str:
+                autopilot = udp is not None or beside is not None
+                text = describe(scenario, devices=directory is not None, autopilot=autopilot, t_s=t_s)
+                return text.removeprefix("# ").rstrip()
+
+            told = take_lines(hands, scenario.aircraft, lambda words: print(f"# {words}", flush=True), truth)
             running.append(asyncio.create_task(told, name="hands"))
         if beside is not None:
             running.append(asyncio.create_task(beside, name="beside"))
@@ -341,6 +350,7 @@ async def run_until_stopped(
         await started.wait()
         print("# Ready. Save these lines as companion.toml and run: companion -c companion.toml run")
         print("# Ctrl-C ends the simulation.")
+        print("# Gyro biases wander by some 10 deg/h in minutes: with --hands, the line `truth` shows them.")
         print(text(), flush=True)
 
     announcing = asyncio.create_task(announce())
