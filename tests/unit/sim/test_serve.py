@@ -162,7 +162,7 @@ def test_an_autopilot_that_was_given_a_passphrase_speaks_and_listens_to_who_has_
     assert hashlib.sha256(key + data[:-6]).digest()[:6] == data[-6:]
 
 
-@pytest.mark.parametrize("typed", ["", "turn 90\nleap\n"])
+@pytest.mark.parametrize("typed", ["", "turn 90\nleap\ntruth\n"])
 async def test_hands_read_a_file_or_the_null_device_to_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: str
 ) -> None:
@@ -171,5 +171,5 @@ async def test_hands_read_a_file_or_the_null_device_to_its_end(
     aircraft, said = demo().aircraft, list[str]()
     with file.open(encoding="utf-8") as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
-        await take_lines(Hands(aircraft), aircraft, said.append)
-    assert [words.split(maxsplit=1)[0] for words in said] == (["moving", "found"] if typed else [])
+        await take_lines(Hands(aircraft), aircraft, said.append, "pose at {:.0f}".format)
+    assert [words.split(maxsplit=1)[0] for words in said] == (["moving", "found", "pose"] if typed else [])
