@@ -104,7 +104,9 @@ def test_it_says_how_to_connect_and_ctrl_c_ends_firmware_and_devices(tmp_path: P
     assert 'url = "udpin:127.0.0.1:14999"' in said
     assert "# Ground station: listen on UDP 127.0.0.1:14998" in said
     assert "gyro bias 1.0, 2.0, 3.0 deg/h" in said
-    assert re.search(r"^# The truth of the last minute, at \d+ s: pitch 0.6, roll -0.4, heading 40 deg", said, re.MULTILINE)
+    assert re.search(
+        r"^# The truth of the last minute, at \d+ s: pitch 0.6, roll -0.4, heading 40 deg", said, re.MULTILINE
+    )
     process = int(said.partition("# Firmware: process ")[2].partition(",")[0])
     assert (folder / "gradienter").is_symlink()
     arguments = (folder / "firmware" / "firmware.log").read_text()
