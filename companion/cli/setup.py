@@ -390,10 +390,10 @@ def next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: 
         sigma_deg = parsed.gradienter.sigma_deg or tilt_sigma_deg(parsed.gradienter.protocol)
         until = f"until then accelerometers to {math.radians(sigma_deg) * 1e3:.1f} mg"
         yield f"{command} align zero   (once: the gradienter's zero; {until})"
-    yield f"{command} calibrate   (disarmed, standing still, hands off)"
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
-        yield f"{command} align faces --write   (once: accelerometers too, in about 11 poses, held by hand, 5 min)"
+        yield f"{command} align faces --write   (once: accelerometers, in about 11 poses, held by hand, 5 min)"
+    yield f"{command} calibrate   (disarmed, standing still, hands off)"
 
 
 def _zero_is_known(parsed: Config) -> bool:

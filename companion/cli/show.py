@@ -279,7 +279,7 @@ def _flown(flight: Flight) -> str:
 def by_hand_words(done: Object) -> str:
     words = f"{done['what']}{' failed' if done['state'] == 'failed' else ''}: {done['reason']}"
     if not (number := len(done["written"])):
-        return words
+        return f"{words}; forgotten {_minute(done['undone_at'])}" if done["undone_at"] else words
     if done["undone_at"]:
         return f"{words}; {number} parameters written, undone {_minute(done['undone_at'])}"
     in_force = {True: ", active", False: ", changed by another writer since", None: ""}[done["in_force"]]

@@ -163,13 +163,12 @@ class Draft:
         if (gradienter := self.section("gradienter")) is not None:
             known = PROTOCOLS["gradienter"][gradienter["protocol"]].law
             unknown = "Its data sheet tells; a wrong one costs milli-g. A test finds out: two tilts by 20 deg."
-            guessed = LAW_KEY in self.guessed
             yield Question(
-                f"What do the gradienter's readings mean: axis, slope{', euler or test?' if guessed else ' or euler?'}",
-                "" if guessed else gradienter["law"],
+                "What do the gradienter's readings mean: axis, slope, euler or test?",
+                "" if LAW_KEY in self.guessed else gradienter["law"],
                 self.put_law,
                 f"Its documents say {known}." if known else unknown,
-                (*get_args(Law), *(["test"] if guessed else [])),
+                (*get_args(Law), "test"),
                 more=_LAWS,
                 key=LAW_KEY,
             )

@@ -157,6 +157,20 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
     run_virtual(again({}, None, forget=True))
 
 
+async def test_a_mounting_that_contradicts_the_turn_is_not_trusted(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    made.config = replaced(made.config, gradienter={"mounting": "ROTATION_YAW_90"})
+    async with made.running():
+        await made.ready()
+        result = await aligned(made, hands)
+        assert result.outcome == "failed"
+        assert "gradienter not trusted" in made.service.status()["warnings"][0]
+        await calibrated(made)
+        headline = made.service.status()["headline"]
+        assert headline["tone"] != "good"
+        assert headline["reason"].startswith("gradienter not trusted")
+
+
 async def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
     made, _ = rig(tmp_path)
 

@@ -143,6 +143,11 @@ async def test_after_an_undo_nothing_is_written_until_the_next_request(tmp_path:
         assert rig.service.arming.readiness.answer().words == "calibration was undone: calibrate"
         assert rig.service.arming.readiness.answer().verdict == "refuse"
         assert rig.service.status()["automatic"]["stopped"] == "undone"
+    async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:  # the companion starts again
+        await rig.ready()
+        await asyncio.sleep(120.0)
+        assert rig.double.writes == []
+        assert rig.service.status()["automatic"]["stopped"] == "undone"
         rig.ground.command(CALIBRATE, 0.0)
         await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 60.0)
         await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 15.0)

@@ -259,7 +259,7 @@ async def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Pat
         assert made.file.read_bytes() == before
         async with Terminal(first, tmp_path) as terminal:
             await terminal.answer("on the ground", "deck")
-            await terminal.answer("axis, slope or euler")
+            await terminal.answer("axis, slope, euler or test")
             await terminal.answer("gradienter turned")
             await terminal.answer("Which part")
             await terminal.answer(r"Write it\?")

@@ -89,6 +89,9 @@ class Automatic:
 
     async def run(self) -> None:
         self._writes = await self._core.offload(self._file.read)
+        last = self._manager.last
+        if last is not None and last.undone_at is not None:
+            self._stop("undone")  # before this start
         while True:
             self.turns += 1
             await asyncio.sleep(POLL_S)

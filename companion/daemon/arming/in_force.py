@@ -203,6 +203,9 @@ class ActiveCalibration:
             self.undone, self.calibration = False, job.record
             for imu in job.record.imus:
                 self._take(imu, asyncio.get_running_loop().time(), job.held_back)
+            for key in job.solution.unknown if job.solution is not None else ():
+                if (coarse := self._triads.get(key)) is not None:
+                    self._leave_out(key, coarse)
 
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Inconsistency]) -> None:
         corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s

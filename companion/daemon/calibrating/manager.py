@@ -307,7 +307,7 @@ class CalibrationManager:
     async def _note_undone(self, step: ChangeSet) -> bool:
         """Note in the history that a write was undone; return whether a calibration had made that write."""
         if step.origin.what in BY_HAND:
-            await self._by_hand.undone(step)
+            await self._by_hand.undone(step.origin.at)
             return False
         now = utc_now()
         try:

@@ -188,6 +188,8 @@ class Calibrating(Subsystem):
         elif asked.action == "forget":
             if (busy := self.manager.blocking_reason((Precondition.IDLE,))) is not None:
                 raise CalibrationRefusedError(busy[1])
+            if (record := self.alignment.record) is not None:
+                await self.by_hand.undone(record.measured_at)
             was = await self.alignment.forget()
             words = "the configuration's zero and sigma are active" if was else "there was no alignment to forget"
             yield {"kind": "result", "state": "done", "reason": words}

@@ -66,7 +66,8 @@ class Diagnosis:
     async def answer_fix(self, _asked: Fix, face: str) -> AsyncIterator[Object]:
         fix = next((finding["fix"] for finding in self.findings if finding["fix"]), None)
         if fix is None:
-            raise CalibrationRefusedError("no remedy that the companion can carry out: type `companion status`")
+            none = "no remedy that the companion can carry out: type `companion status`"
+            raise CalibrationRefusedError(none if self.findings else "nothing to fix: the autopilot names no reason")
         if fix == FIRMWARE:
             job, work = Job(FIRMWARE, What.GYROS, f"{face} fix"), self._offsets.calibrate_by_firmware
             job = accepted(self._calibrating.manager.start_job(job, work, None))

@@ -38,7 +38,7 @@ from companion.formats import Object, utc_now
 from companion.links.system.events import Listeners
 from companion.messages import message
 from companion.physics.units import MG
-from companion.storage.changes import PREDICTION, ChangeSet
+from companion.storage.changes import PREDICTION
 from companion.storage.records import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot
 
 logger = logging.getLogger(__name__)
@@ -52,6 +52,7 @@ class ActiveAlignment:
         self._store = alignment_in(config.storage.path)
         self.record: AlignmentRecord | None = None
         self.unused: str | None = None
+        self.doubt: str | None = None  # Reason why the last alignment found no zero, until the next one or a restart
         self.on_change: Listeners[[]] = Listeners()
 
     def load(self) -> None:
@@ -91,12 +92,15 @@ class ActiveAlignment:
 
     @property
     def warning(self) -> str | None:
+        if self.doubt is not None:
+            return message("gradienter_doubted", reason=self.doubt)
         return None if self.unused is None else message("alignment_not_used", reason=self.unused)
 
     @property
     def contradicted(self) -> bool:
-        """Whether the gradienter or its mounting is configured otherwise than when the saved zero was measured."""
-        return self.record is not None and self.unused is not None and self._gradienter is not None
+        """Whether the gradienter contradicts the IMUs, or is configured otherwise than when its zero was measured."""
+        changed = self.record is not None and self.unused is not None and self._gradienter is not None
+        return changed or self.doubt is not None
 
     def status(self) -> dict[str, object] | None:
         if self.record is None and self.unused is None:
@@ -105,7 +109,7 @@ class ActiveAlignment:
         return {"in_force": self.used is not None, "unused_because": self.unused, **kept}
 
     def _take(self, record: AlignmentRecord | None) -> None:
-        self.record, self.unused = record, None
+        self.record, self.unused, self.doubt = record, None, None
         now = self.settings()
         if record is None:
             return
@@ -244,10 +248,11 @@ class ByHand:
         )
         await self._write([*self._done, done][-KEEP_DONE:])
 
-    async def undone(self, step: ChangeSet) -> None:
-        now, at = utc_now(), step.origin.at
-        undone = [msgspec.structs.replace(one, undone_at=now) if one.measured_at == at else one for one in self._done]
-        await self._write(undone)
+    async def undone(self, measured_at: str) -> None:
+        """Note that what was measured at this time was undone, or that its zero was forgotten."""
+        here = [one.measured_at == measured_at for one in self._done]
+        undone = [msgspec.structs.replace(one, undone_at=utc_now()) for one in self._done]
+        await self._write([new if is_it else one for one, new, is_it in zip(self._done, undone, here, strict=True)])
 
     async def _write(self, done: list[Done]) -> None:
         self._done = done

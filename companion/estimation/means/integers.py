@@ -42,6 +42,8 @@ BORROWED_RMS: Final = 0.1  # Relative difference between the noise of the three 
 HALF_STEP: Final = 0.5  # Sigma, LSB, of a mean that the readings do not determine
 NEAR_ZERO: Final = 1.0  # Sigma, LSB, of an undetermined mean within a step of zero, on either side
 
+SPREAD_SHARE: Final = 0.4
+"""Least number of seconds with rare integers, over the number by chance. Noise behind a filter comes in runs: 0.5."""
 _ROUNDS: Final = 60
 _HALVINGS: Final = 30
 _CONVERGED: Final = 1e-7
@@ -175,10 +177,12 @@ def integer_columns(
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
     start, tables = _aligned(batches, plain, steps)
+    tables = tables * _quiet(tables)[:, None, :]
     bounds = truncation_edges(start, tables.shape[1])
     inside = np.maximum(tables.sum(axis=1), 1.0)
     pooled = tables.sum(axis=0)
     own = fit(bounds, pooled)
+    own = msgspec.structs.replace(own, identified=own.identified & _is_everywhere(tables, pooled))
     sigma = _borrowed(own, pooled)
     borrows = bool((sigma > 0.0).any())
     weight, found = np.ones_like(plain), own
@@ -207,9 +211,25 @@ def integer_columns(
         np.where(known, values, half_off) * steps,
         np.where(known, second, 0.0) * steps,
         hidden * steps,
-        ~own.identified,
+        ~(own.identified & known),
         ~known & has_zero,
     )
+
+
+def _quiet(tables: Floats) -> NDArray[np.bool_]:
+    """Return (m, c) false for seconds with far more noise than the others: a hand, a gust; `tables` is (m, k, c)."""
+    beyond = np.sort(tables, axis=1)[:, :-2].sum(axis=1)
+    usual = np.median(beyond, axis=0)
+    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(beyond - usual), axis=0), np.sqrt(usual + 1.0))
+    return np.asarray(beyond <= usual + _OUTLIER * spread)
+
+
+def _is_everywhere(tables: Floats, pooled: Floats) -> NDArray[np.bool_]:
+    """Return (c,) true if the rare integers are spread over the seconds like noise; a disturbance fills a few."""
+    common = np.take_along_axis(tables, np.argsort(pooled, axis=0)[None, -2:], axis=1).sum(axis=1)
+    rare, seconds = tables.sum(axis=1) - common, len(tables)
+    expected = seconds * (1.0 - np.exp(-rare.sum(axis=0) / seconds))
+    return np.asarray((rare > 0.0).sum(axis=0) >= np.maximum(min(MIN_BEYOND_TWO, seconds), SPREAD_SHARE * expected))
 
 
 def _borrowed(own: Fit, pooled: Floats) -> Floats:

@@ -288,3 +288,13 @@ def test_nothing_is_ever_nan(lowest: int, counts: list[int], sigma: float | None
     if found.identified[0] and sigma is None:
         values = np.flatnonzero(counts) + lowest
         assert values[0] - 1.0 <= found.mean[0] <= values[-1] + 1.0
+
+
+@pytest.mark.parametrize("gripped_s", [1, 3, 5, 10])
+@pytest.mark.parametrize("noise_lsb", [0.8, 1.5, 3.0])
+def test_a_hand_on_the_aircraft_makes_no_bias_known(gripped_s: int, noise_lsb: float) -> None:
+    rng = np.random.default_rng(gripped_s)
+    mean = np.concatenate([[-0.43, -0.48, -0.35], GRAVITY_LSB[3:]])
+    readings = white(rng, mean, 0.12, 60)
+    readings[2000 : 2000 + 100 * gripped_s] += rng.normal(0.0, noise_lsb, (100 * gripped_s, 6))
+    assert "gyro" in estimate(batches_of(readings))[1].useless
