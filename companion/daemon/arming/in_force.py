@@ -201,6 +201,8 @@ class ActiveCalibration:
                 state.held, state.in_doubt = Why.UNDONE, None
         elif isinstance(job, CalibrationRun) and job.record is not None:
             self.undone, self.calibration = False, job.record
+            for state in self._triads.values():
+                state.held = Why.NEVER if state.held is Why.UNDONE else state.held
             for imu in job.record.imus:
                 self._take(imu, asyncio.get_running_loop().time(), job.held_back)
             for key in job.solution.unknown if job.solution is not None else ():
