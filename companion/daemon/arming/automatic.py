@@ -69,10 +69,10 @@ class Automatic:
 
     def why_not(self) -> str | None:
         """Return the waiting time or the remedy, as text, if no automatic calibration can start now; otherwise None."""
-        if not self.wanted or self.stopped is not None:
-            return "calibrate"
         if self._alignment.contradicted:  # with a wrong mounting, new accelerometer offsets would be wrong
             return self._alignment.warning
+        if not self.wanted or self.stopped is not None:
+            return "calibrate"
         if self._writes_today() >= PER_DAY:
             return f"calibrate ({PER_DAY} writes today)"
         now_s = asyncio.get_running_loop().time()

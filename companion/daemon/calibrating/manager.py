@@ -153,6 +153,9 @@ class CalibrationManager:
             return own
         untold = what is What.ACCELEROMETERS and self._core.config.gradienter is None
         missing = "accelerometers need a gradienter: none is configured" if untold else None
+        alignment = self._parts.estimator.alignment
+        if what.accelerometers and alignment.doubt is not None:  # their offsets would be wrong
+            missing = alignment.warning
         if (refusal := self._refusal(missing)) is not None:
             return refusal
         run = CalibrationRun(

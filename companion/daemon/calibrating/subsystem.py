@@ -206,7 +206,7 @@ class Calibrating(Subsystem):
         if alignment.used is not None or (sides and alignment.settings() is None):
             known = [self.faces.sigma_m_s2(one["name"], one["temperature_degc"]) for one in sides]
             here = alignment.settings() is not None or None not in known
-            state, reason = "active", "" if here else "the autopilot's offsets are others"
+            state, reason = ("active", "") if here else ("not used", "the autopilot's offsets are others")
         elif alignment.unused is not None:
             state, reason = "not used", alignment.unused
         else:

@@ -152,11 +152,12 @@ class ZeroTask(SamePlaceTask):
         self._make_stands(state, readable(state.windows), local.declination_deg if magnetic else 0.0)
         law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
         try:
-            self._check_fit(align(law, mounted, self.stands, ground(local, self._compass)))
+            found = align(law, mounted, self.stands, ground(local, self._compass))
         except CalibrationRefusedError as error:
             self._kept.doubt = str(error)
             raise
         self._kept.doubt = None
+        self._check_fit(found)
         return []
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:

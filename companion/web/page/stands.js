@@ -78,7 +78,8 @@ function stands(found, status) {
   if (found.share > 0) $("still").textContent = "";
   $("share").style.strokeDasharray = `${100 * found.share} 100`;
   $("now").classList.toggle("writing", writing);
-  $("grip").textContent = writing ? status.reason : grip || (found.unknown.length ? "" : why || "");
+  $("grip").textContent = writing ? status.reason
+    : found.objection || grip || (found.unknown.length ? "" : why || "");
   $("wish").textContent = writing ? "leave it as it is" : wish;
   const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, ended]);
   if (key === shownStands) return;
