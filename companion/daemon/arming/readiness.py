@@ -66,6 +66,8 @@ class Readiness:
     def __init__(self, core: Core, owed: RequiredReboot, in_force: ActiveCalibration, automatic: Automatic) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
+        by_autopilot = any(imu.source == "autopilot" for imu in core.config.imu)
+        self._by_hand = core.config.gradienter is None and by_autopilot and not self._on_deck
         self._min_still_s = core.config.calibration.min_still_s
         self.in_force, self._automatic, self.owed = in_force, automatic, owed
         self._answer = ArmAnswer("wait", "companion is starting")
@@ -224,7 +226,7 @@ class Readiness:
         parts = [f"{words} {_ago(now_s - since_s)}", *sigma_texts(gyro, accel)]
         if accel_s is not None and abs(accel_s - since_s) > AGES_APART_S:
             parts[-2:] = [f"{parts[-2]}; accel {_ago(now_s - accel_s)}", parts[-1]]
-        lacks = f"; {NO_FACES}" if accel is None and in_force.faces.record is not None else ""
+        lacks = f"; {NO_FACES}" if accel is None and self._by_hand else ""
         return ", ".join(parts) + lacks
 
     def _quality(self, triad: Triad, unit: float) -> dict[str, object]:

@@ -108,7 +108,6 @@ function quality(status) {
     if (help) (goals[help] ||= []).push(`${+found[triad].wanted.toFixed(digits)} ${unit}`);
   }
   const rows = Object.entries(goals).map(([help, wanted]) => `goal ${wanted.join(", ")} not met: ${help}`);
-  if (found.accel.sigma === null && status.pose === null) rows.push("accelerometers not calibrated: hold FACES below");
   $("quality").hidden = !good || !rows.length || status.headline.word === "ARMED";
   $("quality").textContent = rows.join("; ");
   $("head").classList.toggle("coarse", good && unmet.length > 0);
