@@ -250,9 +250,9 @@ class ByHand:
 
     async def undone(self, measured_at: str) -> None:
         """Note that what was measured at this time was undone, or that its zero was forgotten."""
-        here = [one.measured_at == measured_at for one in self._done]
-        undone = [msgspec.structs.replace(one, undone_at=utc_now()) for one in self._done]
-        await self._write([new if is_it else one for one, new, is_it in zip(self._done, undone, here, strict=True)])
+        now, at = utc_now(), measured_at
+        undone = [msgspec.structs.replace(one, undone_at=now) if one.measured_at == at else one for one in self._done]
+        await self._write(undone)
 
     async def _write(self, done: list[Done]) -> None:
         self._done = done
