@@ -177,7 +177,6 @@ def integer_columns(
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
     start, tables = _aligned(batches, plain, steps)
-    tables = tables * _quiet(tables)[:, None, :]
     bounds = truncation_edges(start, tables.shape[1])
     inside = np.maximum(tables.sum(axis=1), 1.0)
     pooled = tables.sum(axis=0)
@@ -214,14 +213,6 @@ def integer_columns(
         ~(own.identified & known),
         ~known & has_zero,
     )
-
-
-def _quiet(tables: Floats) -> NDArray[np.bool_]:
-    """Return (m, c) false for seconds with far more noise than the others: a hand, a gust; `tables` is (m, k, c)."""
-    beyond = np.sort(tables, axis=1)[:, :-2].sum(axis=1)
-    usual = np.median(beyond, axis=0)
-    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(beyond - usual), axis=0), np.sqrt(usual + 1.0))
-    return np.asarray(beyond <= usual + _OUTLIER * spread)
 
 
 def _is_everywhere(tables: Floats, pooled: Floats) -> NDArray[np.bool_]:
