@@ -15,9 +15,10 @@ sigma from the first pose on. A pose that does not fit is found by leaving out o
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import msgspec
@@ -62,6 +63,7 @@ SIDES: Final = {
 
 Face = tuple[Array, Array]
 """Mean specific force during one pose, in the sensor's axes, and one sigma per axis; m/s^2, each (3,)."""
+_Fit = tuple[Array, Matrix, float, bool]
 
 
 class Sides(msgspec.Struct, frozen=True):
@@ -131,12 +133,12 @@ def faces(
         if 4 * (len(left_out) + 1) > len(stands):
             in_doubt = kept
             break
-        without = {k: _fit(stands, tuple(j for j in kept if j != k), gravity) for k in kept}
-        mended = [k for k in kept if without[k][3]]
-        if len(mended) > 1 or len(kept) - FIGURES < LEAST_SPARE:
+        without = dict(_fits_without_one(stands, kept, gravity))
+        mended = [k for k in without if without[k][3]]
+        if not without or len(mended) > 1 or len(kept) - FIGURES < LEAST_SPARE:
             in_doubt = tuple(mended) or kept
             break
-        worst = mended[0] if mended else min(kept, key=lambda k: without[k][2])
+        worst = mended[0] if mended else min(without, key=lambda k: without[k][2])
         left_out = (*left_out, worst)
         figures, covariance, _, fits = without[worst]
     stretch = response(figures[SCALE], figures[SHEAR])
@@ -155,9 +157,16 @@ def faces(
     )
 
 
-def _fit(
-    stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]
-) -> tuple[Array, Matrix, float, bool]:
+def _fits_without_one(
+    stands: Sequence[Face], kept: Sequence[int], gravity: tuple[float, float]
+) -> Iterator[tuple[int, _Fit]]:
+    """Yield each pose that can be left out, with the fit of the others."""
+    for k in kept:
+        with contextlib.suppress(CalibrationRefusedError):
+            yield k, _fit(stands, tuple(j for j in kept if j != k), gravity)
+
+
+def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]) -> _Fit:
     """Estimate the nine figures; return them, their covariance (9, 9), chi-square, and true if every pose fits."""
     force, sigmas = (np.array([stands[k][part] for k in which]) for part in (0, 1))
     prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
