@@ -45,7 +45,8 @@ SETTLE_S: Final = 1.0
 STOP_WITHIN_DEG: Final = 5.0  # Angle before the target at which the operator is asked to stop
 TURNS_DEG: Final = 2.0  # Minimum turn within a second that counts as turning
 EARLY_S: Final = 3.0  # Time at rest after which a movement counts as too early: before, the aircraft is set down
-STILL_MOVING_S: Final = 20.0  # Duration of movement after which the operator gets a message: a hand, or the wind
+STILL_MOVING_S: Final = 15.0  # Duration of movement after which the operator gets a message: a hand, or the wind
+STILL_MOVES: Final = "it still moves: set it down, hands off"
 LEANED_DEG: Final = 0.03  # Largest change of tilt within a pose: half of it enters the mean
 ARMED: Final = "armed during the alignment; the earlier one stays active"
 
@@ -121,6 +122,7 @@ class PoseTask(abc.ABC):
     """Text of the error if the aircraft arms; None: the alignment continues once it is disarmed."""
     request: AlignmentRequest
     total: int
+    stand_s: float | None = None  # Time without motion in the next pose; None: STAND_S, or min_still_s if longer
     fit_from: int
     """Number of poses before the first fit; the fit is repeated after each further pose."""
     board: Mounting | None = None  # Tilt of the board, if it can be known
@@ -236,6 +238,7 @@ class PoseSession:
     async def _measure(self, state: SessionState, task: PoseTask, wish: PoseRequest) -> None:
         loop, job = asyncio.get_running_loop(), state.job
         state.begin_pose(wish, task.total, loop.time())
+        stand_s = task.stand_s or self._stand_s
         if state.number > 1:
             self._machine.on(Event.MOVED)
             self._core.tunes.play(Tune.NEXT)
@@ -248,7 +251,7 @@ class PoseSession:
             state.still_s = min(status.still_s, now_s - state.since_s - SETTLE_S)
             # If only more still time is needed, show the pose as measuring from its first second on.
             standing = state.moved and (waiting_for is None or hold_still_s is not None)
-            state.share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
+            state.share = min(max(state.still_s, 0.0) / stand_s, 1.0) if standing else 0.0
             turned = self._turned(state, now_s) if moving or standing else ""
             state.act = "HOLD STILL" if standing else state.act
             job.act = state.act if waiting_for is None or hold_still_s is not None or moving else ""
@@ -256,7 +259,7 @@ class PoseSession:
                 reason = turned or waiting_for if state.moved or not job.act else "waiting for it to move"
                 words = f"{state.objection or wish.words}; {reason}"
             else:
-                words = f"measuring, {max(state.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
+                words = f"measuring, {max(state.still_s, 0.0):.0f} of {stand_s:.0f} s, hands off"
                 words += f" ({turned})" if turned else ""
                 if not state.hold_still_said:
                     state.hold_still_said = True
@@ -265,8 +268,8 @@ class PoseSession:
             percent = 100.0 * (state.number - 1 + state.share) / state.total
             job.progress(percent, f"{state.number} of {state.total}: {words}")
             state.words = words
-            enough = state.moved and waiting_for is None and state.still_s >= self._stand_s
-            if enough and await self._accept(state, task, now_s):
+            enough = waiting_for is None if task.stand_s is None else standing
+            if enough and state.moved and state.still_s >= stand_s and await self._accept(state, task, now_s):
                 return
             await job.pause(POLL_S)
 
@@ -319,14 +322,15 @@ class PoseSession:
         glance = self._collector.glance(now_s)
         if not glance.moving:
             state.moving_since_s = math.inf
+            state.objection = "" if state.objection == STILL_MOVES else state.objection
             return False
         if glance.moves is not None and state.moved:
             state.moving_since_s = min(state.moving_since_s, now_s)
             if state.still_s >= EARLY_S:
-                self._object(state, f"it moved after {state.still_s:.0f} of {self._stand_s:.0f} seconds: hands off")
+                self._object(state, f"it moved after {state.still_s:.0f} seconds: hands off")
             elif now_s - state.moving_since_s >= STILL_MOVING_S:
-                state.moving_since_s, state.act = now_s, "HOLD STILL"
-                self._say(Severity.NOTICE, "It still moves: set it down, hands off")
+                state.moving_since_s, state.act, state.objection = now_s, "HOLD STILL", STILL_MOVES
+                self._say(Severity.NOTICE, STILL_MOVES.capitalize())
         state.moved, state.since_s, state.still_s = True, now_s, 0.0
         return True
 

@@ -15,7 +15,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.poses.alignment import ActiveAlignment, ActiveSixPosition
-from companion.daemon.poses.session import ARMED, PoseTask, SessionState
+from companion.daemon.poses.session import ARMED, STAND_S, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
 from companion.estimation.alignment.align_model import Ground, PoseMeans
@@ -45,6 +45,9 @@ OFFSET_WARNING_SIGMAS: Final = 4.0
 EXPECTED: Final = 11  # Least number of poses in a six-position alignment
 MOST: Final = 24  # Maximum
 NOT_WRITTEN: Final = "not written (--write does)"
+SHORTEST_S: Final = 8.0
+"""Shortest time without motion in one of the six positions: fewer seconds do not show that the aircraft leans."""
+POSE_SIGMA_M_S2: Final = 0.05 * MG  # Noise of the mean of one pose: a third of the bias' sigma that is good enough
 _FIRST: Final = PoseRequest("any side down, propped up, hands off")
 TURN_LIMITED_M_S2: Final = 0.5 * MG
 """Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""
@@ -341,6 +344,7 @@ class SixPositionTask(PoseTask):
             self.total = max(self.total, found.least_poses)
         if not self._by_imu:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
+        self.stand_s = self._needed_s(state.windows[-1])
         return [
             f"Pose {stand + 1} is left out: it is off by {float(found.off_m_s2[stand]) / MG:+.1f} mg"
             for name, found in self._by_imu.items()
@@ -401,6 +405,12 @@ class SixPositionTask(PoseTask):
         """Return mean acceleration and sigma, (3,) each, in sensor axes: autopilots apply the scale in these axes."""
         turn = self._imus[imu.name].in_force.orientation.T
         return turn @ np.array(imu.accel_m_s2), np.sqrt(np.square(turn) @ np.square(imu.accel_sigma_use_m_s2))
+
+    def _needed_s(self, last: Window) -> float:
+        """Return how long the next pose must be at rest, by the noise of the last one."""
+        noise_m_s2 = max(max(imu.accel_sigma_stat_m_s2) for imu in last.imus if imu.name in self._by_imu)
+        needed_s = (last.end_s - last.start_s) * (noise_m_s2 / POSE_SIGMA_M_S2) ** 2
+        return min(max(needed_s, SHORTEST_S), STAND_S)
 
     def _scales_left(self) -> Iterator[str]:
         for name, found in self._by_imu.items():
