@@ -47,7 +47,9 @@ MOST: Final = 24  # Maximum
 NOT_WRITTEN: Final = "not written (--write does)"
 SHORTEST_S: Final = 8.0
 """Shortest time without motion in one of the six positions: fewer seconds do not show that the aircraft leans."""
-POSE_SIGMA_M_S2: Final = 0.05 * MG  # Noise of the mean of one pose: a third of the bias' sigma that is good enough
+POSE_SIGMA_M_S2: Final = (
+    0.1 * MG
+)  # Noise of the mean of one pose that leaves a bias sigma of half of what is good enough
 _FIRST: Final = PoseRequest("any side down, propped up, hands off")
 TURN_LIMITED_M_S2: Final = 0.5 * MG
 """Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""
@@ -398,7 +400,7 @@ class SixPositionTask(PoseTask):
     def summary(self) -> str:
         bias_mg = max(float(found.sigma[BIAS].max()) for found in self._by_imu.values()) / MG
         scale = max(float(found.sigma[SCALE].max()) for found in self._by_imu.values())
-        end = "written; now: companion calibrate" if self.request.write else NOT_WRITTEN
+        end = "written" if self.request.write else NOT_WRITTEN
         return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"
 
     def _face(self, imu: ImuWindow) -> Face:

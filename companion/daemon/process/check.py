@@ -22,7 +22,7 @@ from companion.daemon.interfaces.control import process_behind
 from companion.daemon.process.service import Service
 from companion.errors import CalibrationRefusedError, DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
-from companion.links.serial.listening import Heard, listen_to_all
+from companion.links.serial.listening import Heard, listen_to_all, refuse_if_held
 from companion.links.serial.ports import ROOT, list_ports, port_faults, same_ports
 from companion.links.system.connection import ask
 from companion.messages import message
@@ -218,8 +218,11 @@ async def find_law(config: Config, say: Callable[[str], object]) -> tuple[Law, i
     """Guide through two tilts; return the law of the gradienter's readings and its yaw in the aircraft, deg.
 
     Raises:
+        LinkError: another program, such as the companion, uses the gradienter's port.
         CalibrationRefusedError: the tilts did not come in time, or no law explains them.
     """
+    if config.gradienter is not None:
+        refuse_if_held(config.gradienter.port)
     alone = msgspec.structs.replace(config, mqtt=None, web=None)
     service, test = Service(alone, only_listening=ONLY_CHECKING), TiltTest(say)
 

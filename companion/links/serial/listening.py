@@ -74,10 +74,15 @@ async def listen_to_all(
     return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
 
 
-async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
-    """Try line settings, likely ones first, for half a minute at most; raise LinkError if the port cannot be opened."""
+def refuse_if_held(path: str, root: Path = ROOT) -> None:
+    """Raise a LinkError that names the other program which uses a port, and how to end it, if there is one."""
     if holders := [holder for holder in find_holders(path, root) if holder.pid != os.getpid()]:
         raise LinkError(f"{in_use(path, holders)}: {how_to_free(holders[0])}")
+
+
+async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
+    """Try line settings, likely ones first, for half a minute at most; raise LinkError if the port cannot be opened."""
+    refuse_if_held(path, root)
     heard, plain = 0, dict[int, float]()
     bauds: list[int] = []
     for number, line in enumerate(lines_to_try(first)):

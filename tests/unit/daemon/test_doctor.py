@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
+import sys
 from pathlib import Path
 
 import pytest
 
 from companion.config import parse
 from companion.config.sections import Config
-from companion.daemon.process.check import storage_finding, system_findings
+from companion.daemon.process.check import find_law, storage_finding, system_findings
+from companion.errors import LinkError
 from companion.links.serial.ports import port_faults, same_ports
 from tests.support.usb_tree import UsbTree
 
@@ -194,3 +197,23 @@ def test_a_full_card_is_found_before_a_calibration(tmp_path: Path, monkeypatch: 
     found = storage_finding(tmp_path)
     assert (found.verdict, found.words) == ("wrong", f"{tmp_path} not usable: No space left on device")
     assert list(tmp_path.iterdir()) == []
+
+
+async def test_the_test_of_the_law_is_refused_at_once_while_another_program_has_the_port() -> None:
+    master, slave = os.openpty()
+    port = os.ttyname(slave)
+    holds = [sys.executable, "-c", "import sys; f = open(sys.argv[1]); print(flush=True); sys.stdin.read()", port]
+    process = await asyncio.create_subprocess_exec(
+        *holds, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+    )
+    try:
+        assert process.stdout is not None
+        await process.stdout.readline()
+        config = parse(CONFIG.format(autopilot="serial:/dev/none:57600", imu="/dev/nobody", gradienter=port), "test")
+        with pytest.raises(LinkError, match=rf"^{port}: in use .*, process {process.pid}\): sudo kill {process.pid}"):
+            await asyncio.wait_for(find_law(config, pytest.fail), 10.0)
+    finally:
+        process.kill()
+        await process.wait()
+        os.close(master)
+        os.close(slave)
