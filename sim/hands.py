@@ -44,7 +44,7 @@ SIDES: Final = {
 }
 """Pitch and roll for each side, by the name that the companion uses."""
 _SIDE = "|".join(SIDES)
-_MISSING = re.compile(rf"(?:between ({_SIDE}) and ({_SIDE})|({_SIDE})): ")
+_MISSING = re.compile(rf"(?:: |now )(?:between ({_SIDE}) and ({_SIDE})|({_SIDE}))(?=[:;]|$)")
 _TURN = re.compile(r"turn it (?:by|on by) (\d+) deg")
 
 

@@ -104,7 +104,6 @@ class SessionState:
             "total": self.total,
             "wish": self.wish.words,
             "hold": {"up": list(self.wish.up), "turn_deg": self.wish.turn_deg},
-            "unknown": list(self.wish.unknown),
             "words": self.words,
             "objection": self.objection or None,
             "share": round(self.share, 3),

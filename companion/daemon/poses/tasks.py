@@ -355,7 +355,7 @@ class SixPositionTask(PoseTask):
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> FacesRecord:
         if self._missing is not None:
-            self.shortfall = f"after {MOST} poses {self._missing.words.partition(': ')[2]}"
+            self.shortfall = f"after {MOST} poses {self._missing.lacks}"
             log.warnings.append(self.shortfall)
         elif self.request.write:
             log.warnings += self._scales_left()

@@ -205,22 +205,17 @@ def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> PoseRequest | 
     scale = np.hypot(np.maximum(ENOUGH_SCALE, wander / gravity), found.gravity_sigma_m_s2 / gravity)
     sigma = np.sqrt(np.diag(found.by_stands))[: SCALE.stop]
     share = sigma / np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale])
-    worst_first = [int(which) for which in np.argsort(-share) if share[which] > 1.0]
-    unchecked = len(found.up) < found.least_poses
-    if not worst_first and not unchecked and not found.in_doubt:
-        return None
+    weight = np.where(share > 1.0, share, 0.0)
+    if not weight.any():
+        if len(found.up) >= found.least_poses and not found.in_doubt:
+            return None
+        weight = np.ones(SCALE.stop)
     # Once all sides were seen, ask again for the most informative one.
     sides = _not_seen(found, vehicle_from_sensor) or _all_sides(vehicle_from_sensor)
-    weight = np.where(share > 1.0, share, 0.0) if worst_first else np.ones(SCALE.stop)
-    told = [_told(found, up)[: SCALE.stop] * weight for _, up in sides]
-    best = int(np.argmax([each.sum() for each in told]))
-    if worst_first:
-        why = _figure(sigma, int(np.argmax(told[best])))
-    else:
-        why = "one pose does not fit; the next one shows which" if found.in_doubt else "one more pose needed as a check"
-    side, up = sides[best]
-    unknown = tuple(_figure(sigma, which) for which in worst_first)
-    return PoseRequest(f"{side}: {why}", vector(vehicle_from_sensor @ up), unknown=unknown)
+    side, up = sides[int(np.argmax([_told(found, up)[: SCALE.stop] @ weight for _, up in sides]))]
+    lacks = "one pose does not fit" if found.in_doubt else _figure(sigma, int(np.argmax(share)))
+    words = f"{side}: one pose does not fit, this one shows which" if found.in_doubt else side
+    return PoseRequest(words, vector(vehicle_from_sensor @ up), lacks=lacks)
 
 
 def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:

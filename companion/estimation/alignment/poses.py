@@ -66,13 +66,13 @@ class AlignmentRequest(NamedTuple):
 class PoseRequest(NamedTuple):
     """Pose to request next. `up`: unit vector pointing up, in the aircraft's axes (forward, right, down).
 
-    `words`: text; spoken up to its first colon. `unknown`: texts on values not yet precise enough, worst first.
+    `words`: text; spoken up to its first colon. `lacks`: what the poses so far do not show well enough.
     """
 
     words: str
     up: Vector = LEVEL
     turn_deg: float = 0.0  # Turn at one place, clockwise from above
-    unknown: tuple[str, ...] = ()
+    lacks: str = ""
 
 
 class HeldPose(NamedTuple):

@@ -79,7 +79,7 @@ function stands(found, status) {
   $("share").style.strokeDasharray = `${100 * found.share} 100`;
   $("now").classList.toggle("writing", writing);
   $("grip").textContent = writing ? status.reason
-    : found.objection || grip || (found.unknown.length ? "" : why || "");
+    : found.objection || grip || why || "";
   $("wish").textContent = writing ? "leave it as it is" : wish;
   const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, ended]);
   if (key === shownStands) return;
@@ -92,7 +92,6 @@ function stands(found, status) {
   $("written").replaceChildren(...(running ? [] : ended.written.map(words => make("div", words))));
   $("stands").dataset.outcome = running ? "" : ended.outcome;
   $("still").textContent = found.share > 0 ? "" : found.objection || "";
-  $("unknowns").textContent = running && found.unknown.length ? "not known yet: " + found.unknown.join(", ") : "";
   $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
   const left = Math.max(found.total - found.done.length, 0);
   $("done").replaceChildren(...found.done.map((up, k) => {

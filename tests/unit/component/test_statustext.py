@@ -103,7 +103,11 @@ def sent_to_script(text: str) -> str:
     [
         (Severity.NOTICE, "Calibration done: sigma 4.7 deg/h, 0.13 mg", "Calibration done:"),
         (Severity.NOTICE, "Armed: calibrated 3 min ago, 4.7 deg/h", "Armed: calibrated 3 min ago,"),
-        (Severity.NOTICE, "2 of 12: on its back: z bias uncertain by 30 mg", "2 of 12: on its back:"),
+        (
+            Severity.NOTICE,
+            "2 of 12: on its back: one pose does not fit, this one shows which",
+            "2 of 12: on its back: one pose does not fit,",
+        ),
         (Severity.NOTICE, "2 of 3: turn it by 180 degrees, onto its marks", None),
         (Severity.WARNING, "Before flight: reboot PX4: tilt 1.2 deg off", None),
         (

@@ -107,7 +107,7 @@ def every_request() -> Iterator[str]:
         for number in range(plan.total):
             yield f"{number + 1} of {plan.total}: {wanted_pose(plan, taken[:number]).words}"
     for side in (*SIDES, *EDGES):
-        yield f"24 of 24: {side}: z scale uncertain by 0.46 %"
+        yield f"24 of 24: {side}: one pose does not fit, this one shows which"
 
 
 def test_what_is_asked_for_is_one_line_to_be_heard() -> None:
