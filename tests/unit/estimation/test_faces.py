@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -126,16 +127,9 @@ def test_a_wrong_stand_is_named_and_left_out(off_mg: float) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_a_wrong_stand_among_the_asked_ones_does_not_end_the_alignment(seed: int) -> None:
     """Every fit on the way goes through, also where the others without one pose are no gravity."""
-    sensor = Sensor(seed)
-    stands: list[Face] = []
-    wish: PoseRequest | None = PoseRequest("level: ")
-    while wish is not None:
-        force, sigma = sensor.read(sensor.up(*_middle(wish.words.partition(":")[0]), by_hand_deg=8.0))
-        off = 10.0 * MG * force / np.linalg.norm(force) if len(stands) == seed % 11 else 0.0
-        stands.append((force + off, sigma))
-        wish = missing(solved(stands), np.eye(3))
-    found = solved(stands)
-    assert found.left_out == (seed % 11,)
+    sensor, bad = Sensor(seed), seed % 11
+    found = solved(obeying(sensor, np.eye(3), {bad: 10.0 * MG})[1])
+    assert found.left_out == (bad,)
     assert (np.abs(found.figures - sensor.truth) < 5.0 * found.sigma).all()
 
 
@@ -166,22 +160,26 @@ def test_readings_that_are_no_gravity_are_refused() -> None:
 @pytest.mark.parametrize("mounting", ["ROTATION_NONE", "ROTATION_YAW_90", "ROTATION_ROLL_180_YAW_45"])
 def test_it_says_which_stand_is_missing_until_nothing_is(mounting: str) -> None:
     """The words are of the aircraft, however its sensor is mounted; who obeys them is done within twelve stands."""
-    turned = rotation_matrix(mounting)
     sensor = Sensor(8)
-    obeyed: list[str] = []
-    stands: list[Face] = []
-    wish: PoseRequest | None = PoseRequest("level: ")
-    while wish is not None:
-        side = wish.words.partition(":")[0]
-        assert side not in obeyed
-        obeyed.append(side)
-        pitch_deg, roll_deg = _middle(side)
-        stands.append(sensor.read(turned.T @ sensor.up(pitch_deg, roll_deg)))
-        wish = missing(solved(stands), turned)
+    obeyed, stands = obeying(sensor, rotation_matrix(mounting))
+    assert len(set(obeyed)) == len(obeyed)
     assert set(obeyed[:6]) == set(HELD)
     assert 11 <= len(obeyed) <= 12
     found = solved(stands)
     assert (np.abs(found.figures - sensor.truth)[:6] < 4.0 * found.sigma[:6]).all()
+
+
+def obeying(sensor: Sensor, turned: Floats, off_m_s2: Mapping[int, float] = {}) -> tuple[list[str], list[Face]]:
+    """Return the sides asked for, and what is read there; `off_m_s2`: error of gravity's length in these stands."""
+    obeyed: list[str] = []
+    stands: list[Face] = []
+    wish: PoseRequest | None = PoseRequest("level")
+    while wish is not None:
+        obeyed.append(wish.words.partition(":")[0])
+        force, sigma = sensor.read(turned.T @ sensor.up(*_middle(obeyed[-1])))
+        stands.append((force * (1.0 + off_m_s2.get(len(stands), 0.0) / SITE.gravity_m_s2), sigma))
+        wish = missing(solved(stands), turned)
+    return obeyed, stands
 
 
 def _middle(side: str) -> tuple[float, float]:
