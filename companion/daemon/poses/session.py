@@ -171,7 +171,6 @@ class PoseSession:
     ) -> None:
         self._core, self._machine, self._collector, self._say = core, core.machine, core.collector, core.say
         self._imus, self._measuring, self._writes = imus, measuring, writes
-        self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
         self.state: SessionState | None = None
 
     async def run(self, job: Job, task: PoseTask) -> str:
@@ -237,7 +236,7 @@ class PoseSession:
     async def _measure(self, state: SessionState, task: PoseTask, wish: PoseRequest) -> None:
         loop, job = asyncio.get_running_loop(), state.job
         state.begin_pose(wish, task.total, loop.time())
-        stand_s = task.stand_s or self._stand_s
+        stand_s = task.stand_s or max(STAND_S, self._core.config.calibration.min_still_s)
         if state.number > 1:
             self._machine.on(Event.MOVED)
             self._core.tunes.play(Tune.NEXT)
