@@ -10,8 +10,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
+import re
 import sys
 from collections.abc import Sequence
+from contextvars import copy_context
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -26,7 +28,9 @@ from companion.cli.terminal import (
     CommandGroup,
     DaemonRefusedError,
     Parser,
+    as_typed,
     how_to_start,
+    own_name,
     print_json,
     print_lines,
 )
@@ -56,11 +60,17 @@ class _Overview(Parser):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
+    return copy_context().run(_run, arguments)
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(OneLineFormatter())
     try:
         options = _parser().parse_args(arguments, argparse.Namespace(json=False))
         command: Command = options.command
+        names, own = "|".join(name for group in GROUPS.values() for name in group), own_name(options)
+        as_typed.set(lambda line: re.sub(rf"\bcompanion (?=({names})\b)", lambda _: f"{own} ", line))
         return asyncio.run(command(options))
     except ConfigError as error:
         print_lines(error, error=True)

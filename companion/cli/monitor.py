@@ -18,7 +18,7 @@ from typing import Final
 
 from companion import summary
 from companion.cli import show
-from companion.cli.terminal import DONE, load_config, print_json, print_lines
+from companion.cli.terminal import DONE, as_typed, load_config, print_json, print_lines
 from companion.errors import DaemonUnreachableError
 from companion.formats import Object, printable
 from companion.links.system.connection import ask
@@ -133,4 +133,6 @@ class _Screen:
 
 def _wrapped(line: str, width: int) -> list[str]:
     """Wrap a line to the terminal's width, and escape control characters in it."""
-    return textwrap.wrap(printable(line), max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]
+    return textwrap.wrap(
+        printable(as_typed.get()(line)), max(width, 20), subsequent_indent="    ", drop_whitespace=False
+    ) or [""]

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Collection, Coroutine, Iterable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final, NoReturn, Self
 from urllib.parse import quote
@@ -29,6 +30,10 @@ NO_DAEMON: Final = 3
 Command = Callable[[argparse.Namespace], Coroutine[Any, Any, int]]
 
 
+as_typed: Final[ContextVar[Callable[[str], str]]] = ContextVar("as_typed", default=str)
+"""Function that completes the commands in a line: `companion status` needs `-c FILE` if the operator typed that."""
+
+
 class DaemonRefusedError(CompanionError):
     """The daemon has refused a request; the text is the reason."""
 
@@ -37,7 +42,7 @@ def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
     """Print lines with control characters escaped: lines can contain text received from elsewhere."""
     stream = sys.stderr if error else sys.stdout
     for line in lines:
-        stream.write(printable(str(line)) + end)
+        stream.write(printable(as_typed.get()(str(line))) + end)
     stream.flush()
 
 
@@ -267,4 +272,5 @@ def conclude(options: argparse.Namespace, answer: Any, lines: Iterable[object], 
 
 
 def print_json(value: Any) -> None:
-    print_lines(json.dumps(value))
+    sys.stdout.write(json.dumps(value) + "\n")
+    sys.stdout.flush()

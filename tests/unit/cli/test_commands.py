@@ -52,6 +52,13 @@ def test_a_wrong_word_leads_to_the_right_one(words: list[str], answer: str, caps
     assert line.count("\n") == 1
 
 
+def test_commands_in_answers_name_the_configuration_that_was_named(capsys: Captured) -> None:
+    assert cli.main(["-c", "my own.toml", "explain", "sensor_silent: no reading from gradienter"]) == 0
+    assert "Type `companion -c 'my own.toml' check`" in capsys.readouterr().out
+    cli.main(["explain", "no reading from gradienter"])
+    assert "Type `companion check`" in capsys.readouterr().out
+
+
 def test_the_stored_history_is_read_without_a_daemon_and_without_damaged_files(
     tmp_path: Path, capsys: Captured
 ) -> None:
