@@ -313,19 +313,12 @@ def pose_lines(record: Object) -> list[str]:
         return compass_lines(record)
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} poses{slope}"]
-    zero: list[str] = []
     if "gradienter" in record:
-        (x, y), sigma, configured = record["offset_deg"], record["sigma_deg"], record["gradienter"]["offset_deg"]
+        (x, y), sigma = record["offset_deg"], record["sigma_deg"]
         worth_mg = 1e3 * math.radians(sigma)
         lines.append(
             f"gradienter zero: x {x:+.4f} y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally"
         )
-        zero = [
-            "in the configuration the same is said by these lines (then: companion align forget):",
-            "    [gradienter]",
-            f"    offset_deg = [{configured[0] + x:.4f}, {configured[1] + y:.4f}]",
-            f"    sigma_deg = {sigma:.4f}",
-        ]
     for imu in record["imus"]:
         scatter = f" poses miss gravity by {imu['scatter_mg']:.2f} mg" if "scatter_mg" in imu else ""
         lines.append(f"{imu['name']}:{scatter}")
@@ -350,4 +343,4 @@ def pose_lines(record: Object) -> list[str]:
             + ("" if board["written"] else "; companion align turn --level tells it the autopilot")
         )
         lines += show.written_lines(board["written"])
-    return [*lines, *(f"warning: {words}" for words in record["warnings"]), *zero]
+    return [*lines, *(f"warning: {words}" for words in record["warnings"])]
