@@ -118,6 +118,9 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
             silent.cancel()
             if reply["kind"] == "progress":
                 words = ": ".join(filter(None, (reply.get("word", reply["state"]), reply["text"])))
+                found = messages.explain(reply["text"])
+                if found is not None and found[1].do in ("hardware", "setting"):
+                    words += f" {show.REMEDY}{found[1].advice()}"
                 progress.show(reply["percent"], words)
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:

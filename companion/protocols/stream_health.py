@@ -121,21 +121,21 @@ class StreamHealth:
             return valueless
         if now_s - self._guessed_s >= GUESS_EVERY_S and len(self._tail) >= TAIL_BYTES // 8:
             self._guessed_s, self._guess = now_s, self._guesses()
+        if self.speaks is not None:
+            return Trouble("undecodable", self._guess)
         rejected = _named(self._decoder.rejected) or "none begun"
         guess = self._guess or "wrong baud or protocol?"
-        words = message("no_frames", protocol=self._protocol, rejected=rejected, guess=guess)
-        return Trouble("undecodable", words)
+        return Trouble("undecodable", message("no_frames", protocol=self._protocol, rejected=rejected, guess=guess))
 
     def _guesses(self) -> str:
         found = likeliest(self._tail)
         self.speaks = found.protocol if found is not None and found.protocol != self._protocol else None
         if found is not None and self.speaks is not None:
-            return f"this is {found.protocol} ({' or '.join(found.kinds)})"
+            device = f"{found.protocol}, a device for {found.kinds[0]}"
+            return message("other_device", found=device, wanted=self._protocol)
         if (stranger := strangers(self._tail)) is not None:
             return f"this is {stranger}"
-        if plain_share(self._tail) < _MUCH_TEXT:
-            return "wrong baud or parity?"
-        return ""
+        return "wrong baud or parity?" if plain_share(self._tail) < _MUCH_TEXT else ""
 
     def _stuck(self) -> Trouble | None:
         since_s, last_s = self.unchanged_since_s, self.last_sample_s

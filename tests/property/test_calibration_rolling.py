@@ -59,7 +59,7 @@ def test_nothing_that_arrives_raises(events: list[object]) -> None:
                 step = 1e-3 if known else 0.0
                 collector.set_imu(still.imu(gyro_step_rad_s=step, accel_step_m_s2=step))
         check(collector, feed.now_s)
-        assert sum(len(source.batches.batches) for source in collector._sources()) <= 3 * 30
+        assert sum(len(source.batches.batches) for source in collector.sources()) <= 3 * 30
 
 
 def check(collector: RollingCollector, now_s: float) -> None:

@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 
 from companion.component.statustext import Say, Severity, Weight
-from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.devices.sensors import ABSENT, SerialSensor
 from companion.estimation.collector.rolling import RollingCollector
 from companion.messages import message
 from companion.physics.frames import Array
-from companion.protocols.stream_health import Trouble
+from companion.protocols.stream_health import SILENT, Trouble
 
 logger = logging.getLogger(__name__)
 
@@ -76,14 +76,21 @@ class SensorWatch:
 
     def update(self, now_s: float) -> None:
         self._note_motion()
+        troubles: dict[str, str] = {}
         for sensor in self._sensors:
             found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
-            if found is not None and found.implausible:
+            if found is None:
+                continue
+            words = f"{sensor.name}: {found.words.removeprefix(f'{sensor.link.settings}: ')}"
+            if found.key == ABSENT or found.key == sensor.health.reported != SILENT:
+                troubles |= {role.name: words for role in sensor.roles}
+            if found.implausible:
                 if is_news:
                     # With this sensor no calibration can finish, and values already written may be wrong.
-                    words = found.words.removeprefix(f"{sensor.link.settings}: ")
-                    self._say(Severity.WARNING, f"{sensor.name}: {words}", Weight.NEWS)
+                    self._say(Severity.WARNING, words, Weight.NEWS)
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
+        for source in self._collector.sources():
+            source.trouble = troubles.get(source.name, "")
 
     def _note_motion(self) -> None:
         for name, batch in self._collector.imu_seconds().items():
@@ -133,16 +140,9 @@ class SensorWatch:
         return Trouble("stuck", message("sensor_stuck", evidence=evidence), implausible=True)
 
     def implausible(self) -> str | None:
-        return next((words for plausible, words in self._troubles() if not plausible), None)
-
-    def named_in(self, reason: str) -> str | None:
-        """Return the trouble of a sensor that `reason` names; None: it names none with trouble."""
-        return next((words for _, words in self._troubles() if words.split(":")[0] in reason), None)
-
-    def _troubles(self) -> list[tuple[bool, str]]:
         now_s = asyncio.get_running_loop().time()
         found = [(sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors]
-        return sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)
+        return next((f"{name}: {each.words}" for name, each in found if each is not None and each.implausible), None)
 
 
 def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:

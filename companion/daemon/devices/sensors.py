@@ -54,7 +54,7 @@ class SensorHealth:
         self._breaks = 0
         self._stuck: Trouble | None = None
         self._opened_s = 0.0
-        self._reported: str | None = None
+        self.reported: str | None = None
         self._began_s = 0.0
         self._good_since_s: float | None = None
         self._warned_s: dict[str, float] = {}
@@ -86,22 +86,22 @@ class SensorHealth:
 
     def _report(self, found: Trouble | None, now_s: float) -> bool:
         if found is None:
-            if self._reported is None:
+            if self.reported is None:
                 return False
             if self._good_since_s is None:
                 self._good_since_s = now_s
             if now_s - self._good_since_s >= GOOD_AFTER_S:
                 logger.info("%s: good again after %.0f s", self.link.name, self._good_since_s - self._began_s)
-                self._reported = None
+                self.reported = None
             return False
         self._good_since_s = None
-        if found.key == self._reported:
+        if found.key == self.reported:
             return False
         if found.key == ABSENT or (now_s - self._opened_s < SILENT_AFTER_S and not found.implausible):
             return False  # `ByteLink` reports a lost port; a device may need a moment to start
-        if self._reported is None:
+        if self.reported is None:
             self._began_s = now_s
-        self._reported = found.key
+        self.reported = found.key
         self.counts[found.key] += 1
         return self._warn(found, now_s)
 

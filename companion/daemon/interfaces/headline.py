@@ -141,8 +141,7 @@ class Headlines:
             return "NOT READY", words, "bad"
         held_back, todo = self._readiness.in_force.held_back, self._automatic.why_not()
         if (held_back is None and todo is None) or (answer.verdict == "refuse" and not answer.against):
-            # Prefer the sensor's own trouble, which names a remedy, to its consequence that no samples arrive.
-            return "NOT CALIBRATED", self._devices.watch.named_in(answer.words) or answer.words, "bad"
+            return "NOT CALIBRATED", answer.words, "bad"
         words = words if held_back is not None or todo == words else f"{words}: {todo}"
         return self._failed() or ("NOT CALIBRATED", words, "bad")
 

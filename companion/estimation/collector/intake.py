@@ -188,7 +188,7 @@ class Source:
     def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
         self.kind, self.name, self.batches, self.gate = kind, name, batches, gate
         self.verdict = GateVerdict(still=False)
-        self.hint = ""
+        self.hint = self.trouble = ""  # Texts in place of "no data": on the readings, and on the bytes of the port
 
     @property
     def label(self) -> str:
@@ -225,11 +225,10 @@ class Source:
 
     def silence(self, now_s: float) -> str | None:
         last = self.batches.last_s
-        if last is None:
-            return self.hint or f"no data from {self.label} yet"
-        if now_s - last > _SILENT_S:
-            return self.hint or f"no data from {self.label} for {now_s - last:.0f} s"
-        return None
+        if last is not None and now_s - last <= _SILENT_S:
+            return None
+        since = "yet" if last is None else f"for {now_s - last:.0f} s"
+        return self.trouble or self.hint or f"no data from {self.label} {since}"
 
     def status(self, now_s: float) -> SourceStatus:
         silence, newest = self.silence(now_s), self.newest

@@ -133,7 +133,7 @@ class RollingCollector:
         """
         if math.isfinite(now_s):
             self._now_s = now_s
-            for source in self._sources():
+            for source in self.sources():
                 source.batches.close_before(now_s - _CLOSE_S)
             for imu in self.imus.values():
                 imu.raw.close_before(now_s - _CLOSE_S)
@@ -187,7 +187,7 @@ class RollingCollector:
         The current second is dropped, too. The still stretch begins again. The learned noise is not dropped.
         """
         self._windows.forget(imu)
-        for source in self._sources():
+        for source in self.sources():
             if imu is None or (source.kind == "imu" and source.name == imu):
                 source.forget()
         self._turns.forget(imu)
@@ -242,7 +242,7 @@ class RollingCollector:
             obstacle=obstacle,
             enough=enough,
             progress=min(found.progress, 1.0 if enough else 0.99),
-            sources=tuple(source.status(now_s) for source in self._sources()),
+            sources=tuple(source.status(now_s) for source in self.sources()),
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
@@ -281,21 +281,21 @@ class RollingCollector:
 
     # --- inside
 
-    def _sources(self) -> list[Source]:
+    def sources(self) -> list[Source]:
         return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
 
     def _others(self) -> list[GateVerdict]:
-        return [source.verdict for source in self._sources() if source is not self._heading]
+        return [source.verdict for source in self.sources() if source is not self._heading]
 
     def _break(self) -> None:
         self._windows.new_stretch()
         self._turns.new_stretch()
-        for source in self._sources():
+        for source in self.sources():
             source.gate.new_stretch()
 
     def _evaluate(self) -> None:
         """Judge every second that all sensors have completed, or for which the wait for silent sensors is over."""
-        sources = self._sources()
+        sources = self.sources()
         restarts = sum(source.batches.restarts for source in sources)
         if restarts > self._restarts:
             # A part of the good seconds has been dropped.
@@ -353,7 +353,7 @@ class RollingCollector:
         return self._turns.add_second(slot, imus, heading, good=good)
 
     def _obstacle(self, now_s: float) -> CollectorObstacle | None:
-        sources = self._sources()
+        sources = self.sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
             return CollectorObstacle(silence)
         if self._turns.words and not any(verdict.words for verdict in self._others()):

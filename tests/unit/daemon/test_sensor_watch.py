@@ -12,11 +12,11 @@ import pytest
 
 from companion.component.statustext import Severity
 from companion.daemon.devices.sensor_watch import NO_OFFSETS, SensorWatch
+from companion.messages import remedy
 from companion.protocols.stream_health import Trouble
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample, Vector
-from tests.support.chatter import Listening
+from tests.support.chatter import Listening, compass_frame
 from tests.support.still_aircraft import imu
-from tests.support.virtual_time import run_virtual
 
 START_S = 1000.0
 
@@ -91,94 +91,83 @@ def heading(t_s: float) -> CompassSample:
     return CompassSample(t_s, 123.4, 18.6, -0.5)
 
 
-def on_the_clock(test: Callable[[], None]) -> None:
-    async def main() -> None:
-        test()
-
-    run_virtual(main())
-
-
-def test_a_gradienter_that_repeats_its_digits_while_all_stands_still_is_left_in_peace() -> None:
-    def check() -> None:
-        bench = SensorWatchBench("gradienter")
-        assert bench.run(120.0, tilt) is None
-        assert bench.resets == []
-
-    on_the_clock(check)
+async def test_a_gradienter_that_repeats_its_digits_while_all_stands_still_is_left_in_peace() -> None:
+    bench = SensorWatchBench("gradienter")
+    assert bench.run(120.0, tilt) is None
+    assert bench.resets == []
 
 
-def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
+async def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
 
-    def check() -> None:
-        bench = SensorWatchBench("gradienter")
-        bench.run(10.0, tilt)
-        assert bench.run(2.0, tilt, pitch_deg=2.0) is None, "one second may be a jolt"
-        found = bench.run(8.0, tilt, pitch_deg=8.0)
-        ((severity, said),) = bench.said
-        assert severity is Severity.WARNING
-        assert said.startswith("gradienter: stuck: the same reading for ")
-        assert said.endswith("; switch its power off and on")
-        assert found is not None
-        assert (found.key, found.implausible) == ("stuck", True)
-        assert "while the aircraft tilted by 8 deg" in found.words
-        assert bench.resets, "nothing may be measured with it"
-        assert bench.one.counts == {"stuck": 1}
-        assert bench.run(2.0, lambda t_s: TiltSample(t_s, 0.43, 8.0 + 1e-3 * (t_s % 3)), pitch_deg=8.0) is None
-        count = len(bench.resets)
-        assert bench.run(5.0, lambda t_s: TiltSample(t_s, 0.43, 8.0 + 1e-3 * (t_s % 3)), pitch_deg=8.0) is None
-        assert len(bench.resets) == count
-
-    on_the_clock(check)
+    bench = SensorWatchBench("gradienter")
+    bench.run(10.0, tilt)
+    assert bench.run(2.0, tilt, pitch_deg=2.0) is None, "one second may be a jolt"
+    found = bench.run(8.0, tilt, pitch_deg=8.0)
+    ((severity, said),) = bench.said
+    assert severity is Severity.WARNING
+    assert said.startswith("gradienter: stuck: the same reading for ")
+    assert said.endswith("; switch its power off and on")
+    assert found is not None
+    assert (found.key, found.implausible) == ("stuck", True)
+    assert "while the aircraft tilted by 8 deg" in found.words
+    assert bench.resets, "nothing may be measured with it"
+    assert bench.one.counts == {"stuck": 1}
+    assert bench.run(2.0, lambda t_s: TiltSample(t_s, 0.43, 8.0 + 1e-3 * (t_s % 3)), pitch_deg=8.0) is None
+    count = len(bench.resets)
+    assert bench.run(5.0, lambda t_s: TiltSample(t_s, 0.43, 8.0 + 1e-3 * (t_s % 3)), pitch_deg=8.0) is None
+    assert len(bench.resets) == count
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warnings) == 1
     assert warnings[0].startswith("gradienter: /nowhere at 9600 baud")
     assert any("gradienter: good again after" in record.getMessage() for record in caplog.records)
 
 
-def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_biased() -> None:
-    def check() -> None:
-        bench = SensorWatchBench("compass")
-        assert bench.run(60.0, heading, bias_deg_s=8.0) is None, "480 deg of bias"
-        assert bench.run(10.0, heading, pitch_deg=10.0) is None, "a heading may stay when it tilts"
-        found = bench.run(4.0, heading, turn_deg_s=30.0)
-        assert found is not None
-        assert "turned by" in found.words
-        assert bench.run(2.0, lambda t_s: CompassSample(t_s, t_s % 360.0)) is None
-
-    on_the_clock(check)
+async def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_biased() -> None:
+    bench = SensorWatchBench("compass")
+    assert bench.run(60.0, heading, bias_deg_s=8.0) is None, "480 deg of bias"
+    assert bench.run(10.0, heading, pitch_deg=10.0) is None, "a heading may stay when it tilts"
+    found = bench.run(4.0, heading, turn_deg_s=30.0)
+    assert found is not None
+    assert "turned by" in found.words
+    assert bench.run(2.0, lambda t_s: CompassSample(t_s, t_s % 360.0)) is None
 
 
-def test_new_offsets_and_another_orientation_are_no_tilt() -> None:
-    def check() -> None:
-        bench = SensorWatchBench("gradienter")
-        bench.run(10.0, tilt)
-        bench.offset = None
-        bench.run(6.0, tilt)
-        bench.offset = (1.0, -0.5, 0.3)
-        bench.one.collector.reset("offsets written", "fc")
-        assert bench.run(10.0, tilt) is None, "the output has stepped by 6 deg"
-        bench.turned, bench.offset = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), (1.0, -0.5, 0.4)
-        bench.one.collector.reset("the autopilot's offsets were read anew", "fc")
-        assert bench.run(10.0, tilt) is None, "AHRS_ORIENTATION was set right"
-
-    on_the_clock(check)
+async def test_new_offsets_and_another_orientation_are_no_tilt() -> None:
+    bench = SensorWatchBench("gradienter")
+    bench.run(10.0, tilt)
+    bench.offset = None
+    bench.run(6.0, tilt)
+    bench.offset = (1.0, -0.5, 0.3)
+    bench.one.collector.reset("offsets written", "fc")
+    assert bench.run(10.0, tilt) is None, "the output has stepped by 6 deg"
+    bench.turned, bench.offset = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), (1.0, -0.5, 0.4)
+    bench.one.collector.reset("the autopilot's offsets were read anew", "fc")
+    assert bench.run(10.0, tilt) is None, "AHRS_ORIENTATION was set right"
 
 
-def test_one_imu_that_is_broken_convicts_nobody() -> None:
-    def check() -> None:
-        bench = SensorWatchBench("gradienter")
-        add = bench.one.collector.add_imu
-        bench.one.collector.set_imu(imu("second"))
+async def test_one_imu_that_is_broken_convicts_nobody() -> None:
+    bench = SensorWatchBench("gradienter")
+    add = bench.one.collector.add_imu
+    bench.one.collector.set_imu(imu("second"))
 
-        def both(name: str, sample: ImuSample) -> None:
-            add(name, sample)
-            add("second", ImuSample(sample.t_s, (0.0, 0.0, sample.gyro_rad_s[2]), (0.0, 0.0, -9.8)))
+    def both(name: str, sample: ImuSample) -> None:
+        add(name, sample)
+        add("second", ImuSample(sample.t_s, (0.0, 0.0, sample.gyro_rad_s[2]), (0.0, 0.0, -9.8)))
 
-        bench.one.collector.add_imu = both  # type: ignore[method-assign]
-        bench.run(5.0, tilt)
-        assert bench.run(10.0, tilt, pitch_deg=20.0) is None
+    bench.one.collector.add_imu = both  # type: ignore[method-assign]
+    bench.run(5.0, tilt)
+    assert bench.run(10.0, tilt, pitch_deg=20.0) is None
 
-    on_the_clock(check)
+
+async def test_the_wait_for_a_gradienter_on_the_compass_port_names_the_device_found() -> None:
+    bench = SensorWatchBench("gradienter")
+    for tick in range(60):
+        bench.one.sensor.receive(compass_frame(tick), now_s := START_S + 0.1 * tick)
+        bench.one.watch.update(now_s)
+    sources = bench.one.collector.status(now_s).sources
+    waits = next(one.words for one in sources if one.name == "gradienter")
+    assert waits == "gradienter: this is hmr3300, a device for compass, not inclinometer_xy"
+    assert "swapped" in remedy(f"{bench.one.sensor.link.settings}: {waits}")

@@ -139,7 +139,7 @@ def test_the_window_is_at_most_max_s_long_and_memory_is_bounded() -> None:
     assert status.enough
     assert status.progress == 1.0
     assert status.still_s > 250.0
-    for source in feed.collector._sources():
+    for source in feed.collector.sources():
         assert len(source.batches.batches) <= 30
 
 
