@@ -125,10 +125,7 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:
             raise
-        reply = await request(options, at_interrupt | {"face": "interrupt"})
-        if reply.get("reason") == "cancelled by Ctrl-C's cancel":
-            reply["reason"] = "Cancelled (Ctrl-C). Nothing was written."
-        return reply
+        return await request(options, at_interrupt | {"face": "interrupt"})
     finally:
         silent.cancel()
         progress.close()
@@ -209,7 +206,7 @@ async def temperature(options: argparse.Namespace) -> int:
 
 def _heading(answer: Object) -> str:
     state: str = answer["state"].upper()
-    return f"{state}: {answer['reason']}" if answer["reason"] else state
+    return f"{state}: {show.without_state(answer)}" if answer["reason"] else state
 
 
 async def setup(options: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
 
 def record_lines(record: Object) -> list[str]:
-    lines = [f"{record['state'].upper()} after {record['duration_s']:.0f} s: {record['reason']}"]
+    lines = [f"{record['state'].upper()} after {record['duration_s']:.0f} s: {without_state(record)}"]
     pose = record.get("pose")
     if pose is not None:
         sigma = pose["sigma_deg"]
@@ -46,6 +46,11 @@ def record_lines(record: Object) -> list[str]:
     if not outcomes or set(outcomes) == {"rolled_back"}:
         return [*lines, "The autopilot has its old values."]
     return [*lines, f"{len(outcomes)} parameters written to the autopilot; to restore them: companion undo"]
+
+
+def without_state(ended: Object) -> str:
+    reason: str = ended["reason"]  # that of a cancelled job begins with "cancelled"
+    return reason.removeprefix(f"{ended['state']} ")
 
 
 def _magnetic_lines(magnetic: Object | None) -> list[str]:
@@ -169,7 +174,7 @@ def end_lines(status: Object) -> list[str]:
     found = "none yet"
     if last is not None:
         undone = ", undone" if last["undone_at"] else ""
-        found = f"{last['state']} at {_minute(last['started_at'])} UTC{undone}: {last['reason']}"
+        found = f"{last['state']} at {_minute(last['started_at'])} UTC{undone}: {without_state(last)}"
     return [*lines, f"last calibration: {found}"]
 
 
@@ -243,7 +248,7 @@ def history_lines(
         lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
     lines += [
         f"{number:4} {record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
-        f" {record['duration_s']:5.0f}s  {record['reason']}{_what_became(record)}"
+        f" {record['duration_s']:5.0f}s  {without_state(record)}{_what_became(record)}"
         for number, record in zip(numbers, records, strict=True)
     ]
     if by_hand:

@@ -63,6 +63,7 @@ class Job:
         self.progress_percent = 0  # 0 to 100; it falls only where a measurement begins again
         self._until_s = 0.0
         self.cancelled_by: str | None = None
+        self.has_written = False  # True once a write to the autopilot has begun, even if it was rolled back
         self._nudge = asyncio.Event()
 
     @property
@@ -102,7 +103,8 @@ class Job:
     def check_cancelled(self) -> None:
         """Raise JobCancelledError, which names the canceller, if cancelled; call this where stopping is safe."""
         if self.cancelled_by is not None:
-            raise JobCancelledError(f"cancelled by {self.cancelled_by}")
+            left = "" if self.has_written else "; nothing written"
+            raise JobCancelledError(f"cancelled by {self.cancelled_by}{left}")
 
     def check_time(self) -> None:
         """Raise CalibrationRefusedError if the deadline has passed."""

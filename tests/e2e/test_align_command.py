@@ -52,7 +52,7 @@ async def test_ctrl_c_a_closed_terminal_and_who_has_to_wait(tmp_path: Path) -> N
         assert status["readings"]["gradienter_x_deg"] is not None
         assert status["readings"]["compass_deg"] is not None
         cancelled = await companion("-c", config, "cancel", "--json")
-        assert cancelled.json["state"] == "cancelled"
+        assert cancelled.json == {"state": "cancelled", "reason": "cancelled by companion cancel; nothing written"}
 
         third = await companion("-c", config, "align", "zero", "--timeout", "4", "--json")
         assert third.code == FAILED

@@ -220,7 +220,7 @@ async def test_ctrl_c_cancels_the_calibration_that_is_watched(tmp_path: Path) ->
             watched.send_signal(signal.SIGINT)
             out, _ = await watched.communicate()
         assert watched.returncode == FAILED
-        assert out.decode() == "Cancelled (Ctrl-C). Nothing was written.\n"
+        assert out.decode() == "cancelled by Ctrl-C; nothing written\n"
         status = (await companion("-c", config, "status", "--json")).json
         assert status["state"] not in ("waiting", "measuring")
         assert line.scenario.autopilot.writes == []

@@ -90,7 +90,7 @@ async def test_a_cancel_from_another_face_is_seen_here(tmp_path: Path) -> None:
             replies = [reply async for reply in rig.service.faces.answer({"command": "cancel"})]
             assert replies[-1]["state"] == "cancelled"
             ended = await watcher.response("field/heron", "calibrate", "x", "cancelled")
-            assert ended["reason"] == "cancelled by companion cancel"
+            assert ended["reason"] == "cancelled by companion cancel; nothing written"
             kept = await watcher.until("field/heron/calibration/state")
             assert kept.json["state"] == "cancelled"
 
@@ -100,7 +100,7 @@ async def test_a_cancel_from_another_face_is_seen_here(tmp_path: Path) -> None:
             await watcher.publish("field/heron/request/cancel")
             await watcher.response("field/heron", "calibrate", "y", "cancelled")
             said = await watcher.response("field/heron", "cancel", None)
-            assert said["reason"] == "cancelled by mqtt cancel"
+            assert said["reason"] == "cancelled by mqtt; nothing written"
 
 
 # --- requests that nobody wants

@@ -95,7 +95,7 @@ async def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same
         busy = await press(rig, "calibrate")
         assert busy[0] == 409
         assert "running" in busy[1]
-        assert await press(rig, "cancel") == (200, "cancelled by the page's cancel")
+        assert await press(rig, "cancel") == (200, "cancelled by the page; nothing written")
         assert (await job.finished).outcome == "cancelled"
 
         before = rig.double.parameter("INS_GYROFFS_X")

@@ -178,7 +178,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             assert await tab.value("document.querySelector('#calibrate').disabled")
             await tab.touch("#cancel")
             await tab.lift()
-            await tab.until(f'{SAID} === "CANCEL: cancelled by the page\'s cancel"')
+            await tab.until(f'{SAID} === "CANCEL: cancelled by the page; nothing written"')
             await tab.until("document.querySelector('#last').textContent.includes('cancelled by the page')")
             assert (await here.status())["last"]["state"] == "cancelled"
 
@@ -194,7 +194,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             await tab.value("scrollTo(0, 0)")
             await tab.touch("#cancel")
             await tab.lift()
-            await tab.until("$('result').textContent === \"TURN: cancelled by the page's cancel\"")
+            await tab.until("$('result').textContent === \"TURN: cancelled by the page; nothing written\"")
             assert await tab.value("$('standing').textContent") == "CANCELLED"
             await tab.value("$('dismiss').click()")
             await asyncio.sleep(1.0)
@@ -273,7 +273,7 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
             assert (await here.status())["state"] != "idle"
             await tab.mouse("#cancel", "mousePressed")
             await tab.mouse("#cancel", "mouseReleased")
-            await tab.until(f'{SAID} === "CANCEL: cancelled by the page\'s cancel"')
+            await tab.until(f'{SAID} === "CANCEL: cancelled by the page; nothing written"')
 
             # An address that brings the token along: nothing has to be typed.
             await tab.value("localStorage.clear()")

@@ -159,7 +159,7 @@ class Calibrating(Subsystem):
             yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
 
     async def _cancel(self, _asked: Cancel, face: str) -> AsyncIterator[Object]:
-        running = self.manager.cancel(f"{face} cancel")
+        running = self.manager.cancel(f"{face} cancel" if face == "companion" else face.removesuffix("'s"))
         if running and self.manager.job is not None:
             await asyncio.shield(self.manager.job.finished)
         reason = self.manager.reason if running else "nothing was running"

@@ -44,7 +44,7 @@ MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
 MOST_SAMPLES: Final = 1000
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet", "interrupt": "Ctrl-C's"}
-"""Names of interfaces in requests, and in texts for people, as in "cancelled by mqtt cancel"."""
+"""Names of interfaces in requests, and in texts for people, as in "asked for by mqtt calibrate"."""
 _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
 """Status of the web page while its process reports nothing."""
 

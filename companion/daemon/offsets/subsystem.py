@@ -118,6 +118,7 @@ class Offsets(Subsystem):
         self._machine.on(Event.WRITE)
         job.progress(MEASURED_PERCENT, message("write_in_progress", count=parameters, what="parameters"))
         await self._wait_disarmed()
+        job.has_written = True
 
     async def commit(
         self,
