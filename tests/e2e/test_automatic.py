@@ -190,6 +190,20 @@ async def test_cancelling_an_automatic_calibration_ends_it_for_good(tmp_path: Pa
         assert CANCELLED not in rig.ground.acks(CALIBRATE)
 
 
+async def test_a_cancel_after_a_restart_leaves_the_offsets_from_before_in_the_headline(tmp_path: Path) -> None:
+    async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+        await calibrated_by_itself(rig)
+        await rig.restart()
+        await rig.until(lambda: rig.service.calibrating.manager.blocking_reason() is None, 10.0)
+        job = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
+        assert isinstance(job, Job)
+        job.cancel("test")
+        await job.finished
+        at = rig.service.calibrating.store.history()[0].started_at[:16].replace("T", " ")
+        words = f"not confirmed since start (the autopilot has the offsets of {at} UTC): calibrates by itself in 5 min"
+        await rig.until(lambda: rig.service.status()["headline"]["reason"] == words, 15.0)
+
+
 async def test_failures_are_not_repeated_for_ever(tmp_path: Path) -> None:
     async with Rig(tmp_path, at_arm="gate", max_s=12.0, **SLOW).running() as rig:
         rig.double.faults.echo_without_effect = True

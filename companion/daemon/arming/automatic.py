@@ -79,7 +79,7 @@ class Automatic:
         # Offsets replaced by a boot, and a new gradienter zero, are urgent unless a calibration has failed.
         urgent = any(finding.why in (Why.REPLACED, Why.ALIGNED) for finding in self._in_force.findings(now_s))
         if self._next_s > now_s and not (urgent and self._failures == 0):
-            return f"again in {math.ceil((self._next_s - now_s) / 60)} min"
+            return f"calibrates by itself in {math.ceil((self._next_s - now_s) / 60)} min"
         return None
 
     def _writes_today(self) -> int:

@@ -52,6 +52,7 @@ logger = logging.getLogger(__name__)
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
 """Findings reported even while a result is held back: people's choices, and writes without a visible effect."""
+NOT_CONFIRMED: Final = "not confirmed since start"
 SETTLED_EVERY_S: Final = 5  # Interval between checks of the output while there is no finding; otherwise 1 s
 
 
@@ -110,7 +111,7 @@ class ActiveCalibration:
                 if any(finding.why is held for finding in found):
                     continue
                 since = held is Why.NEVER and self.earlier is not None
-                against = [Objection(held, "not confirmed since start" if since else held.value)]
+                against = [Objection(held, NOT_CONFIRMED if since else held.value)]
             else:
                 model = noise_profile(self._core.profiles.of(name)).of(triad)
                 degc = self.temperatures_degc.get(name)
@@ -131,6 +132,16 @@ class ActiveCalibration:
     def earlier(self) -> Record | None:
         """Last good calibration, from this run of the daemon or an earlier one; None if it was undone."""
         return None if self.undone else self.manager.last_good
+
+    @property
+    def kept_from(self) -> str | None:
+        """Return the time of the last good calibration if the autopilot still has its offsets; otherwise None."""
+        record = self.earlier
+        written = {} if record is None else record.written
+        known = [imu.calibration for imu in self._imus.values()]
+        if record is None or not (known and written) or any(one is None or one.contradicts(written) for one in known):
+            return None
+        return f"{record.started_at[:16].replace('T', ' ')} UTC"
 
     @property
     def worth_writing_s(self) -> float:

@@ -94,13 +94,18 @@ class CalibrationManager:
         self.asked: Job | None = None  # Latest job that somebody asked for, other than an undo
         self.reason = ""
         self.last: Record | None = None  # Record of the latest calibration, loaded from disk at start
+        self._ended: Record | None = None  # Record of the latest one that nobody cancelled: it may have written offsets
         self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified when a job ends, before its requester
         core.vehicle.on_event.add(self._on_event)
         self._recovery.on_recovered = self._recovered
 
     def load(self) -> None:
         try:
-            self.last = next(iter(self._store.history(limit=1)), None)
+            for _, record in self._store.latest():
+                self.last = self.last or record
+                if record.state != "cancelled":
+                    self._ended = record
+                    break
         except StorageError as error:
             logger.warning("%s; the companion continues without earlier records", error)
 
@@ -123,7 +128,8 @@ class CalibrationManager:
 
     @property
     def last_good(self) -> Record | None:
-        return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
+        found = self._ended
+        return found if found is not None and found.state == "done" and not found.undone_at else None
 
     def blocking_reason(self, among: Collection[Precondition] = tuple(Precondition)) -> tuple[Precondition, str] | None:
         unmet = blocked(self._vehicle, self._recovery.journal, self.running)
@@ -300,6 +306,7 @@ class CalibrationManager:
 
     async def _keep(self, record: Record) -> None:
         self.last = record
+        self._ended = self._ended if record.state == "cancelled" else record
         try:
             if record.is_worth_keeping:
                 await self._core.offload(self._store.save, record)
@@ -318,7 +325,9 @@ class CalibrationManager:
         except StorageError as error:
             logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
             marked = [step.origin.at] if step.origin.at else []
-        if self.last is not None and self.last.started_at in marked:
-            self.last = msgspec.structs.replace(self.last, undone_at=now)
+        self.last, self._ended = (
+            each if each is None or each.started_at not in marked else msgspec.structs.replace(each, undone_at=now)
+            for each in (self.last, self._ended)
+        )
         await self._parts.memory.forget(marked)
         return bool(marked or step.origin.what)

@@ -7,6 +7,7 @@ from typing import Final, Literal
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import ArmAnswer
+from companion.daemon.arming.in_force import NOT_CONFIRMED
 from companion.daemon.arming.readiness import NEEDED
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.manager import Precondition
@@ -107,13 +108,11 @@ class Headlines:
             return "CANCELLING", words, "busy"
         if state is State.UNDOING:
             return state.word.upper(), "the old values are being written", "busy"
-        if state is State.SETTLING:
-            return state.word.upper(), words, "busy"
         moves = self._collector.glance(now_s).moves
         if state is State.VERIFYING and moves is not None and job.words != TELEMETRY:
             return "HOLD STILL", moves, "wait"
         if state is not State.WAITING:
-            percent = f" {job.progress_percent} %" if job.act is None else ""
+            percent = f" {job.progress_percent} %" if job.act is None and state is not State.SETTLING else ""
             return f"{state.word.upper()}{percent}", words, "busy"
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()
@@ -139,9 +138,12 @@ class Headlines:
             return self._by_answer(answer)
         if words == self._readiness.owed.words:
             return "NOT READY", words, "bad"
-        held_back, todo = self._readiness.in_force.held_back, self._automatic.why_not()
+        in_force, todo = self._readiness.in_force, self._automatic.why_not()
+        held_back = in_force.held_back
         if (held_back is None and todo is None) or (answer.verdict == "refuse" and not answer.against):
             return "NOT CALIBRATED", answer.words, "bad"
+        if words == NOT_CONFIRMED and (kept_from := in_force.kept_from) is not None:
+            words += f" (the autopilot has the offsets of {kept_from})"
         words = words if held_back is not None or todo == words else f"{words}: {todo}"
         return self._failed() or ("NOT CALIBRATED", words, "bad")
 
