@@ -174,6 +174,7 @@ async def test_a_mounting_that_contradicts_the_turn_is_not_trusted(tmp_path: Pat
         headline = made.service.status()["headline"]
         assert headline["tone"] != "good"
         assert "gradienter not trusted" in headline["reason"]
+        assert headline["remedy"].startswith("Correct both"), "there may be nothing to undo"
 
 
 async def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
