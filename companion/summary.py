@@ -7,6 +7,7 @@ from typing import Final, Literal
 from companion import messages
 from companion.formats import Object
 
+_LOST_SHARE: Final = 0.01  # Share of lost samples from which a calibration warns (estimation.means.windows)
 _HEARTBEAT_S: Final = 2.0  # maximum age of the autopilot's heartbeat before the link counts as lost
 REFUSES: Final = "will not arm"  # Name of a row with one of the autopilot's reasons against arming
 
@@ -53,9 +54,10 @@ def _wrong(name: str, words: str) -> StatusRow:
 
 
 def _counts(device: Object) -> str:
+    lost, came = device.get("lost") or 0, device.get("frames") or 0
     words = {
         "bad frames": sum((device.get("rejected") or {}).values()),
-        "samples lost": device.get("lost"),
+        "samples lost": f"{lost / (lost + came):.0%}" if lost > _LOST_SHARE * (lost + came) else None,
         "repeated": (device.get("dropped") or {}).get("repeated"),
         "too late": device.get("too_late"),
         "restarts": device.get("restarts"),

@@ -11,8 +11,8 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
         "headline": {"word": "READY", "reason": "calibrated 5 s ago", "tone": "good"},
         "vehicle": {"heartbeat_age_s": 2.5, "summary": "ArduPilot, disarmed", "signing": None},
         "devices": [
-            {"name": "imu", "good": True, "summary": "200 Hz", "rejected": {"crc": 3, "length": 1}, "reconnects": 2},
-            {"name": "compass", "good": False, "summary": "silent for 3 s", "lost": 0},
+            {"name": "imu", "good": True, "summary": "200 Hz", "rejected": {"a": 3, "b": 1}, "lost": 9, "frames": 999},
+            {"name": "compass", "good": False, "summary": "silent", "reconnects": 2, "lost": 30, "frames": 970},
         ],
         "compasses": [{"name": "compass 1", "summary": "heading good to 1.2 deg, aligned 2026-11-28"}],
         "ground_stations": {"good": False, "summary": "hear nothing"},
@@ -29,8 +29,8 @@ def test_the_summary_names_each_part_with_its_verdict_and_then_the_warnings() ->
     assert headline(status) == "READY: calibrated 5 s ago"
     assert [row[:3] for row in rows(status)] == [
         ("wrong", "autopilot", "ArduPilot, disarmed"),
-        ("ok", "imu", "200 Hz; bad frames: 4; reconnected: 2"),
-        ("wrong", "compass", "silent for 3 s"),
+        ("ok", "imu", "200 Hz; bad frames: 4"),
+        ("wrong", "compass", "silent; samples lost: 3%; reconnected: 2"),
         ("ok", "compass 1", "heading good to 1.2 deg, aligned 2026-11-28"),
         ("wrong", "ground stations", "hear nothing"),
         ("ok", "mqtt", "connected"),
