@@ -45,7 +45,7 @@ ALIGNMENTS: Final = {
         ("headings", "heading", "sides", "write", "timeout_s"),
     ),
     "show": ("show the stored alignment", ()),
-    "forget": ("return to the zero and sigma of the configuration", ()),
+    "forget": ("return to the zero and sigma of the configuration; a faces alignment stays", ()),
 }
 """Kinds of `companion align`: help, and the fields of the request that each uses."""
 

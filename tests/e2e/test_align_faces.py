@@ -92,9 +92,11 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         (shown,) = made.service.status()["by_hand"]
         assert (shown["what"], shown["reason"], shown["in_force"]) == ("faces", result.reason, True)
         assert set(shown["written"]) == set(old)
+        (answer,) = [one async for one in made.service.faces.answer({"command": "align", "action": "forget"})]
+        assert answer["reason"].startswith("there was no zero to forget; the faces alignment stays")
         # A calibration of the gyros afterwards does not put them out of reach, nor warn of them.
         gyros = {name: made.double.parameter(name) for name in offset_names(1, "gyro")}
-        made.service.calibrating.manager.last = None  # or the gyros of just now count as calibrated
+        made.service.calibrating.manager._ended = None  # or the gyros of just now count as calibrated
         done, after = await calibrated(made, What.GYROS)
         assert done.outcome == "done"
         assert not re.search("scale", " ".join([*after.warnings, *after.imus[0].warnings]))

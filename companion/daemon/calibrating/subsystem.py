@@ -191,7 +191,9 @@ class Calibrating(Subsystem):
             if (record := self.alignment.record) is not None:
                 await self.by_hand.undone(record.measured_at)
             was = await self.alignment.forget()
-            words = "the configuration's zero and sigma are active" if was else "there was no alignment to forget"
+            words = "the configuration's zero and sigma are active" if was else "there was no zero to forget"
+            if self.faces.record is not None:
+                words += "; the faces alignment stays: companion align faces replaces it"
             yield {"kind": "result", "state": "done", "reason": words}
         else:
             job = accepted(self.start_alignment(asked, f"{face} align"))

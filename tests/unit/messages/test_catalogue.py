@@ -36,7 +36,7 @@ NOT_MESSAGES = {
     # Complete in themselves: nothing to do, or said by what the person has just asked for.
     "whole numbers", "… of … s were not still and are left out", "no noise profile … (known: …)", "nothing measured",
     "there is no IMU of the autopilot: none is configured", "the configuration's zero and sigma are active",
-    "there was no alignment to forget", "the companion ends", "starts with companion run", "nose up", "nose down",
+    "there was no zero to forget", "the companion ends", "starts with companion run", "nose up", "nose down",
     "left side down", "right side down", "… (after … more like this, left out)", "TURN IT", "PUT IT DOWN", "HOLD STILL",
     ": type companion fix",
     "the board would sit more than 10 deg askew: no level is for that", "learned from … h at rest in …, saved …",
