@@ -129,6 +129,11 @@ class ActiveCalibration:
         return f"held back: {in_short(kept)} ({', '.join(dict.fromkeys(kept.values()))})" if kept else None
 
     @property
+    def left_out(self) -> str:
+        out = [key for key, state in self._triads.items() if not state.judged]
+        return f"{in_short(out)} left out (telemetry too coarse)" if out else ""
+
+    @property
     def earlier(self) -> Record | None:
         """Last good calibration, from this run of the daemon or an earlier one; None if it was undone."""
         return None if self.undone else self.manager.last_good
@@ -218,7 +223,7 @@ class ActiveCalibration:
                 self._take(imu, asyncio.get_running_loop().time(), job.held_back)
             for key in job.solution.unknown if job.solution is not None else ():
                 if (coarse := self._triads.get(key)) is not None:
-                    self._leave_out(key, coarse)
+                    self._leave_out(coarse)
 
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Inconsistency]) -> None:
         corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s
@@ -301,7 +306,7 @@ class ActiveCalibration:
                 if (state := self._triads.get(key)) is None:
                     continue
                 if key in solution.unknown:
-                    self._leave_out(key, state)
+                    self._leave_out(state)
                     continue
                 if residual is None:
                     continue
@@ -320,11 +325,11 @@ class ActiveCalibration:
         elif self._worth_since_s is None:
             self._worth_since_s = end_s
 
-    def _leave_out(self, key: Key, state: _TriadState) -> None:
+    def _leave_out(self, state: _TriadState) -> None:
         state.present = None
         if state.held in (Why.NEVER, Why.UNDONE) and state.judged and len(self._judged) > 1:
-            logger.warning("%s %s left out of READY: its telemetry is too coarse to show a bias", key[1], key[0])
             state.judged = False
+            logger.warning("%s", self.left_out)
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:
         """Return True if a held-back result is recent and fits the output, and the active calibration does not fit."""

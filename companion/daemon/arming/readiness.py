@@ -247,7 +247,7 @@ class Readiness:
             "verdict": answer.verdict,
             "words": answer.words,
             "state": state,
-            "in_force": words,
+            "in_force": "; ".join(filter(None, (words, self.in_force.left_out))),
             "held_back": self.in_force.held_back,
             "quality": {"gyro": self._quality("gyro", DEG_H), "accel": self._quality("accel", MG)},
             "against": [finding.words for finding in self.in_force.findings(now_s)],

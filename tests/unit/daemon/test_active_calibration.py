@@ -22,7 +22,7 @@ SECOND = '[[imu]]\nname = "second"\nsource = "autopilot"\ninstance = 2\n'
 
 async def test_a_triad_that_no_window_can_measure_is_left_out_after_an_undo(tmp_path: Path) -> None:
     config = parse(ALONE.format(folder=tmp_path, more=SECOND), "test.toml")
-    in_force = Service(config).arming.readiness.in_force
+    in_force = (readiness := Service(config).arming.readiness).in_force
     first, *others = in_force._triads
     assert others
     for state in in_force._triads.values():
@@ -35,6 +35,7 @@ async def test_a_triad_that_no_window_can_measure_is_left_out_after_an_undo(tmp_
     assert not in_force._triads[first].judged
     assert [in_force._triads[key].held for key in others] == [Why.UNDONE] * len(others)
     assert in_force.findings(20.0)
+    assert str(readiness.status()["in_force"]).endswith("; gyros of fc left out (telemetry too coarse)")
 
 
 @pytest.mark.parametrize(("by_faces", "shown"), [(0.0003, 0.0003), (0.02, 0.009), (None, 0.009)])
