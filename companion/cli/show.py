@@ -26,8 +26,7 @@ _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
 def record_lines(record: Object) -> list[str]:
     lines = [f"{record['state'].upper()} after {record['duration_s']:.0f} s: {without_state(record)}"]
-    pose = record.get("pose")
-    if pose is not None:
+    if (pose := record.get("pose")) is not None:
         sigma = pose["sigma_deg"]
         angles = (
             f"{words} unknown"
@@ -54,9 +53,7 @@ def without_state(ended: Object) -> str:
 
 
 def _magnetic_lines(magnetic: Object | None) -> list[str]:
-    if magnetic is None:
-        return []
-    return [f"compass: {msgspec.convert(magnetic, Magnetic).in_words()}"]
+    return [] if magnetic is None else [f"compass: {msgspec.convert(magnetic, Magnetic).in_words()}"]
 
 
 def _imu_lines(imu: Object) -> list[str]:
@@ -125,8 +122,7 @@ def status_lines(status: Object) -> list[str]:
     lines += [f"by hand, {_minute(one['measured_at'])} UTC: {by_hand_words(one)}" for one in status["by_hand"]]
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
-    if status["undoable"]:
-        lines.append(undo_line(status["undoable"]))
+    lines += [undo_line(status["undoable"])] if status["undoable"] else []
     return lines if last is None else [*lines, *_magnetic_lines(last.get("magnetic")), *last.get("when_warm", [])]
 
 
@@ -147,8 +143,8 @@ def undo_line(steps: Sequence[Object]) -> str:
     when = f" of {_minute(step['at'])} UTC" if step["at"] else ""
     several = f" and all since {_minute(step['since'])}" if step["since"] != step["at"] else ""
     further = f"; {more} more after it" if more else ""
-    words = f"{step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters{further}"
-    return f"the next undo reverts: {words}"
+    what = step["what"] or "last write"
+    return f"the next undo reverts: {what}{when}{several}, {len(step['parameters'])} parameters{further}"
 
 
 def _minute(iso: str) -> str:
@@ -182,8 +178,7 @@ def monitor_lines(status: Object) -> list[str]:
     lines = []
     if (percent := status["progress"]) is not None:
         lines += [f"[{'#' * (percent * _BAR // 100):.<{_BAR}}] {percent} %", ""]
-    pose = status["pose"]
-    if pose is not None:
+    if (pose := status["pose"]) is not None:
         heading = f"{_number(pose['heading_deg'], '.1f')} {pose['north'] or ''}"
         lines.append(f"pitch {pose['pitch_deg']:+.2f}  roll {pose['roll_deg']:+.2f}  heading {heading}")
     lines += ["", *_judged(summary.rows(status)), ""]

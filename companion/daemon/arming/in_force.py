@@ -78,10 +78,8 @@ class ActiveCalibration:
         self.manager, self._memory = calibrating.manager, calibrating.memory
         self._estimator = calibrating.estimator
         settings = models.settings(config)
-        self._floors: dict[Triad, float] = {
-            "gyro": settings.target_gyro_sigma_rad_s,
-            "accel": settings.target_accel_sigma_m_s2,
-        }
+        gyro, accel = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
+        self._floors: dict[Triad, float] = {"gyro": gyro, "accel": accel}
         # IMUs used by the autopilot; if it uses none of the configured ones, all of them.
         flown = [imu.name for imu in config.imu if imu.is_flown]
         names = flown or [imu.name for imu in config.imu]
@@ -141,9 +139,8 @@ class ActiveCalibration:
     @property
     def kept_from(self) -> str | None:
         """Return the time of the last good calibration if the autopilot still has its offsets; otherwise None."""
-        record = self.earlier
+        record, known = self.earlier, [imu.calibration for imu in self._imus.values()]
         written = {} if record is None else record.written
-        known = [imu.calibration for imu in self._imus.values()]
         if record is None or not (known and written) or any(one is None or one.contradicts(written) for one in known):
             return None
         return f"{record.started_at[:16].replace('T', ' ')} UTC"
@@ -354,15 +351,9 @@ class ActiveCalibration:
             right = key[0] in self._imus and not worth_writing(present, None, self._floors[key[1]])
             if right and held in _SETTLED_BY_MEASURING:
                 state.held = Held(
-                    calibrated_s=None,
-                    confirmed_s=end_s,
-                    temperature_degc=degc,
-                    sigma_use=present.sigma_use,
-                    sigma=present.sigma,
-                    expected=(0.0, 0.0, 0.0),
-                    seen=True,
-                    averaged_s=averaged_s,
-                )
+                    calibrated_s=None, confirmed_s=end_s, temperature_degc=degc, sigma_use=present.sigma_use,
+                    sigma=present.sigma, expected=(0.0, 0.0, 0.0), seen=True, averaged_s=averaged_s,
+                )  # fmt: skip
         elif worst_axis(held, present) is None and (end_s > held.confirmed_s or not held.seen):
             # A write voids earlier telemetry, so this window was sent under the new offsets.
             confirmed_s = max(end_s, held.confirmed_s)

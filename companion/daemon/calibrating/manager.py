@@ -101,11 +101,8 @@ class CalibrationManager:
 
     def load(self) -> None:
         try:
-            for _, record in self._store.latest():
-                self.last = self.last or record
-                if record.state != "cancelled":
-                    self._ended = record
-                    break
+            self.last = next((record for _, record in self._store.latest()), None)
+            self._ended = next((record for _, record in self._store.latest() if record.state != "cancelled"), None)
         except StorageError as error:
             logger.warning("%s; the companion continues without earlier records", error)
 

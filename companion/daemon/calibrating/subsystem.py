@@ -112,24 +112,17 @@ class Calibrating(Subsystem):
             "last": None
             if last is None
             else {
-                "state": last.state,
-                "undone_at": last.undone_at,
-                "started_at": last.started_at,
-                "reason": last.reason,
+                **{key: getattr(last, key) for key in ("state", "undone_at", "started_at", "reason")},
                 "magnetic": msgspec.to_builtins(last.magnetic),
                 "when_warm": [words for imu in last.imus if imu.when_warm is not None for words in imu.when_warm.words],
             },
             "job": None
             if job is None
             else {
-                "kind": job.kind,
-                "what": job.what.name.lower(),
-                "requester": job.requester,
-                "state": manager.state.shown,
-                "percent": manager.progress_percent,
-                "text": words,
+                "kind": job.kind, "what": job.what.name.lower(), "requester": job.requester,
+                "state": manager.state.shown, "percent": manager.progress_percent, "text": words,
             },
-        }
+        }  # fmt: skip
 
     async def _calibrate(self, asked: Calibrate, face: str) -> AsyncIterator[Object]:
         job = accepted(

@@ -86,11 +86,8 @@ class SensorHealth:
 
     def _report(self, found: Trouble | None, now_s: float) -> bool:
         if found is None:
-            if self.reported is None:
-                return False
-            if self._good_since_s is None:
-                self._good_since_s = now_s
-            if now_s - self._good_since_s >= GOOD_AFTER_S:
+            self._good_since_s = now_s if self._good_since_s is None else self._good_since_s
+            if self.reported is not None and now_s - self._good_since_s >= GOOD_AFTER_S:
                 logger.info("%s: good again after %.0f s", self.link.name, self._good_since_s - self._began_s)
                 self.reported = None
             return False
@@ -293,6 +290,4 @@ class SerialSensor:
 
     @property
     def text(self) -> str:
-        if self._held_by:
-            return self._held_by
-        return self.dialogue.words if self.dialogue is not None else ""
+        return self._held_by or (self.dialogue.words if self.dialogue is not None else "")

@@ -139,12 +139,11 @@ class Headlines:
         if words == self._readiness.owed.words:
             return "NOT READY", words, "bad"
         in_force, todo = self._readiness.in_force, self._automatic.why_not()
-        held_back = in_force.held_back
-        if (held_back is None and todo is None) or (answer.verdict == "refuse" and not answer.against):
+        if (in_force.held_back is None and todo is None) or (answer.verdict == "refuse" and not answer.against):
             return "NOT CALIBRATED", answer.words, "bad"
         if words == NOT_CONFIRMED and (kept_from := in_force.kept_from) is not None:
             words += f" (the autopilot has the offsets of {kept_from})"
-        words = words if held_back is not None or todo == words else f"{words}: {todo}"
+        words = words if in_force.held_back is not None or todo == words else f"{words}: {todo}"
         return self._failed() or ("NOT CALIBRATED", words, "bad")
 
     def _failed(self) -> Headline | None:

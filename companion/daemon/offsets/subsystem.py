@@ -174,10 +174,9 @@ class Offsets(Subsystem):
 
     async def _wait_disarmed(self) -> None:
         await self._heartbeat(DISARMED_WITHIN_S)
-        if self._vehicle.arm_state is ArmState.ARMED:
-            raise NotDisarmedError(message("nothing_written", reason="armed"))
-        if self._vehicle.arm_state is ArmState.UNKNOWN:
-            raise NotDisarmedError(message("nothing_written", reason="no heartbeat"))
+        if (state := self._vehicle.arm_state) is not ArmState.DISARMED:
+            reason = "armed" if state is ArmState.ARMED else "no heartbeat"
+            raise NotDisarmedError(message("nothing_written", reason=reason))
 
     async def _heartbeat(self, within_s: float) -> None:
         with contextlib.suppress(TimeoutError):

@@ -110,14 +110,13 @@ class ActiveAlignment:
 
     def _take(self, record: AlignmentRecord | None) -> None:
         self.record, self.unused, self.doubt = record, None, None
-        now = self.settings()
         if record is None:
             return
-        if now is None:
+        if (now := self.settings()) is None:
             self.unused = "no gradienter is configured"
-            return
-        different = [key for key in now.__struct_fields__ if getattr(record.gradienter, key) != getattr(now, key)]
-        if different:
+        elif different := [
+            key for key in now.__struct_fields__ if getattr(record.gradienter, key) != getattr(now, key)
+        ]:
             names = ", ".join(f"gradienter.{key}" for key in different)
             self.unused = f"measured with another {names}: correct it, or align zero"
 

@@ -103,8 +103,7 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
 
 def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[CheckLine]:
     def bad(words: str, remedy: str = "") -> list[CheckLine]:
-        said = f"{words}: {remedy}" if remedy else words
-        return [CheckLine(sensor.name, good=False, words=said, remedy=remedy)]
+        return [CheckLine(sensor.name, good=False, words=f"{words}: {remedy}" if remedy else words, remedy=remedy)]
 
     if isinstance(heard, str):
         return []  # the status line of the device reports it
@@ -191,13 +190,11 @@ async def run_check(
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
-    no_tilt = (
-        f"{message('sensor_missing', sensor='gradienter', sensors='accelerometers')}: by hand, companion align faces"
-    )
-    for kind, words in (("gradienter", no_tilt), ("compass", message("no_heading", reason="no compass"))):
-        if getattr(config, kind) is None:
-            findings.append(CheckLine(kind, good=True, words=words))
-    return findings
+    no_tilt = message("sensor_missing", sensor="gradienter", sensors="accelerometers")
+    lacks = {"gradienter": f"{no_tilt}: by hand, companion align faces"}
+    lacks["compass"] = message("no_heading", reason="no compass")
+    missing = [kind for kind in lacks if getattr(config, kind) is None]
+    return findings + [CheckLine(kind, good=True, words=lacks[kind]) for kind in missing]
 
 
 async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str | None]:
@@ -248,10 +245,8 @@ def _devices(config: Config, status: Object) -> list[CheckLine]:
     """List the devices; without a heartbeat leave out all that only an autopilot can show."""
     names = {imu.name for imu in config.imu if imu.source == "autopilot"}
     devices, ground = status["devices"], {**status["ground_stations"], "name": "ground stations"}
-    if status["vehicle"]["heartbeat_age_s"] is None:
-        shown = [device for device in devices if device["name"] not in names]
-    else:
-        shown = [*devices, ground]
+    is_heard = status["vehicle"]["heartbeat_age_s"] is not None
+    shown = [*devices, ground] if is_heard else [device for device in devices if device["name"] not in names]
     found = [CheckLine(one["name"], one["good"], one["summary"]) for one in shown]
     return found + [CheckLine(one["name"], good=True, words=one["summary"]) for one in status["compasses"]]
 

@@ -30,7 +30,6 @@ class SensorWatchBench:
         self.one.sensor.link._descriptor = -1
         self.random = np.random.default_rng(5)
         self.now_s = START_S
-        self.second = False
         self.resets: list[str] = []
         self.said: list[tuple[Severity, str]] = []
         self.offset: Vector | None = (0.0, 0.0, 0.0)
@@ -39,10 +38,9 @@ class SensorWatchBench:
         """Sensor axes to vehicle axes, by the autopilot's configured mounting."""
         collector, sensor = self.one.collector, self.one.sensor
         self.one.watch = SensorWatch(
-            [sensor], collector, self.offsets_of,
-            lambda severity, words, _: self.said.append((severity, words)),
-        )  # fmt: skip
-        reset = self.one.collector.reset
+            [sensor], collector, self.offsets_of, lambda severity, words, _: self.said.append((severity, words))
+        )
+        reset = collector.reset
 
         def told(why: str, imu: str | None = None) -> None:
             self.resets.append(why)
@@ -72,8 +70,6 @@ class SensorWatchBench:
                 x, y, z = (self.turned @ np.subtract(force, self.offset)).tolist()
                 p, q, r = (self.turned @ gyro).tolist()
                 self.one.collector.add_imu("fc", ImuSample(t_s, (p, q, r), (x, y, z)))
-            if self.second:
-                self.one.collector.add_imu("second", ImuSample(t_s, gyro, force))
             if tick % 5 == 0:
                 self.one.sensor.health.stream.took(b"x", [sample(t_s)], t_s)
             if tick % 25 == 0:
@@ -101,7 +97,6 @@ async def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
-
     bench = SensorWatchBench("gradienter")
     bench.run(10.0, tilt)
     assert bench.run(2.0, tilt, pitch_deg=2.0) is None, "one second may be a jolt"
@@ -167,7 +162,6 @@ async def test_the_wait_for_a_gradienter_on_the_compass_port_names_the_device_fo
     for tick in range(60):
         bench.one.sensor.receive(compass_frame(tick), now_s := START_S + 0.1 * tick)
         bench.one.watch.update(now_s)
-    sources = bench.one.collector.status(now_s).sources
-    waits = next(one.words for one in sources if one.name == "gradienter")
+    waits = {one.name: one.words for one in bench.one.collector.status(now_s).sources}["gradienter"]
     assert waits == "gradienter: this is hmr3300, a device for compass, not inclinometer_xy"
     assert "swapped" in remedy(f"{bench.one.sensor.link.settings}: {waits}")
