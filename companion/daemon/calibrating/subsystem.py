@@ -229,8 +229,7 @@ class Calibrating(Subsystem):
         if request.headings == 1 and asked.heading is None and self._core.config.compass is None:
             return Refusal("other", "headings: found 1; allowed without --heading or a compass: 2, 3, 4, 6, 8")
         if self._core.config.vehicle.platform == "deck":
-            what = "a zero is" if _KINDS[action] == ALIGNMENT else "accelerometers are"
-            return Refusal("other", f"{what} not measured on a deck that moves: align ashore")
+            return Refusal("other", "nothing is aligned on a deck that moves: align ashore")
         biases = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
         job = Job(_KINDS[action], biases, by, asked.timeout_s or ALIGN_TIMEOUT_S)
         return self.manager.start_job(job, partial(self._align_by, request), self._why_not_aligned(request))
