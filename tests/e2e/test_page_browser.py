@@ -185,10 +185,16 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             # An alignment is asked for in the same way, shown with its picture, and its end stays on the page.
             await tab.value("$('align').open = true")
             button = "#align button[data-name='align turn']"
-            await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'center'}})")
+            end = f"document.querySelector({button!r}).getBoundingClientRect().bottom"
+            await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'end'}})")
+            assert await tab.value(f"{end} <= $('bar').getBoundingClientRect().top"), "the bar covers it"
             await tab.touch(button)
             await tab.until("$('standing').textContent === 'TURN: 1 of 5' && $('wish').textContent")
             assert await tab.value("$('writes').textContent") == "will be written to the autopilot"
+            status = await here.status()
+            objected = json.dumps(status["stands"] | {"objection": "it leaned", "share": 0})
+            shown = await tab.value(f"stands({objected}, {json.dumps(status)}); $('now').innerText")
+            assert shown.count("it leaned") == 1
             await tab.lift()
             assert await tab.value("document.querySelectorAll('#how .nose').length") == 4
             await tab.value("scrollTo(0, 0)")

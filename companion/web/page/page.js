@@ -394,5 +394,7 @@ for (const button of document.querySelectorAll("button.hold")) {
   button.addEventListener("keydown", event => { if (!event.repeat && (event.key === "Enter" || event.key === " ")) start(); });
   button.addEventListener("keyup", stop);
 }
+// The buttons of an opened section lie below the bar.
+$("align").addEventListener("toggle", () => { if ($("align").open) $("align").scrollIntoView(); });
 $("cancel").addEventListener("click", () => act("CANCEL", "cancel", {}));
 listen();

@@ -75,13 +75,13 @@ function stands(found, status) {
   if ($("stands").hidden) return;
   const [first, why] = found.wish.split(/: (.*)/), [wish, grip] = first.split(/, (.*)/);
   const writing = running && ["writing", "verifying"].includes(status.state);
-  if (found.share > 0) $("still").textContent = "";
+  $("still").textContent = found.share > 0 ? "" : found.objection || "";
   $("share").style.strokeDasharray = `${100 * found.share} 100`;
   $("now").classList.toggle("writing", writing);
   $("grip").textContent = writing ? status.reason
-    : found.objection || grip || why || "";
+    : grip || why || (found.what === "faces" ? "propped up, hands off" : "");
   $("wish").textContent = writing ? "leave it as it is" : wish;
-  const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, ended]);
+  const key = JSON.stringify([found.number, found.total, found.wish, found.done.length, ended]);
   if (key === shownStands) return;
   shownStands = key;
   const what = found.what.toUpperCase();
@@ -91,7 +91,6 @@ function stands(found, status) {
   $("result").textContent = running ? "" : `${what}: ${ended.words}`;
   $("written").replaceChildren(...(running ? [] : ended.written.map(words => make("div", words))));
   $("stands").dataset.outcome = running ? "" : ended.outcome;
-  $("still").textContent = found.share > 0 ? "" : found.objection || "";
   $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
   const left = Math.max(found.total - found.done.length, 0);
   $("done").replaceChildren(...found.done.map((up, k) => {
