@@ -29,7 +29,7 @@ PLACEMENT_DEG, PROPPED_DEG = 0.02, 4.0
 """Sigmas of the error when placing the aircraft on marks by careful hands, and when propping it up; degrees."""
 HANDS: Final = (
     "turn DEG: clockwise on its spot; tilt PITCH ROLL: nose up and right side down against its spot (tilt 20 0); hold"
-    " PITCH ROLL: against the horizon (hold 0 180: on its back; hold 45 0: between level and nose up); spot PITCH"
+    " PITCH ROLL: against the horizon (hold 0 180: on its back; hold 45 0: nose half up); spot PITCH"
     " ROLL: onto another spot, which slopes so; back: onto its spot; bump PITCH ROLL: the spot tips; grip SECONDS: a"
     " hand stays on it; wait SECONDS: before the next line; truth: pose, and biases of the last minute"
 )
@@ -44,7 +44,9 @@ SIDES: Final = {
 }
 """Pitch and roll for each side, by the name that the companion uses."""
 _SIDE = "|".join(SIDES)
-_MISSING = re.compile(rf"(?:: |now )(?:between ({_SIDE}) and ({_SIDE})|({_SIDE}))(?=[:;]|$)")
+_MISSING = re.compile(
+    rf"(?:: |now )(?:(?:({_SIDE}) with )?(nose|left side|right side) half (up|down)|({_SIDE}))(?=[:;]|$)"
+)
 _TURN = re.compile(r"turn it (?:by|on by) (\d+) deg")
 
 
@@ -110,7 +112,9 @@ class Hands:
     def follow(self, words: str, t_s: float) -> bool:
         """Obey a request of `companion align`; return False if the words are no such request."""
         if (missing := _MISSING.search(words)) is not None:
-            up = np.mean([_up(*SIDES[name]) for name in missing.groups() if name is not None], axis=0)
+            base, part, way, whole = missing.groups()
+            names = [whole] if whole else [base or "level", f"{part} {way}"]
+            up = np.mean([_up(*SIDES[name]) for name in names], axis=0)
             up /= np.linalg.norm(up)
             self.hold(t_s, math.degrees(math.asin(up[0])), math.degrees(math.atan2(-up[1], -up[2])))
         elif (asked := _TURN.search(words)) is not None:

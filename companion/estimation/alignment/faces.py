@@ -240,12 +240,14 @@ def _not_seen(found: FacesEstimate, vehicle_from_sensor: Matrix) -> list[tuple[s
 
 def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
     faces = {name: np.array(up, dtype=np.float64) for name, up in SIDES.items()}
-    edges = {
-        f"between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
-        for a, b in itertools.combinations(faces, 2)
-        if not faces[a] @ faces[b]
-    }
+    pairs = [pair for pair in itertools.combinations(faces, 2) if not faces[pair[0]] @ faces[pair[1]]]
+    edges = {_edge(a, b): (faces[a] + faces[b]) / np.sqrt(2.0) for a, b in pairs}
     return [(name, vehicle_from_sensor.T @ up) for name, up in {**faces, **edges}.items()]
+
+
+def _edge(a: str, b: str) -> str:
+    side, (part, _, way) = (b, a.rpartition(" ")) if a.startswith("nose") else (a, b.rpartition(" "))
+    return f"{part} half {way}" if side == "level" else f"{side} with {part} half {way}"
 
 
 def _told(found: FacesEstimate, up: Array) -> Array:
@@ -255,10 +257,9 @@ def _told(found: FacesEstimate, up: Array) -> Array:
 
 
 def _figure(sigma: Array, which: int) -> str:
-    axis = _AXES[which % 3]
     if which < SCALE.start:
-        return f"{axis} bias uncertain by {_two_digits(sigma[which] / MG)} mg"
-    return f"{axis} scale uncertain by {_two_digits(100.0 * sigma[which])} %"
+        return f"{_AXES[which]} bias uncertain by {_two_digits(sigma[which] / MG)} mg"
+    return f"{_AXES[which - SCALE.start]} scale uncertain by {_two_digits(100.0 * sigma[which])} %"
 
 
 def _two_digits(value: float) -> str:

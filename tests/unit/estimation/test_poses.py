@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 from companion.component.statustext import Severity, as_lines
+from companion.estimation.alignment.faces import _all_sides
 from companion.estimation.alignment.poses import (
     AlignmentRequest,
     HeldPose,
@@ -92,12 +92,6 @@ def test_a_turn_that_nobody_counted_is_taken_as_asked(plan: AlignmentRequest, nu
     assert asked_turn_deg(plan, taken) == turn_deg
 
 
-SIDES = ("level", "on its back", "nose up", "nose down", "left side down", "right side down")
-EDGES = [
-    f"between {a} and {b}" for a, b in itertools.combinations(SIDES, 2) if SIDES.index(a) // 2 != SIDES.index(b) // 2
-]
-
-
 def every_request() -> Iterator[str]:
     """With the longest words and numbers that there can be."""
     for plan in (AlignmentRequest("zero"), AlignmentRequest("turn", headings=4), AlignmentRequest("tilts")):
@@ -106,7 +100,7 @@ def every_request() -> Iterator[str]:
         taken = [*spot, *tilted][: plan.total]
         for number in range(plan.total):
             yield f"{number + 1} of {plan.total}: {wanted_pose(plan, taken[:number]).words}"
-    for side in (*SIDES, *EDGES):
+    for side, _ in _all_sides(np.eye(3)):
         yield f"24 of 24: {side}: one pose does not fit, this one shows which"
 
 
@@ -116,7 +110,7 @@ def test_what_is_asked_for_is_one_line_to_be_heard() -> None:
         assert len(words) <= 50, words
         assert not re.search(r"\b(deg|mg|s)\b|[%/;]", words), "no abbreviations: it is spoken"
     assert "2 of 3: turn it by 180 degrees, onto its marks" in spoken
-    assert "24 of 24: between level and nose up" in spoken
+    assert "24 of 24: on its back with right side half down" in spoken
 
 
 def test_what_is_wrong_with_a_turn_or_a_tilt_is_one_line_too() -> None:

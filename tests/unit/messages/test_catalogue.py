@@ -31,7 +31,7 @@ NOT_MESSAGES = {
     "USB device", "on-board port", "on-board port (…)", "autopilot of kind …", "MAVLink component …", "an undo",
     "SERIALn_PROTOCOL = 2, SERIALn_BAUD = …", "MAV_1_CONFIG = 102, SER_TEL2_BAUD = …", "SYS_HAS_MAG = 0",
     # Sides of an aircraft, of which a request is made; names of tasks in the log, and keys.
-    "on its back", "between … and …", "MAVLink component", "MAVLink connection", "the page's", "airframe changed",
+    "on its back", "… with … half …", "MAVLink component", "MAVLink connection", "the page's", "airframe changed",
     "Operation timed out",  # Recognises an error of the operating system.
     # Complete in themselves: nothing to do, or said by what the person has just asked for.
     "whole numbers", "… of … s were not still and are left out", "no noise profile … (known: …)", "nothing measured",
