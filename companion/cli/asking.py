@@ -28,7 +28,7 @@ class Interview:
 
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
-        self._rest = b""
+        self._rest, self._where = b"", ""
         self._echoes = not sys.stdin.isatty()
 
     def say(self, *lines: str) -> None:
@@ -47,7 +47,7 @@ class Interview:
             return found
         self.say("", question.words, *([f"  {question.hint}"] if question.hint else []))
         while True:
-            self._prompt(now)
+            print_lines(f"  [{now}]{self._where} >" if now else f" {self._where} >", error=self._error, end=" ")
             answer = (await self._line()).strip() or now
             if self._echoes:
                 self.say(answer)
@@ -58,9 +58,6 @@ class Interview:
                 return question.put(answer)
             except ConfigError as error:
                 self.say(f"  {error}")
-
-    def _prompt(self, now: str) -> None:
-        print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
 
     async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
         choices = ("yes", "no")
@@ -98,7 +95,7 @@ class PageInterview(Interview):
         from companion.web.server import Page  # no other command needs the web server
 
         super().__init__(yes=False, error=False)
-        self._echoes = True
+        self._echoes, self._where = True, " answer on the page"
         self._lines: list[str] = []
         self._question: Object | None = None
         self._answered: asyncio.Future[str] | None = None
@@ -137,9 +134,6 @@ class PageInterview(Interview):
         self._serving.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await self._serving
-
-    def _prompt(self, now: str) -> None:
-        print_lines(f"  [{now}] answer on the page >" if now else "  answer on the page >", end=" ")
 
     def say(self, *lines: str) -> None:
         super().say(*lines)

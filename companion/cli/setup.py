@@ -325,10 +325,10 @@ class _Session:
             self.asking.say("", "Not checked: a companion runs, and has the ports.")
         started = self._goes_on or await self._service(runs=runs)
         is_old = runs and not started and self.answer["state"] != "unchanged"
-        command, runs = own_name(self._options), runs or started
-        steps = [*next_steps(parsed, command, is_old=is_old, runs=runs, good=good, checks=checks)]
+        command, runs, on_page = own_name(self._options), runs or started, self._options.page is not None
+        steps = [*next_steps(parsed, command, is_old=is_old, runs=runs, good=good, checks=checks, page=on_page)]
         self.answer["next"] = steps
-        if parsed.web is not None and self._options.page is not None:
+        if parsed.web is not None and on_page:
             from companion.web.access import page_url, split_address
 
             page = f"open {page_url(*split_address(parsed.web.bind))}"
@@ -370,9 +370,17 @@ class _Session:
         return not reason
 
 
-def next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
-    """List the operator's next steps; `is_old`: the running daemon still uses the previous configuration."""
-    is_service = command == "companion"
+def next_steps(
+    parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool, page: bool = False
+) -> Iterator[str]:
+    """List the operator's next steps; `is_old`: the running daemon still uses the previous configuration.
+
+    `page`: name the page's buttons instead of commands.
+    """
+    is_service, align = command == "companion", f"{command} align"
+    zero, faces, calibrate = f"{align} zero", f"{align} faces --write", f"{command} calibrate"
+    if page:
+        zero, faces, calibrate = "hold ZERO, below ALIGN", "hold FACES, below ALIGN", "hold CALIBRATE"
     if not good:
         yield f"mend what is wrong above, then: {command} check"
     if is_old:
@@ -381,7 +389,7 @@ def next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: 
     elif not runs and is_service and installing.systemd_runs():
         yield f"{installing.how_to_start()}   (starts it now, and at every boot)"
     elif not runs:
-        yield f"{command} run   (leave it running, and go on in another terminal)"
+        yield f"{command} run   (leave it running, and go on {'here' if page else 'in another terminal'})"
     if not checks:
         yield f"{command} check"
     if parsed.gradienter is not None and not _zero_is_known(parsed):
@@ -389,11 +397,11 @@ def next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: 
 
         sigma_deg = parsed.gradienter.sigma_deg or tilt_sigma_deg(parsed.gradienter.protocol)
         until = f"until then accelerometers to {math.radians(sigma_deg) * 1e3:.1f} mg"
-        yield f"{command} align zero   (once: the gradienter's zero; {until})"
+        yield f"{zero}   (once: the gradienter's zero; {until})"
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
-        yield f"{command} align faces --write   (once: accelerometers, in about 11 poses, held by hand, 5 min)"
-    yield f"{command} calibrate   (disarmed, standing still, hands off)"
+        yield f"{faces}   (once: accelerometers, in about 11 poses, propped up, hands off, 5 min)"
+    yield f"{calibrate}   (disarmed, standing still, hands off)"
 
 
 def _zero_is_known(parsed: Config) -> bool:

@@ -62,7 +62,9 @@ async def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> N
         assert not made.file.exists()
         await press("yes")
         await asks("Read all of it?")
-        assert "Next:" in await tab.value("$('told').textContent")
+        steps = (await tab.value("$('told').textContent")).partition("Next:")[2]
+        assert "hold ZERO, below ALIGN" in steps
+        assert "hold CALIBRATE" in steps
         then = f"Next, on the board: companion -c {made.file} run. Then this page shows the companion."
         assert await tab.value("$('hint').textContent") == then
         await press("yes")
