@@ -140,6 +140,12 @@ async def test_a_calibration_of_the_firmware_that_fails_is_said_and_ours_stays(t
         assert sent.commands == 1
         assert "Gyros not calibrated" in " ".join(record.warnings)
         assert "Gyros not calibrated" in rig.double.prearm_failures(rig.now_s)
+        rig.double.prearm_failures = lambda loop_s: []  # type: ignore[method-assign]
+        failed = "the firmware's gyro calibration failed"
+        await rig.until(lambda: rig.service.status()["headline"]["reason"].startswith(failed), 60.0)
+        assert rig.service.status()["headline"]["remedy"].startswith("Hold still, calibrate again")
+        rig.double.reboot(down_s=1.0)
+        await rig.until(lambda: rig.service.status()["headline"]["reason"].startswith("calibrated"), 60.0)
         assert gyro_error_deg_h(rig) < FINE_DEG_H
 
 

@@ -77,9 +77,8 @@ class ActiveCalibration:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
         self.manager, self._memory = calibrating.manager, calibrating.memory
         self._estimator = calibrating.estimator
-        settings = models.settings(config)
-        gyro, accel = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
-        self._floors: dict[Triad, float] = {"gyro": gyro, "accel": accel}
+        goal = models.settings(config)
+        self._floors = dict(zip(TRIADS, (goal.target_gyro_sigma_rad_s, goal.target_accel_sigma_m_s2), strict=True))
         # IMUs used by the autopilot; if it uses none of the configured ones, all of them.
         flown = [imu.name for imu in config.imu if imu.is_flown]
         names = flown or [imu.name for imu in config.imu]
@@ -253,6 +252,8 @@ class ActiveCalibration:
             self.offsets.poll()
 
     def _lose(self, name: str, why: Why) -> None:
+        if why is Why.REBOOTED and self.calibration is not None:  # the EKF has started afresh
+            self.calibration = msgspec.structs.replace(self.calibration, warnings=())
         for state in (state for key, state in self._triads.items() if key[0] == name and state.judged):
             if why is not Why.REBOOTED:  # a reboot changes no offsets: a result held back stays so
                 state.in_doubt = None

@@ -23,6 +23,7 @@ from companion.formats import Object
 from companion.messages import catalogue, explain, message
 
 ARMED: Final = "ARMED"
+GYROS_NOT_RESET: Final = "firmware_gyro_calibration_failed"  # Warning of a calibration, in the message catalogue
 Tone = Literal["good", "wait", "busy", "bad"]
 """Tone: good (ready to fly), wait (be patient or hold still), busy (the companion works), bad (somebody must act)."""
 
@@ -49,12 +50,13 @@ class Headlines:
         if first is not None and (word == "READY" or (word in ("NOT CALIBRATED", "NOT READY") and not first["waits"])):
             word, reason, tone = "WILL NOT ARM", first["line"], "wait" if first["waits"] else "bad"
             remedy = first["remedy"]
-        good = tone == "good"
         devices = self._devices
         contradicted = self._alignment.warning if self._alignment.contradicted else None
         concern = devices.watch.implausible() or contradicted or devices.signing.warning or self._heading.concern
-        if concern is not None and (good or word == ARMED):
-            reason, tone = f"{concern}; {reason}", "wait" if good else tone
+        warnings = () if (record := self._readiness.in_force.calibration) is None else record.warnings
+        concern = concern or next((one for one in warnings if (explain(one) or one)[0] == GYROS_NOT_RESET), None)
+        if concern is not None and (tone == "good" or word == ARMED):
+            reason, tone = f"{concern}; {reason}", "wait" if tone == "good" else tone
         if remedy is None and word == ARMED and tone != "good" and concern is None:
             remedy = catalogue()["armed_uncalibrated"].remedy
         elif remedy is None:
