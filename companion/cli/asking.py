@@ -173,5 +173,5 @@ class PageInterview(Interview):
         if question is None:
             latest = next((line for line in reversed(self._lines) if line.strip()), "")
             headline = self._end or {"word": "SETTING UP", "reason": latest.strip(), "tone": "busy"}
-        ended = self._end is not None
-        return {"headline": headline, "setup": {"lines": self._lines, "question": question, "ended": ended}}
+        shown = {"lines": self._lines, "question": question, "ended": self._end is not None}
+        return {"headline": headline, "setup": shown}

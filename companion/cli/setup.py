@@ -313,8 +313,7 @@ class _Session:
         kept = drafting.put(self._path, text)
         self._so_far = f"{self._path} is written"
         self.asking.say(f"Written: {self._path}" + (f" (the old one: {kept.name})" if kept is not None else ""))
-        if kept is not None:
-            self.answer["kept"] = str(kept)
+        self.answer["kept"] = None if kept is None else str(kept)
 
     async def _finish(self, *, runs: bool) -> None:
         parsed = load_config(self._options, profiles=True)
@@ -331,9 +330,8 @@ class _Session:
         if parsed.web is not None and on_page:
             from companion.web.access import page_url, split_address
 
-            page = f"open {page_url(*split_address(parsed.web.bind))}"
-            if parsed.web.bind == self._options.page:
-                page = "this page shows the companion"
+            url = page_url(*split_address(parsed.web.bind))
+            page = "this page shows the companion" if parsed.web.bind == self._options.page else f"open {url}"
             first = f", on the board: {steps[0].partition('   ')[0]}. Then"
             self.then = f"Next{':' if runs and good and not is_old else first} {page}."
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))

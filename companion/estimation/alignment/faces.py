@@ -126,8 +126,7 @@ def faces(
     everyone = tuple(range(len(stands)))
     gravity = (gravity_m_s2, gravity_sigma_m_s2)
     figures, covariance, _, fits = _fit(stands, everyone, gravity)
-    left_out: tuple[int, ...] = ()
-    in_doubt: tuple[int, ...] = ()
+    left_out, in_doubt = tuple[int, ...](), tuple[int, ...]()
     while not fits:
         kept = tuple(k for k in everyone if k not in left_out)
         if 4 * (len(left_out) + 1) > len(stands):
