@@ -134,6 +134,12 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
                 box = f"document.querySelector('#{button}').getBoundingClientRect()"
                 assert await tab.value(f"{box}.height >= 80 && {box}.width >= 90 && {box}.bottom <= innerHeight")
             await read_the_record(here, record)
+            # An offset left unchanged is shown as it is active: the new measurement less its residual.
+            kept = json.dumps({"name": "fc", "unchanged": ["gyro"], "gyro_bias_deg_h": [150.0, 0.0, 0.0]})
+            residual = {"name": "fc", "residual_gyro_rad_s": [math.radians(1 / 360), 0.0, 0.0]}
+            found = json.dumps({"started_at": "now", "imus": [residual]})
+            await tab.value(f"recordsRead = [{{record: {found}}}]")
+            assert await tab.value(f"active({found}, {kept}, 'gyro')[0].toFixed(2)") == "140.00"
             # Without a gradienter there is no place for an attitude; a silent one is a fault.
             status = await here.status() | {"pose": None, "rows": []}
             for devices, hidden in (

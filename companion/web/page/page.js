@@ -143,17 +143,25 @@ function axes(names, digits, biases, sigmas, unit, title, held, unchanged, befor
   if (before) {
     const most = Math.max(...biases.map((bias, k) => Math.abs(bias - before.bias[k])));
     const change = `${most.toFixed(digits)} ${unit.split(" ")[0]}`;
-    words.push(make("p", unchanged ? `measured ${change} off ${utc(before.at)}: too little to write`
+    words.push(make("p", unchanged ? `measured ${utc(before.at)}: ${change} off at most, too little to write`
       : `changed by ${change} at most since ${utc(before.at)}`, "note"));
   }
   return [make("h3", `${title}, ${unit}${held ? ", held back" : ""}`), ...words, ...rows];
 }
-// Figures of the previous calibration, if its record has been read.
-function earlier(found, name, triad) {
+const TRIADS = {gyro: ["gyro_bias_deg_h", "gyro_bias_rad_s", "residual_gyro_rad_s", DEG_H], accel: ["accel_bias_mg", "accel_bias_m_s2", "residual_accel_m_s2", MG]};
+// Biases that the active offsets remove: an unchanged offset differs from the measured bias by the residual.
+function active(found, imu, triad) {
+  const [shown, , residual, unit] = TRIADS[triad];
+  const one = recordsRead.find(({record}) => record.started_at === found.started_at)?.record.imus.find(({name}) => name === imu.name);
+  if (!imu.unchanged.includes(triad) || !one || !one[residual]) return imu[shown];
+  return imu[shown].map((bias, k) => bias - one[residual][k] / unit);
+}
+// Figures of the previous calibration, or of one that left the offsets unchanged, if its record has been read.
+function earlier(found, {name, unchanged}, triad) {
   const at = recordsRead.findIndex(({record}) => record.started_at === found.started_at);
   if (at < 0) return null;
-  const [key, unit] = triad === "gyro" ? ["gyro_bias_rad_s", DEG_H] : ["accel_bias_m_s2", MG];
-  for (const {record} of recordsRead.slice(at + 1)) {
+  const [, key, , unit] = TRIADS[triad];
+  for (const {record} of recordsRead.slice(unchanged.includes(triad) ? at : at + 1)) {
     const imu = record.imus.find(imu => imu.name === name);
     if (record.state === "done" && !record.undone_at && imu && imu[key] && !imu.held_back.includes(triad)) {
       return {at: record.started_at, bias: imu[key].map(value => value / unit)};
@@ -183,10 +191,10 @@ function calibration(found, arming) {
     if (imu.temperature_degc !== null) warm.push(`at ${imu.temperature_degc.toFixed(1)} °C`);
     if (imu.temperature_now_degc !== null) warm.push(`now ${imu.temperature_now_degc.toFixed(1)} °C`);
     return [make("h3", `${imu.name}${warm.length ? ": " + warm.join(", ") : ""}`), ...imu.when_warm.map(words => make("p", words, "note")),
-      ...axes(["x", "y", "z"], 1, imu.gyro_bias_deg_h, imu.gyro_sigma_deg_h, "°/h ± sigma", "gyro bias", imu.held_back.includes("gyro"),
-        imu.unchanged.includes("gyro"), earlier(found, imu.name, "gyro")),
-      ...axes(["x", "y", "z"], 2, imu.accel_bias_mg, imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"),
-        imu.unchanged.includes("accel"), earlier(found, imu.name, "accel"))];
+      ...axes(["x", "y", "z"], 1, active(found, imu, "gyro"), imu.gyro_sigma_deg_h, "°/h ± sigma", "gyro bias", imu.held_back.includes("gyro"),
+        imu.unchanged.includes("gyro"), earlier(found, imu, "gyro")),
+      ...axes(["x", "y", "z"], 2, active(found, imu, "accel"), imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"),
+        imu.unchanged.includes("accel"), earlier(found, imu, "accel"))];
   }));
 }
 let shownByHand = null;
