@@ -159,21 +159,16 @@ class Hands:
     def obey(self, line: str, t_s: float) -> str:
         word, *rest = line.split() or [""]
         moves: dict[str, tuple[int, Callable[..., object]]] = {
-            "turn": (1, self.turn),
-            "tilt": (2, self.tilt),
-            "hold": (2, self.hold),
-            "spot": (2, self.spot),
-            "back": (0, self.back),
-            "bump": (2, self.bump),
-            "grip": (1, self.grip),
-        }
+            "turn": (1, self.turn), "tilt": (2, self.tilt), "hold": (2, self.hold), "spot": (2, self.spot),
+            "back": (0, self.back), "bump": (2, self.bump), "grip": (1, self.grip),
+        }  # fmt: skip
         count, move = moves.get(word, (-1, self.back))
         try:
             figures = [float(figure) for figure in rest]
         except ValueError:
             count, figures = -1, []
         if len(figures) != count:
-            return f"found {line.strip()!r}; allowed: {HANDS}"
+            return HANDS if word == "help" else f"found {line.strip()!r}; type help"
         move(t_s, *figures)
         if word == "bump":
             return "the spot has tipped; it shows when the aircraft is put onto it again"

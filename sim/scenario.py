@@ -144,13 +144,14 @@ class Scenario:
     gradienter: SerialDevice
     compass: SerialDevice
     gradienter_law: Law
+    without: frozenset[str] = frozenset()  # Roles of devices that are not served
 
     @property
     def ports(self) -> dict[str, SerialDevice]:
         """Return the devices by the names of their ports; a device with two roles has one port."""
         found: dict[str, SerialDevice] = {}
         for name, device in (("imu", self.imu), ("gradienter", self.gradienter), ("compass", self.compass)):
-            if not any(device is other for other in found.values()):
+            if name not in self.without and not any(device is other for other in found.values()):
                 found[name] = device
         return found
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import dataclasses
 import hashlib
+import math
 import os
 import shlex
 import signal
@@ -21,7 +23,7 @@ from sim.devices import SerialDevice
 from sim.hands import HANDS, PLACEMENT_DEG, PROPPED_DEG, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import MOTIONS, TURN_DEG_S, motions_of
-from sim.pty_device import PtyDevice
+from sim.pty_device import PtyDevice, Setting
 from sim.scenario import (
     COMPASSES,
     DEMO_DEVICES,
@@ -80,6 +82,10 @@ def parser() -> argparse.ArgumentParser:
                     f"--{role}", choices=tuple(table), default=usual,
                     help=f"family of the {role} (default {usual}); one name for two of them: one device on one port",
                 )  # fmt: skip
+            command.add_argument(
+                "--without", nargs="+", choices=Devices._fields, default=(), metavar="DEVICE",
+                help="leave out one or more of imu, gradienter, compass",
+            )  # fmt: skip
             command.add_argument("--dir", type=Path, help="folder for the ports (default: a new one)")
         if name != "devices":
             command.add_argument(
@@ -118,25 +124,19 @@ def parser() -> argparse.ArgumentParser:
 
 def add_world_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--pose",
-        type=float,
-        nargs=3,
-        metavar=("PITCH", "ROLL", "HEADING"),
+        "--pose", type=float, nargs=3, metavar=("PITCH", "ROLL", "HEADING"),
         default=(DEMO_POSE.pitch_deg, DEMO_POSE.roll_deg, DEMO_POSE.heading_deg),
         help="degrees: nose up +, right side down +, clockwise from true north (default 5 -3 40; --hands 0.6 -0.4 40)",
-    )
+    )  # fmt: skip
     command.add_argument("--seed", type=int, default=0, help="the same seed gives the same noise (default 0)")
     command.add_argument(
         "--motion", choices=MOTIONS, default="still",
         help="what happens to it all the time: a slow turn; a sea with that turn; a running engine with both",
     )  # fmt: skip
     command.add_argument(
-        "--turn",
-        type=float,
-        metavar="DEG_S",
-        default=TURN_DEG_S,
+        "--turn", type=float, metavar="DEG_S", default=TURN_DEG_S,
         help=f"how fast that turn is (default {TURN_DEG_S:g})",
-    )
+    )  # fmt: skip
 
 
 def add_hands(command: argparse.ArgumentParser) -> None:
@@ -169,9 +169,7 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
     lines = ["[mavlink]"]
     if udp is not None and directory is not None:
         ports = " ".join(shlex.quote(str(directory / name)) for name in scenario.ports)
-        lines.insert(
-            0, f"# Or without these lines, by questions: companion -c companion.toml setup {ports} --udp {udp[1]}"
-        )
+        lines = [f"# Or by questions: companion -c companion.toml setup {ports} --udp {udp[1]}", *lines]
     if udp is None:
         lines.append("# no autopilot is simulated here; `python -m sim autopilot` is one")
     lines.append(f'url = "udpin:{udp[0]}:{udp[1]}"' if udp else f'url = "udpin:{DEFAULT_UDP}"')
@@ -183,11 +181,14 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
         site = scenario.aircraft.site
         lines += ["", f"# no gradienter, no compass; the site is {site.latitude_deg} {site.longitude_deg}"]
         return "\n".join(lines) + "\n"
-    lines += ["", "[[imu]]", 'name = "own"', 'source = "serial"', *_device_lines(scenario, directory, "imu")]
-    lines.append(f'profile = "{_PROFILES.get(scenario.serial_imu.spec.name, scenario.serial_imu.spec.name)}"')
-    lines += ["", "[gradienter]", *_device_lines(scenario, directory, "gradienter")]
-    lines += [f'law = "{scenario.gradienter_law}"', "", "[compass]", *_device_lines(scenario, directory, "compass")]
-    lines.append('reference = "magnetic"')
+    part = scenario.serial_imu.spec.name
+    for role, head, last in (
+        ("imu", '[[imu]]\nname = "own"\nsource = "serial"', f'profile = "{_PROFILES.get(part, part)}"'),
+        ("gradienter", "[gradienter]", f'law = "{scenario.gradienter_law}"'),
+        ("compass", "[compass]", 'reference = "magnetic"'),
+    ):
+        if role not in scenario.without:
+            lines += ["", head, *_device_lines(scenario, directory, role), last]
     # Beside the ports, so that no root is needed to try.
     lines += ["", "[control]", f'socket = "{directory / "control.sock"}"']
     lines += ["", "[storage]", f'directory = "{directory / "state"}"']
@@ -218,7 +219,8 @@ def describe(scenario: Scenario, *, devices: bool, autopilot: bool, t_s: float =
     """Describe the truth in a few lines: pose at aircraft time `t_s`, biases averaged over the minute before."""
     pose = scenario.aircraft.pose_at(t_s) if t_s else scenario.aircraft.pose
     when = f"of the last minute, at {t_s:.0f} s" if t_s else "at the start"
-    angles = f"pitch {pose.pitch_deg:g}, roll {pose.roll_deg:g}, heading {pose.heading_deg:g} deg"
+    roll_deg = math.remainder(pose.roll_deg, 360.0)
+    angles = f"pitch {pose.pitch_deg:g}, roll {roll_deg:g}, heading {pose.heading_deg % 360.0:g} deg"
     lines = [f"# The truth {when}: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
     models: list[tuple[str, ImuModel]] = []
     if autopilot:
@@ -252,7 +254,7 @@ async def serve(
         running: list[asyncio.Task[None]] = []
         if directory is not None:
             for name, device in scenario.ports.items():
-                pty = await stack.enter_async_context(PtyDevice(device, directory / name))
+                pty = await stack.enter_async_context(PtyDevice(device, directory / name, line=Setting(device.baud)))
                 running.append(asyncio.create_task(pty.wait_closed(), name=f"watch {name}"))
         if udp is not None:
             companion = await open_udp(scenario.autopilot, target=udp)
@@ -297,6 +299,7 @@ def main(argv: Sequence[str]) -> int:
         warms=arguments.warms,
         power_up=arguments.power_up,
     )
+    scenario = dataclasses.replace(scenario, without=frozenset(getattr(arguments, "without", ())))
     directory: Path | None = None
     made_here = devices and arguments.dir is None
     if devices:

@@ -104,7 +104,8 @@ def test_serving_everything_makes_the_ports_and_takes_them_away(tmp_path: Path) 
 
 @pytest.mark.real_clock
 def test_the_command_line_runs_says_how_to_connect_and_ends_cleanly(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sim", "devices", "--dir", str(tmp_path / "ports"), "--pose", "1", "2", "3"]
+    command = [sys.executable, "-m", "sim", "devices", "--dir", str(tmp_path / "ports"), "--pose", "1", "362", "3"]
+    command += ["--without", "gradienter"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         lines = []
@@ -114,10 +115,11 @@ def test_the_command_line_runs_says_how_to_connect_and_ends_cleanly(tmp_path: Pa
                 break
         text = "".join(lines)
         assert "pitch 1, roll 2, heading 3 deg" in text
-        assert os.path.islink(tmp_path / "ports" / "imu")
+        assert {path.name for path in (tmp_path / "ports").iterdir()} == {"imu", "compass"}
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=60.0) == 0
     assert config.parse(text, "printed").compass is not None
+    assert config.parse(text, "printed").gradienter is None
     assert list((tmp_path / "ports").iterdir()) == []
 
 
