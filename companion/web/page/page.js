@@ -120,9 +120,8 @@ function helps(record, triad, si, sigma, devices) {
   const [warm, noise] = ["warm_up", "stat"].map(kind => largest(imu, kind) ** 2), rest = sigma ** 2 - warm - noise;
   if (warm > Math.max(noise, rest) || (imu.when_warm && imu.when_warm.words.length)) return "calibrate again when warm";
   if (noise > rest) return "set a larger calibration.max_s";
-  const has = wanted => devices.some(({name}) => name === wanted);
-  if (triad === "gyro") return record.pose && record.pose.psi_deg === null && !has("compass") ? "connect a compass" : "";
-  return has("gradienter") && !record.alignment ? "hold ZERO once" : "";
+  const tilts = triad === "accel" && devices.some(({name}) => name === "gradienter");
+  return tilts && !record.alignment ? "hold ZERO once" : "";
 }
 function axes(names, digits, biases, sigmas, unit, title, held, unchanged, before) {
   if (!biases) return [];
