@@ -105,7 +105,7 @@ FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
 
 async def run(options: argparse.Namespace) -> int:
     """Run the daemon; if there is no configuration, create one on a web page first."""
-    if not hasattr(options, "config") and not config_path(options).exists():
+    if not config_path(options).exists():
         await _first_run(config_path(options))
     load_config(options, profiles=True, forgiving=True)
     # Replace this process: the daemon then needs no memory for the command line and the page.
@@ -119,9 +119,10 @@ async def _first_run(path: Path) -> None:
     from companion.setup.draft import is_writable
 
     if is_writable(path):
+        print_lines(f"{path}: no such file; the set-up makes it, on a page for the phone:")
         asks = Parser()
         _add_setup_options(asks.add_argument)
-        await session.setup(asks.parse_args(FIRST_RUN, argparse.Namespace(json=False)), goes_on=True)
+        await session.setup(asks.parse_args(FIRST_RUN, argparse.Namespace(json=False, config=path)), goes_on=True)
 
 
 async def ports(options: argparse.Namespace) -> int:

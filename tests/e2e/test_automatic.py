@@ -135,6 +135,9 @@ async def test_after_an_undo_nothing_is_written_until_the_next_request(tmp_path:
     async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
         before = values(rig)
         await calibrated_by_itself(rig)
+        rig.ground.command(CALIBRATE, 0.0)
+        await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 60.0)
+        assert not rig.service.calibrating.store.history()[0].written, "the last result is not the one to be undone"
         rig.ground.command(UNDO)
         await rig.until(lambda: rig.ground.finals(UNDO) == [ACCEPTED], 30.0)
         await asyncio.sleep(120.0)

@@ -89,9 +89,8 @@ class Automatic:
 
     async def run(self) -> None:
         self._writes = await self._core.offload(self._file.read)
-        last = self._manager.last
-        if last is not None and last.undone_at is not None:
-            self._stop("undone")  # before this start
+        if self._manager.was_undone:
+            self._stop("undone")
         while True:
             self.turns += 1
             await asyncio.sleep(POLL_S)

@@ -95,6 +95,7 @@ class CalibrationManager:
         self.reason = ""
         self.last: Record | None = None  # Record of the latest calibration, loaded from disk at start
         self._ended: Record | None = None  # Record of the latest one that nobody cancelled: it may have written offsets
+        self.was_undone = False  # True if the last calibration that wrote had been undone before this start
         self.on_ended: Listeners[Job, JobResult] = Listeners()  # Notified when a job ends, before its requester
         core.vehicle.on_event.add(self._on_event)
         self._recovery.on_recovered = self._recovered
@@ -103,6 +104,8 @@ class CalibrationManager:
         try:
             self.last = next((record for _, record in self._store.latest()), None)
             self._ended = next((record for _, record in self._store.latest() if record.state != "cancelled"), None)
+            wrote = next((record for _, record in self._store.latest() if record.written), None)
+            self.was_undone = wrote is not None and wrote.undone_at is not None
         except StorageError as error:
             logger.warning("%s; the companion continues without earlier records", error)
 

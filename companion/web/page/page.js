@@ -319,7 +319,7 @@ function watch() {
   else if (silent < GONE_MS) headline("gone", "RECONNECTING", "this page was asleep");
   else headline("gone", "NO LINK", refused || (heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
     : "no word from the companion yet"));
-  $("progress").hidden = true;
+  $("progress").hidden = $("remedy").hidden = true;
   for (const button of document.querySelectorAll("#keys button, #align button, #fix")) button.disabled = true;
   if (source && now - triedAt > (heardAt ? 2 : 5) * GONE_MS) listen();
 }
@@ -356,7 +356,7 @@ $("ask").addEventListener("submit", event => {
   event.preventDefault();
   token = $("token").value.trim();
   $("ask").hidden = true;
-  if (token) { remember(token); say("token kept: press again"); }
+  if (token) { remember(token); say("now press again"); }
 });
 function remember(value) { try { localStorage.setItem("token", value); } catch { /* private window: remembered until it closes */ } }
 if (location.hash.startsWith("#token=")) {
