@@ -89,7 +89,7 @@ def test_where_nothing_can_be_written_that_is_said_first(
     monkeypatch.setattr("os.access", lambda *_: False)
     missing = tmp_path / "c.toml"
     assert cli.main(["-c", str(missing), "setup", "--yes"]) == 1
-    assert "is not yours to write: sudo companion setup" in capsys.readouterr().err
+    assert f"is not yours to write: sudo companion -c {missing} setup" in capsys.readouterr().err
     # The daemon's own start says the same with its own code: nobody is asked what cannot be kept.
     monkeypatch.setattr(config, "DEFAULT_PATH", missing)
     assert cli.main(["run"]) == 2
