@@ -51,7 +51,7 @@ class Job:
         self.reboot = reboot  # Restart the autopilot once the result is stored
         self.automatic = automatic  # Started by the daemon itself
         self.was_armed = False
-        self.deadline_s = None if timeout_s is None else loop.time() + timeout_s  # Event-loop time; None: no limit
+        self.limit(timeout_s)
         self.finished: asyncio.Future[JobResult] = loop.create_future()
         self.product: Record | HandRecord | Object | None = None
         self.undid_calibration = kind == "undo"
@@ -65,6 +65,13 @@ class Job:
         self.cancelled_by: str | None = None
         self.has_written = False  # True once a write to the autopilot has begun, even if it was rolled back
         self._nudge = asyncio.Event()
+
+    def limit(self, timeout_s: float | None) -> None:
+        """Limit the time from now on; None: no limit."""
+        self._timeout_s, self._begun_s = timeout_s, asyncio.get_running_loop().time()
+
+    def restart_time(self) -> None:
+        self.limit(self._timeout_s)
 
     @property
     def is_running(self) -> bool:
@@ -108,7 +115,7 @@ class Job:
 
     def check_time(self) -> None:
         """Raise CalibrationRefusedError if the deadline has passed."""
-        if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
+        if self._timeout_s is not None and asyncio.get_running_loop().time() >= self._begun_s + self._timeout_s:
             boat = '; on a boat? set vehicle.platform = "deck"' if self.words.startswith("hold still: ") else ""
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
 

@@ -38,7 +38,7 @@ def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
 
 
 def faced(rig: Rig, *, write: bool) -> Job:
-    wanted = {"action": "faces", "write": write, "timeout_s": 2000.0}
+    wanted = {"action": "faces", "write": write, "timeout_s": 120.0}  # of each pose, not of all
     return started(rig.service.calibrating.start_alignment(Align.read(wanted), "test"))
 
 

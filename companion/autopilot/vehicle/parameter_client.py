@@ -125,6 +125,8 @@ class ParameterClient(Parameters):
         return ParameterRefusedError(words)
 
     def _unanswered(self, request: str, tries: int) -> ParameterTimeoutError:
+        if not self.vehicle.alive and (age_s := self.vehicle.heartbeat_age_s) is not None:
+            return ParameterTimeoutError(message("no_heartbeat_for", seconds=f"{age_s:.0f}", remedy="power? cable?"))
         name, hint = self.vehicle.name, self.vehicle.why_silent
         words = message("parameter_not_answered", autopilot=name, request=request, tries=tries, hint=hint)
         return ParameterTimeoutError(words)

@@ -67,7 +67,8 @@ def blocked(vehicle: Vehicle, journal: WriteJournal, job: Job | None) -> Iterato
     if vehicle.conflict is not None:
         yield Precondition.ONE_AUTOPILOT, vehicle.conflict
     if job is not None and job.is_running:
-        yield Precondition.IDLE, f"a {job.kind} is running ({job.words or 'waiting'})"
+        article = "an" if job.kind[0] in "aeiou" else "a"
+        yield Precondition.IDLE, f"{article} {job.kind} is running ({job.words or 'waiting'})"
     if vehicle.arm_state is ArmState.ARMED:
         yield Precondition.DISARMED, "armed: disarm first"
     if vehicle.arm_state is ArmState.UNKNOWN:

@@ -141,7 +141,7 @@ class CalibrationRun(Job):
     def adopt(self, requester: str, timeout_s: float | None, *, reboot: bool) -> None:
         self.reboot |= reboot
         self.kind, self.requester, self.automatic = "calibration", requester, False
-        self.deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
+        self.limit(timeout_s)
 
     def _announce(self) -> None:
         if self.automatic:

@@ -46,7 +46,7 @@ PROGRESS_EVERY_S: Final = 0.2
 HEARD_WITHIN_S: Final = 5.0
 """Longest time that an undo waits for the first heartbeat of the autopilot."""
 ALIGN_TIMEOUT_S: Final = 900.0
-"""Default time limit of an alignment: one that nobody finishes must not block calibrations for ever."""
+"""Default time limit of each pose of an alignment: one that nobody finishes must not block calibrations for ever."""
 _KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces", "compass"], str]] = {
     "zero": ALIGNMENT,
     "tilts": ALIGNMENT,

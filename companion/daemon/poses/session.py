@@ -298,6 +298,7 @@ class PoseSession:
         read = np.array(window.imus[0].accel_m_s2)
         state.ups.append(vector((read / max(float(np.linalg.norm(read)), 1e-9)).round(3)))
         self._machine.on(Event.ENOUGH)
+        state.job.restart_time()
         return True
 
     def _turned(self, state: SessionState, now_s: float) -> str:
