@@ -197,9 +197,7 @@ class Align(Command, frozen=True, tag="align"):
     level: Annotated[bool, Field("after faces: write the tilt of the board (AHRS_TRIM, SENS_BOARD)", by=by)] = False
     write: Annotated[bool, Field("write the result to the autopilot", by=by)] = False
     wait: Annotated[bool, Field(by=Interface(0))] = True
-    timeout_s: Annotated[
-        _Seconds | None, _SECONDS._replace(help="give up this time after the last pose (default 900)")
-    ] = None
+    timeout_s: Annotated[_Seconds | None, _SECONDS._replace(help="give up this time after a pose (default 900)")] = None
 
 
 class Cancel(Command, frozen=True, tag="cancel"):

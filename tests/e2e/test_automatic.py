@@ -45,6 +45,8 @@ async def started_by_itself(rig: Rig) -> Job:
 
 async def test_it_calibrates_at_the_first_opportunity_after_start_and_says_one_line(tmp_path: Path) -> None:
     async with Rig(tmp_path, at_arm="gate").running() as rig:
+        await rig.until(lambda: rig.service.status()["headline"]["word"].startswith("HOLD STILL"), 10.0)
+        assert rig.service.status()["headline"]["remedy"] == "", "there is nothing to press"
         await calibrated_by_itself(rig)
         left = rig.double.residual(1, rig.now_s)
         assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H

@@ -8,7 +8,7 @@ from typing import Final, Literal
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import ArmAnswer
 from companion.daemon.arming.in_force import NOT_CONFIRMED
-from companion.daemon.arming.readiness import NEEDED
+from companion.daemon.arming.readiness import BY_ITSELF, NEEDED
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.calibrating.subsystem import Calibrating
@@ -60,7 +60,7 @@ class Headlines:
         if remedy is None and word == ARMED and tone != "good" and concern is None:
             remedy = catalogue()["armed_uncalibrated"].remedy
         elif remedy is None:
-            explained = explain(reason) if tone in ("bad", "wait") else None
+            explained = explain(reason) if tone in ("bad", "wait") and reason != BY_ITSELF else None
             remedy = "" if explained is None else explained[1].remedy
         if (left := self._warm_up.words()) is not None and word.startswith(("HOLD STILL", "NOT ", "WAIT")):
             reason = f"{reason}; {left}"
