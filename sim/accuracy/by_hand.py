@@ -26,8 +26,9 @@ from sim.earth import Array
 from sim.hands import Hands
 from sim.imu_model import DEG_H, MG, ImuModel
 
+_Move = Callable[[float], float]
 BY_HAND: Final = ("icm42688p", "bmi088", "adis16470")
-STAND_S: Final = 12
+STAND_S, PROPPED_S = 12, 7  # Seconds in the means of a stand on a spot, and of one propped up
 PLACEMENT_DEG: Final = 0.02
 PROPPED_DEG: Final = 5.0
 """Sigma, about each axis, of the error with which a person props the aircraft up on a face."""
@@ -149,16 +150,16 @@ class _Aircraft:
                 counter.add(ImuSample(t_s, (p, q, r), (0.0, 0.0, 0.0), None, None, stamp_s))
         return times, rows
 
-    def stand(self, move: Callable[[float], float], counter: TurnCounter | None = None) -> _Stood:
+    def stand(self, move: _Move, counter: TurnCounter | None = None, seconds: int = STAND_S) -> _Stood:
         """Move the aircraft, then measure its stand."""
         begin_s = math.ceil(move(self.t_s) + 1.0)
         if counter is not None:
             self._read(begin_s + 0.5 - self._read_s, counter)
         self._read_s = begin_s + 0.5
-        times, rows = self._read(STAND_S + 0.5, counter)
+        times, rows = self._read(seconds + 0.5, counter)
         wanted = Settings(
-            min_still_s=float(STAND_S),
-            max_s=float(STAND_S),
+            min_still_s=float(seconds),
+            max_s=float(seconds),
             target_gyro_sigma_rad_s=0.0,
             target_accel_sigma_m_s2=0.0,
             horizon_s=NEXT_S,
@@ -166,7 +167,7 @@ class _Aircraft:
         collector = RollingCollector(wanted, [self.taken])
         for t_s, (p, q, r, x, y, z) in zip(times.tolist(), rows.tolist(), strict=True):
             collector.add_imu("imu", ImuSample(t_s, (p, q, r), (x, y, z), None))
-        self.t_s = begin_s + STAND_S + 1.3
+        self.t_s = begin_s + seconds + 1.3
         collector.tick(self.t_s)
         window = collector.window(self.t_s)
         return _Stood(window.start_s, window.end_s, window.imus[0], rows[:, 3:])
@@ -175,7 +176,8 @@ class _Aircraft:
         """Prop the aircraft up by hand, on a slope in a random direction; measure its stand."""
         azimuth = self.random.uniform(0.0, 2.0 * math.pi)
         off = self.random.normal(size=2) * PROPPED_DEG + SLOPE_DEG * np.array([math.cos(azimuth), math.sin(azimuth)])
-        return self.stand(lambda t_s: self.hands.hold(t_s, pitch_deg + float(off[0]), roll_deg + float(off[1])))
+        pitch, roll = float(pitch_deg + off[0]), float(roll_deg + off[1])
+        return self.stand(lambda t_s: self.hands.hold(t_s, pitch, roll), seconds=PROPPED_S)
 
     def on_spot(self, slope_deg: float) -> _Spot:
         """Measure stands after four quarter turns, back to the first heading, on a slope in a random direction."""
@@ -264,7 +266,7 @@ def section(runs: list[HandRun], each: int) -> Section:
         lines += [*make(parts, claims), ""]
     lines += [
         f"{STAND_S} s each; turned on marks met to {PLACEMENT_DEG:g} deg, gyros of 1 %, 0.5 % from square;",
-        f"propped up within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}.",
+        f"propped up for {PROPPED_S} s within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}.",
         "Biases against their mean over the next 3 min.",
         "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg, gravity 30 mGal off.",
     ]

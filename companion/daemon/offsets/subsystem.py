@@ -359,9 +359,6 @@ class Offsets(Subsystem):
 
 def _note_verdicts(plan: Plan, target: ImuPlan, verdicts: Sequence[EffectVerdict], log: WriteLog) -> list[str]:
     """Log the outcomes of one IMU's parameters by the verdicts of the check; return the faults as texts."""
-    hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
-    if hidden:
-        log.warn(target.name, message("change_too_small_to_see", parameters=", ".join(hidden)))
     for verdict in verdicts:
         log.warn(target.name, *verdict.problems)
         # Three offsets are in use if their step as a whole was seen: an axis that hardly changed shows no step.
