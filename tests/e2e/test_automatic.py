@@ -153,6 +153,13 @@ async def test_after_an_undo_nothing_is_written_until_the_next_request(tmp_path:
         await asyncio.sleep(120.0)
         assert rig.double.writes == []
         assert rig.service.status()["automatic"]["stopped"] == "undone"
+        manager = rig.service.calibrating.manager
+        assert manager.last_good is None, "what was measured with the undone offsets is void"
+        job = manager.start_calibration(What.BOTH, "test")
+        assert isinstance(job, Job)
+        job.cancel("test")
+        await job.finished
+        assert rig.service.status()["automatic"]["stopped"] == "undone"
         rig.ground.command(CALIBRATE, 0.0)
         await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 60.0)
         await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 15.0)

@@ -145,7 +145,9 @@ class Automatic:
             if result.outcome == "cancelled":  # whoever cancels an alignment has the aircraft in hand, in any pose
                 self._next_s = max(self._next_s, now_s + SPACING_S)
         elif not job.automatic:
-            self.stopped, self._failures, self._next_s = None, 0, now_s + SPACING_S
+            self._next_s = now_s + SPACING_S
+            if result.outcome == "done":
+                self.stopped, self._failures = None, 0
         else:
             if job.record is not None and job.record.written:
                 self._writes = [*self._writes, {"at_unix_s": time.time()}][-PER_DAY - 8 :]

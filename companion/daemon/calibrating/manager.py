@@ -107,6 +107,8 @@ class CalibrationManager:
             self._ended = next((record for _, record in self._store.latest() if record.state != "cancelled"), None)
             wrote = next((record for _, record in self._store.latest() if record.written), None)
             self.was_undone = wrote is not None and wrote.undone_at is not None
+            if self.was_undone:
+                self._ended = None  # a later result without a write was measured with the offsets that were undone
         except StorageError as error:
             logger.warning("%s; the companion continues without earlier records", error)
 

@@ -166,8 +166,10 @@ class ActiveSixPosition:
 
     def sigma_m_s2(self, name: str, temperature_degc: float | None) -> float | None:
         """Return the largest sigma of the biases of an accelerometer; None if its offsets do not remove them."""
-        now = self._now(name, temperature_degc)
-        if now is None or (np.abs(now.figures[BIAS]) > now.sigma[BIAS]).any():
+        imus, now = () if self.record is None else self.record.imus, self._now(name, temperature_degc)
+        # The sigma at the measurement decides: a power-up widens it beyond what undone offsets leave.
+        measured = next((np.array(imu.accel_bias_mg.sigma) * MG for imu in imus if imu.name == name), np.zeros(3))
+        if now is None or (np.abs(now.figures[BIAS]) > measured).any():
             return None
         return float(now.sigma[BIAS].max())
 

@@ -134,6 +134,18 @@ def test_in_another_power_up_the_bias_may_be_another(tmp_path: Path, when: Runni
     assert sigma_mg(kept(tmp_path, when).known("fc", calibration(), 25.0)) == pytest.approx(2.0, rel=0.01)
 
 
+@pytest.mark.parametrize(("left_mg", "sigma"), [(0.0, 2.0), (1.0, None)])
+def test_offsets_that_were_undone_do_not_count_however_wide_sigma_is(
+    tmp_path: Path, left_mg: float, sigma: float | None
+) -> None:
+    there, source, before = kept(tmp_path, None), Source(), calibration()
+    right = np.array(before.accel_offset_m_s2) + np.array(BIAS_MG) * MG / np.array(before.accel_scale)
+    source.calibration = calibration(vector(right - left_mg * MG))
+    there._imus = {"fc": source}  # type: ignore[dict-item]
+    found = there.sigma_m_s2("fc", 25.0)
+    assert found == (sigma and pytest.approx(sigma * MG, rel=0.01))
+
+
 def test_of_another_sensor_nothing_is_known(tmp_path: Path) -> None:
     there = kept(tmp_path, running())
     assert there.known("fc", calibration(accel_id=8), 25.0) is None
