@@ -59,10 +59,11 @@ class Interview:
             except ConfigError as error:
                 self.say(f"  {error}")
 
-    async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
+    async def agrees(self, question: str, *, by_default: bool = True, hint: str = "", more: str = "") -> bool:
         choices = ("yes", "no")
         put = functools.partial(one_of, allowed=choices)
-        return bool(await self.ask(Question(question, choices[not by_default], put, hint, choices)) == "yes")
+        asked = Question(question, choices[not by_default], put, hint, choices, more)
+        return bool(await self.ask(asked) == "yes")
 
     async def _line(self) -> str:
         """Read a line from stdin; unlike Python's `input`, stop waiting at Ctrl-C at once."""

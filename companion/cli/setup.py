@@ -43,6 +43,9 @@ USUAL_URLS: Final = ("serial:/dev/ttyACM0:115200", "serial:/dev/serial0:921600",
 PLACES: Final = f"USB {USUAL_URLS[0]}, UART {USUAL_URLS[1]}, UDP {USUAL_URLS[2]}, or tcp:HOST:PORT."
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
 """Warning about the autopilot's IMUs 2 and 3: SCALED_IMU2 and SCALED_IMU3 have a resolution of 1 mrad/s and 1 mg."""
+_OTHERS: Final = (
+    "An autopilot that loses an IMU flies on with another, by its offsets. no: only the first is calibrated."
+)
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
@@ -149,7 +152,9 @@ class _Session:
             lines = [line for line in text.splitlines() if line and not line.startswith("#")]
             followed = zip(lines, [*lines[1:], "["], strict=True)
             say(*(f"    {line}" for line, after in followed if not (line.startswith("[") and after.startswith("["))))
-            if not await self.asking.agrees("Write it?"):
+            if not await self.asking.agrees(
+                "Write it?", more=f"yes writes the lines above to {self._path}; no changes nothing."
+            ):
                 raise CompanionError("not wanted")
             self._write(text)
         else:
@@ -475,6 +480,6 @@ async def _ask_autopilot(asking: Interview, draft: Draft, *, by_default: bool) -
     if found:
         numbers = " and ".join(str(one["instance"]) for one in found)
         question = f"It has IMU {numbers} too; calibrate that as well?"
-        if await asking.agrees(question, by_default=by_default, hint=COARSE):
+        if await asking.agrees(question, by_default=by_default, hint=COARSE, more=_OTHERS):
             draft.wanted["imu"] += found
     return parts

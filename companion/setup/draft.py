@@ -37,6 +37,14 @@ _DECK: Final = (
     "deck: everything that sways or turns while the aircraft stands on it: a boat, a dock, a car with its engine on."
     " It takes longer, and gyros need a compass."
 )
+_MOUNTING: Final = (
+    "Look down on the aircraft, nose up. 0: the sensor's front points to the nose, 90: to the right wing, 180: to the"
+    " tail. A wrong answer gives each axis the bias of another; check and align zero find most of that."
+)
+_PART: Final = (
+    "The chip that measures, such as ICM-42688-P, not the board. Its known noise makes sigma smaller; a wrong name"
+    " makes it too small. unknown is always right."
+)
 _LASTING: Final = {"name", "source", "mounting", "profile", "autopilot_instance"}
 LAW_KEY: Final = "gradienter.law"
 _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compass", "imu": "companion's own IMU"}
@@ -181,6 +189,7 @@ class Draft:
                     functools.partial(self.put_mounting, kind),
                     "Degrees clockwise; 0: its front is to the aircraft's front. Or ROLL PITCH YAW, or ROTATION_...",
                     ("0", "90", "180", "270"),
+                    more=_MOUNTING,
                     key=f"{kind}.mounting",
                 )
 
@@ -205,6 +214,7 @@ class Draft:
                 f"Its board's data sheet says; any other part: {UNKNOWN}, whose noise is learned at rest. Gyros known,"
                 f" at best, to: {price} deg/h.",
                 choices,
+                more=_PART,
                 key=key,
             )
 

@@ -44,9 +44,14 @@ async def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_pa
         assert len(before) == 1
         assert TEMPORARILY_REJECTED in rig.ground.finals(CALIBRATE)
         assert set(rig.ground.finals(CANCEL)) == {ACCEPTED}
-        assert any("too many requests, wait" in text for text in rig.ground.texts())
-        await asyncio.sleep(1.0)
+        await rig.until(lambda: any("too many requests, wait" in text for text in rig.ground.texts()), 30.0)
         await done(rig)
+        job = ask(rig, "a pilot")
+        assert isinstance(job, Job), job
+        await asyncio.sleep(6.0)
+        job.cancel("a pilot")
+        await job.finished
+        assert [one.state for one in rig.service.calibrating.store.history()] == ["cancelled", "done", "done"]
 
 
 async def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -> None:

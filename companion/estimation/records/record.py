@@ -40,6 +40,9 @@ def outcome_word(outcome: str) -> str:
     return "restored" if outcome == "rolled_back" else outcome
 
 
+WORTH_S = 5.0  # Duration from which the history keeps a cancelled run: a client in a loop must not displace the others
+
+
 class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
     theta: float | None
     gamma: float | None
@@ -317,7 +320,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_worth_keeping(self) -> bool:
-        return self.state != "cancelled" or bool(self.imus or self.warnings)
+        return self.state != "cancelled" or self.duration_s >= WORTH_S or bool(self.imus or self.warnings)
 
 
 def to_json(record: Record) -> bytes:
