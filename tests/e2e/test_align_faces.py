@@ -70,7 +70,7 @@ async def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tm
         assert stands["number"] == stands["total"] == len(stands["done"]), "the last pose is seen as the last"
         record = job.product
         assert isinstance(record, FacesRecord)
-        assert 11 <= len(record.stands) <= 14
+        assert 10 <= sum(one.seconds < 10.0 for one in record.stands) <= 13, "all but the first pose are short"
         (imu,) = record.imus
         assert not imu.left_out
         # With scales undone the sensor is what it is: a bias, and nothing wrong with its scale.

@@ -98,7 +98,7 @@ class ActiveAlignment:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the gradienter contradicts the IMUs, or is configured otherwise than when its zero was measured."""
+        """True if the gradienter contradicts the IMUs, or has other settings than when its zero was measured."""
         changed = self.record is not None and self.unused is not None and self._gradienter is not None
         return changed or self.doubt is not None
 

@@ -47,9 +47,7 @@ MOST: Final = 24  # Maximum
 NOT_WRITTEN: Final = "not written (--write does)"
 SHORTEST_S: Final = 8.0
 """Shortest time without motion in one of the six positions: fewer seconds do not show that the aircraft leans."""
-POSE_SIGMA_M_S2: Final = (
-    0.1 * MG
-)  # Noise of the mean of one pose that leaves a bias sigma of half of what is good enough
+POSE_SIGMA_M_S2: Final = 0.1 * MG  # Noise of the mean of one pose: eleven poses then give half the allowed bias sigma
 _FIRST: Final = PoseRequest("any side down, propped up, hands off")
 TURN_LIMITED_M_S2: Final = 0.5 * MG
 """Sigma of accelerometer biases above which a wrong turning angle matters more than placement on the floor marks."""

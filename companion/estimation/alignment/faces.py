@@ -64,6 +64,7 @@ SIDES: Final = {
 Face = tuple[Array, Array]
 """Mean specific force during one pose, in the sensor's axes, and one sigma per axis; m/s^2, each (3,)."""
 _Fit = tuple[Array, Matrix, float, bool]
+"""Nine figures (9,), their covariance (9, 9), chi-square, and true if every pose fits."""
 
 
 class Sides(msgspec.Struct, frozen=True):
@@ -126,7 +127,8 @@ def faces(
     everyone = tuple(range(len(stands)))
     gravity = (gravity_m_s2, gravity_sigma_m_s2)
     figures, covariance, _, fits = _fit(stands, everyone, gravity)
-    left_out, in_doubt = tuple[int, ...](), tuple[int, ...]()
+    left_out: tuple[int, ...] = ()
+    in_doubt: tuple[int, ...] = ()
     while not fits:
         kept = tuple(k for k in everyone if k not in left_out)
         if 4 * (len(left_out) + 1) > len(stands):
@@ -166,7 +168,6 @@ def _fits_without_one(
 
 
 def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]) -> _Fit:
-    """Estimate the nine figures; return them, their covariance (9, 9), chi-square, and true if every pose fits."""
     force, sigmas = (np.array([stands[k][part] for k in which]) for part in (0, 1))
     prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
 

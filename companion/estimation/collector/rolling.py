@@ -199,6 +199,9 @@ class RollingCollector:
 
     # --- state and results
 
+    def sources(self) -> list[Source]:
+        return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
+
     @property
     def begun_s(self) -> dict[str, float]:
         return {name: source.begun_s for name, source in self.imus.items() if source.begun_s is not None}
@@ -280,9 +283,6 @@ class RollingCollector:
         )
 
     # --- inside
-
-    def sources(self) -> list[Source]:
-        return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
 
     def _others(self) -> list[GateVerdict]:
         return [source.verdict for source in self.sources() if source is not self._heading]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
 
@@ -40,7 +40,7 @@ def outcome_word(outcome: str) -> str:
     return "restored" if outcome == "rolled_back" else outcome
 
 
-WORTH_S = 5.0  # Duration from which the history keeps a cancelled run: a client in a loop must not displace the others
+WORTH_S: Final = 5.0  # Shortest cancelled run that the history keeps: a client in a loop must not displace the others
 
 
 class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
